@@ -1,0 +1,147 @@
+"""The words of the design as data: what travels between the parts, with units and signs.
+
+Times are integer nanoseconds. x points forward, y left, z up; a left turn is positive. The vehicle's frame has its
+origin on the ground under the middle of the rear axle. `mono_ns` is a host's monotonic clock, `wall_ns` its wall clock.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]
+"""A picture: (height, width, 3), blue green red, 0 to 255."""
+
+FloatArray = NDArray[np.float64]
+
+NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
+NS_PER_US = 1_000
+
+PATH_STEP_M = 2.0
+"""A command carries the curvature of the path it means to follow at 2, 4, .. 20 m ahead of the rear axle."""
+PATH_POINTS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Now:
+    """One reading of a host's two clocks."""
+
+    mono_ns: int
+    wall_ns: int
+
+    def later(self, duration_ns: int) -> Now:
+        """Both clocks after `duration_ns` without a step."""
+        return Now(self.mono_ns + duration_ns, self.wall_ns + duration_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where the vehicle is: its rear axle in the world's frame, at a time of the server's monotonic clock."""
+
+    mono_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Actuation:
+    """What a vehicle is asked to do: road wheel angle, and pedals in [0, 1]."""
+
+    steering_rad: float
+    throttle: float
+    brake: float
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """What a vehicle reports of itself, at its own time `mono_ns` on the server's monotonic clock."""
+
+    mono_ns: int
+    speed_mps: float
+    steering_rad: float
+    gear: Literal["park", "reverse", "neutral", "drive"]
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """What only a simulator knows; it is recorded on the server and never published."""
+
+    mono_ns: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    steering_rad: float
+    cross_track_m: float
+    """Distance of the rear axle from the lane's centre, left positive."""
+    heading_error_rad: float
+    """Heading of the body less that of the lane's centre."""
+    progress_m: float
+    """Distance along the lane's centre since the start of the route."""
+
+
+EventKind = Literal["lane_invasion", "collision", "off_road", "completed", "timeout", "fault"]
+
+Ending = Literal["completed", "collision", "off_road", "timeout", "safe_stop"]
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleEvent:
+    """Something that happened to a vehicle."""
+
+    mono_ns: int
+    kind: EventKind
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture, no roll and no yaw.
+
+    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    field_of_view_rad: float = 1.5707963267948966
+    x_m: float = 1.6
+    z_m: float = 1.4
+    pitch_rad: float = 0.0
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels."""
+        return self.width_px / 2 / float(np.tan(self.field_of_view_rad / 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """The lane as seen in one picture, in the vehicle's frame.
+
+    The centre line is y = c0 + c1 x + c2 x^2, x metres ahead of the rear axle, valid from `near_m` to `far_m`.
+    """
+
+    centre: tuple[float, float, float]
+    width_m: float
+    near_m: float
+    far_m: float
+    confidence: float
+    """0 (nothing of a lane in the picture) to 1 (both lines seen over the whole length)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What a controller wants: pedals, road wheel angle, and the path it means to follow.
+
+    `path_curvature_per_m` has `PATH_POINTS` values, `PATH_STEP_M` apart, left positive.
+    """
+
+    steering_rad: float
+    throttle: float
+    brake: float
+    path_curvature_per_m: tuple[float, ...]

@@ -1,0 +1,1 @@
+"""Runs, sweeps, what is computed from their records, and the report."""

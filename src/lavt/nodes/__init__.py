@@ -1,0 +1,1 @@
+"""The parts of the loop, each a table of hops without input, output or clock."""

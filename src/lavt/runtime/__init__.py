@@ -1,0 +1,1 @@
+"""What drives the nodes: the machine's time, or a virtual one."""

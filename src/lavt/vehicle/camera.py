@@ -1,0 +1,43 @@
+"""What LAVT needs of a camera. Only the camera node calls it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from lavt.domain import CameraModel, Picture, Pose
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedFrame:
+    """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known."""
+
+    number: int
+    capture_ns: int | None
+    picture: Picture
+
+
+class Camera(Protocol):
+    """Something that gives a frame at a time."""
+
+    @property
+    def model(self) -> CameraModel:
+        """Geometry of the pictures."""
+        ...
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        ...
+
+    @property
+    def phase_ns(self) -> int:
+        """When frame 0 is taken, after the start, in [0, 1 / rate)."""
+        ...
+
+    def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
+        """Give frame `number`, taken at `at_ns`; None when there is no picture.
+
+        `pose` is the newest pose at or before `at_ns`; only a simulated camera has to do with it.
+        """
+        ...
