@@ -145,3 +145,76 @@ class Decision:
     throttle: float
     brake: float
     path_curvature_per_m: tuple[float, ...]
+
+
+Mode = Literal["arm", "drive", "stop"]
+Operation = Literal["hold", "release", "emergency_stop", "clear_emergency_stop"]
+SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the client wants the vehicle to do, at least 50 times a second."""
+
+    epoch: int
+    sequence: int
+    sent_wall_ns: int
+    """Send time on the client's wall clock; it serves the measurement of latency only."""
+    stamp_ns: int
+    """Stamp of the newest picture this command was made from; 0: none."""
+    stamp_received_wall_ns: int
+    """When the client had read that stamp, on its wall clock."""
+    steering_rad: float
+    throttle: float
+    brake: float
+    path_curvature_per_m: tuple[float, ...]
+    mode: Mode
+    emergency_stop: int
+    """0, or the number of an emergency stop; the numbers only grow."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What the vehicle tells, 50 times a second."""
+
+    sent_wall_ns: int
+    state_mono_ns: int
+    """The state's own time, on the server's monotonic clock."""
+    speed_mps: float
+    steering_rad: float
+    gear: str
+    safety: SafetyState
+    because: str
+    """Why the safety state is what it is, in words."""
+    applied_sequence: int
+    """Sequence of the command last obeyed; -1: none in this epoch."""
+    refused: str
+    """Why a command was last refused; empty: none was."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRequest:
+    """A client's query to the server."""
+
+    operation: Operation
+    who: str
+    instance: int
+    """Random number of the client's process: the same client asking again is told from a new one of the same name."""
+    number: int
+    """Number of an emergency stop, else 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionReply:
+    """The server's answer to a `SessionRequest`."""
+
+    granted: bool
+    because: str
+    epoch: int
+    token: bytes
+    """Opens the path of the video (16 bytes); empty when refused."""
+    video_port: int
+    host: str
+    """Identity of the server's kernel: hosts that share one share a clock."""
+    emergency_stop: int
+    """Highest number of an emergency stop that the server has seen."""

@@ -58,6 +58,11 @@ class Node(Protocol):
         ...
 
     @property
+    def counts(self) -> Mapping[str, int]:
+        """What the node has counted; written into the record at the end."""
+        ...
+
+    @property
     def chains(self) -> Mapping[str, Sequence[Hop]]:
         """For each channel the node listens to, its hops in order."""
         ...

@@ -1,0 +1,319 @@
+"""What a user can configure: one schema with units in its names; unknown keys are refused with the nearest known one."""
+
+from __future__ import annotations
+
+import difflib
+import typing
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from lavt.errors import UserError
+
+
+def shipped(name: str) -> Path:
+    """Path of a file that comes with LAVT, such as `configs/costs.yaml`: inside the package, or in the source tree."""
+    packaged = Path(str(resources.files("lavt"))) / "data" / name
+    return packaged if packaged.exists() else Path(__file__).parents[2] / name
+
+
+class Section(BaseModel):
+    """A part of a config: no unknown keys, no silent conversion, not changed once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class VehicleConfig(Section):
+    """Which vehicle, and what it drives."""
+
+    kind: str = "simulator"
+    route: str = "a_key"
+    scenery: Literal["full", "light", "none"] = "full"
+
+
+class CameraConfig(Section):
+    """The camera: where it sits (vehicle's frame) and what it gives."""
+
+    width_px: int = Field(640, ge=128, le=3840, multiple_of=2)
+    height_px: int = Field(480, ge=128, le=2160, multiple_of=2)
+    rate_hz: float = Field(30.0, gt=0, le=120)
+    field_of_view_deg: float = Field(90.0, gt=10, lt=150)
+    x_m: float = 1.6
+    z_m: float = Field(1.4, gt=0)
+    pitch_deg: float = Field(0.0, ge=-20, le=45)
+
+
+class VideoConfig(Section):
+    """H.264 and RTP."""
+
+    bit_rate_bps: int = Field(4_000_000, ge=50_000, le=50_000_000)
+    gop_frames: int = Field(30, ge=1, le=600)
+    buffer_ms: float = Field(100.0, gt=0, le=2000)
+    reorder_hold_ms: float = Field(10.0, ge=0, le=500)
+
+
+class NetworkConfig(Section):
+    """What the network does to a run on one machine."""
+
+    condition: str = "L0"
+    inherent: Literal["loopback", "paper_wifi5"] = "loopback"
+    injection: Literal["relay", "none"] = "relay"
+    state_delay: Literal["none", "with_video"] = "none"
+
+
+class SafetyConfig(Section):
+    """The limits that a study may widen, for a simulated vehicle only."""
+
+    lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
+    picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
+
+
+class ControllerConfig(Section):
+    """Who drives."""
+
+    kind: str = "lane_keeper"
+    preset: str = "designed"
+    rearm: bool = False
+    """Arm again by itself after a safe stop."""
+
+
+class ClocksConfig(Section):
+    """The virtual hosts' clocks: the server's against the true time (the client's is true), and chrony's model."""
+
+    offset_ms: float = Field(250.0, ge=-60_000, le=60_000)
+    drift_ppm: float = Field(20.0, ge=-500, le=500)
+    error_us: float = Field(20.0, ge=0)
+    bound_us: float = Field(100.0, ge=0)
+
+    @field_validator("bound_us")
+    @classmethod
+    def _holds(cls, bound_us: float, info: Any) -> float:
+        if bound_us < info.data.get("error_us", 0.0):
+            raise ValueError("must be at least error_us: the modelled error lies inside its bound")
+        return bound_us
+
+
+class StudyConfig(Section):
+    """Where a run belongs in a study with people; empty for a controller."""
+
+    participant: str | None = None
+    block: int | None = None
+    order: int | None = None
+
+
+class RunConfig(Section):
+    """One run on one machine."""
+
+    vehicle: VehicleConfig = VehicleConfig()
+    controller: ControllerConfig = ControllerConfig()
+    camera: CameraConfig = CameraConfig()
+    video: VideoConfig = VideoConfig()
+    network: NetworkConfig = NetworkConfig()
+    safety: SafetyConfig = SafetyConfig()
+    clocks: ClocksConfig = ClocksConfig()
+    study: StudyConfig = StudyConfig()
+    time: Literal["real", "virtual"] = "virtual"
+    seed: int = Field(1, ge=0, lt=2**63)
+
+
+class SweepConfig(RunConfig):
+    """Many runs: every route under every condition, repeated, over every combination of further axes."""
+
+    routes: tuple[str, ...] = ("a_key",)
+    conditions: tuple[str, ...] = ("L0", "L1", "L2", "L3", "L4", "L5")
+    repetitions: int = Field(1, ge=1, le=10_000)
+    axes: dict[str, list[Any]] = {}
+
+
+class ZenohConfig(Section):
+    """The session to the router on this machine."""
+
+    session: str = "zenoh-configs/session.json5"
+    """A JSON5 file: a path, or one of those that come with LAVT."""
+    router: str = ""
+    """Endpoint of the router; empty: the one the file names."""
+
+
+class ServerVideoConfig(VideoConfig):
+    """The video as the server sends it."""
+
+    bind: str = "0.0.0.0"  # noqa: S104 (the video's path must be proven before anything is sent)
+    port: int = Field(5600, ge=0, le=65535)
+    send_to: tuple[str, ...] = ()
+    """Plain receivers, as host:port, that get the video without proving anything."""
+
+
+class ServerConfig(Section):
+    """The vehicle's machine."""
+
+    vehicle_id: str = "vehicle-1"
+    vehicle: VehicleConfig = VehicleConfig()
+    camera: CameraConfig = CameraConfig()
+    video: ServerVideoConfig = ServerVideoConfig()
+    zenoh: ZenohConfig = ZenohConfig()
+    safety: SafetyConfig = SafetyConfig()
+    seed: int = Field(1, ge=0, lt=2**63)
+
+
+class ClientVideoConfig(Section):
+    """The video as the client receives it."""
+
+    server: str = "127.0.0.1"
+    port: int = Field(0, ge=0, le=65535)
+    """0: the port that the server names in the session."""
+    reorder_hold_ms: float = Field(10.0, ge=0, le=500)
+
+
+class ClientConfig(Section):
+    """The remote machine."""
+
+    vehicle_id: str = "vehicle-1"
+    who: str = "operator-1"
+    controller: ControllerConfig = ControllerConfig()
+    camera: CameraConfig = CameraConfig()
+    video: ClientVideoConfig = ClientVideoConfig()
+    zenoh: ZenohConfig = ZenohConfig()
+
+
+class DelayConfig(Section):
+    """One direction of a relayed flow: a constant delay and, on top, a lognormal one."""
+
+    constant_ms: float = Field(0.0, ge=0, le=60_000)
+    jitter_median_ms: float = Field(0.0, ge=0)
+    jitter_sigma: float = Field(0.0, ge=0)
+
+
+class RelayConfig(Section):
+    """The relay: where it listens, where the server is, and what it holds back."""
+
+    video_listen: str = "127.0.0.1:0"
+    video_server: str
+    control_listen: str = "127.0.0.1:0"
+    control_server: str
+    video: DelayConfig = DelayConfig()
+    control: DelayConfig = DelayConfig()
+    state: DelayConfig = DelayConfig()
+    seed: int = Field(1, ge=0, lt=2**63)
+
+
+class Condition(Section):
+    """What is injected under a condition."""
+
+    video_ms: float = Field(ge=0, le=60_000)
+    control_ms: float = Field(ge=0, le=60_000)
+
+
+class Costs(Section):
+    """What the loop costs where the virtual runtime does not wait for it: see `configs/costs.yaml`."""
+
+    measured_on: str
+    hops_us: dict[str, dict[str, float]]
+    links_us: dict[str, float]
+
+
+Config = TypeVar("Config", bound=Section)
+
+
+def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> Config:
+    """Read a YAML file and `--set` changes (`a.b=value`, the value in YAML) into a config of class `kind`.
+
+    Raises `UserError` for what is missing, unknown, of the wrong type or out of range.
+    """
+    data = read_yaml(path)
+    for change in changes:
+        _set(data, change)
+    return parse_config(kind, data, str(path))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file that holds a mapping; raises `UserError` where it does not."""
+    try:
+        data = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}): name an existing file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = " ".join(str(error).split())
+        raise UserError(f"{path} is not YAML: {where}") from error
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise UserError(f"{path} must hold keys and values, not a {type(data).__name__}")
+    return data
+
+
+def parse_config(kind: type[Config], data: Mapping[str, Any], where: str) -> Config:
+    """Check `data` against the schema; `where` names its source in the error."""
+    try:
+        return kind.model_validate(_tuples(kind, data))
+    except ValidationError as error:
+        raise UserError(f"{where}: " + "; ".join(_sentence(kind, problem) for problem in error.errors())) from error
+
+
+def conditions() -> dict[str, Condition]:
+    """Read all conditions of `netem/conditions.yaml`."""
+    path = shipped("netem/conditions.yaml")
+    return {name: parse_config(Condition, entry, f"{path}: {name}") for name, entry in read_yaml(path).items()}
+
+
+def condition(name: str) -> Condition:
+    """Give the condition of a name; raises `UserError` naming the known ones."""
+    known = conditions()
+    if name not in known:
+        raise UserError(f"there is no condition {name!r}: the known ones are {', '.join(known)}")
+    return known[name]
+
+
+def _set(data: dict[str, Any], change: str) -> None:
+    key, equals, text = change.partition("=")
+    if not equals or not key:
+        raise UserError(f"--set {change!r} is not of the form a.b=value")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UserError(f"--set {change!r}: the value is not YAML") from error
+    *sections, last = key.split(".")
+    for section in sections:
+        data = data.setdefault(section, {})
+        if not isinstance(data, dict):
+            raise UserError(f"--set {change!r}: {section} is not a section")
+    data[last] = value
+
+
+def _tuples(kind: type[BaseModel], data: Mapping[str, Any]) -> dict[str, Any]:
+    """YAML knows lists and integers only where the schema has tuples and floats; everything else stays strict."""
+    converted = dict(data)
+    for name, field in kind.model_fields.items():
+        value = converted.get(name)
+        section = field.annotation
+        if isinstance(value, dict) and isinstance(section, type) and issubclass(section, BaseModel):
+            converted[name] = _tuples(section, value)
+        elif isinstance(value, list) and typing.get_origin(section) is tuple:
+            converted[name] = tuple(value)
+    return converted
+
+
+def _sentence(kind: type[BaseModel], problem: Any) -> str:
+    """Say in words what is wrong with one value, and what would be right."""
+    location = [str(part) for part in problem["loc"]]
+    where = ".".join(location)
+    if problem["type"] == "extra_forbidden":
+        known = _keys(kind, location[:-1])
+        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(sorted(known))}"
+        return f"unknown key {where!r}: {hint}"
+    if problem["type"] == "missing":
+        return f"{where!r} is missing: give it"
+    return f"{where!r}: {problem['msg']}, not {problem['input']!r}"
+
+
+def _keys(kind: type[BaseModel], location: Iterable[str]) -> list[str]:
+    for part in location:
+        section = kind.model_fields[part].annotation
+        if not (isinstance(section, type) and issubclass(section, BaseModel)):
+            return []
+        kind = section
+    return list(kind.model_fields)

@@ -1,0 +1,67 @@
+"""The last thing before the vehicle: limits of steering and speed that hold whatever is asked."""
+
+from __future__ import annotations
+
+import math
+
+from lavt.control.limits import Limits
+from lavt.domain import NS_PER_S, Actuation, VehicleState
+
+
+class Limiter:
+    """Keeps what is asked within the limits, and tells which of them changed it.
+
+    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are the vehicle's own.
+    """
+
+    def __init__(self, limits: Limits, *, wheelbase_m: float, max_steering_rad: float, max_braking_mps2: float) -> None:
+        self.limits = limits
+        self.max_braking_mps2 = max_braking_mps2
+        self.changed: tuple[str, ...] = ()
+        """Names of the limits that changed what was last asked."""
+        self._wheelbase_m = wheelbase_m
+        self._max_steering_rad = max_steering_rad
+        self._steering_rad: float | None = None
+        self._at_ns = 0
+
+    def start(self, steering_rad: float, now_ns: int) -> None:
+        """Begin from where the wheel is."""
+        self._steering_rad, self._at_ns = steering_rad, now_ns
+
+    def target_rad(self, vehicle: VehicleState) -> float:
+        """Last steering target; before the first one, where the wheel is."""
+        return vehicle.steering_rad if self._steering_rad is None else self._steering_rad
+
+    def limit(self, asked: Actuation, vehicle: VehicleState, now_ns: int) -> Actuation:
+        """Bring `asked` within the limits at the vehicle's speed; the wheel turns no faster than the rate allows."""
+        before_rad = self.target_rad(vehicle)
+        step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
+        if self._steering_rad is None:
+            step_rad = 0.0
+        steps = (
+            ("steering angle", self._max_steering_rad),
+            ("lateral acceleration", self._lateral_limit_rad(vehicle.speed_mps)),
+        )
+        changed = []
+        steering_rad = asked.steering_rad
+        for name, bound_rad in steps:
+            bounded_rad = min(max(steering_rad, -bound_rad), bound_rad)
+            if bounded_rad != steering_rad:
+                changed.append(name)
+                steering_rad = bounded_rad
+        reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
+        if reached_rad != steering_rad:
+            changed.append("steering rate")
+        throttle = asked.throttle
+        if throttle > 0 and vehicle.speed_mps > self.limits.speed_limit_mps:
+            throttle = 0.0
+            changed.append("speed")
+        self._steering_rad, self._at_ns = reached_rad, now_ns
+        self.changed = tuple(changed)
+        return Actuation(reached_rad, throttle, asked.brake)
+
+    def _lateral_limit_rad(self, speed_mps: float) -> float:
+        """Road wheel angle at which the kinematic car has the lateral acceleration limit: v^2 tan(angle) / L."""
+        if abs(speed_mps) < 0.1:
+            return math.pi / 2
+        return math.atan(self._wheelbase_m * self.limits.lateral_acceleration_mps2 / speed_mps**2)

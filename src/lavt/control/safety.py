@@ -1,0 +1,286 @@
+"""Which commands a vehicle obeys, and what it does without one.
+
+No clock, no input, no output: the actuator node gives times of the server's monotonic clock, and nothing here relies on
+what the message layer promises. States and transitions are the table `TRANSITIONS`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from lavt.control.limiter import Limiter
+from lavt.control.limits import Limits
+from lavt.control.written import WrittenStamps
+from lavt.domain import Actuation, Command, SafetyState, SessionReply, SessionRequest, VehicleState
+
+Trigger = Literal[
+    "arming begins", "arming broken", "arming held", "silence", "fresh command", "long silence", "stop asked",
+    "camera fault", "emergency stop", "cleared", "released",
+]  # fmt: skip
+
+ACTIVE: tuple[SafetyState, ...] = ("arming", "driving", "degraded")
+"""States in which somebody is about to drive or drives."""
+
+TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
+    ("disarmed", "arming begins"): "arming",
+    ("safe_stop", "arming begins"): "arming",
+    ("arming", "arming broken"): "disarmed",
+    ("arming", "camera fault"): "disarmed",
+    ("arming", "released"): "disarmed",
+    ("arming", "arming held"): "driving",
+    ("driving", "silence"): "degraded",
+    ("degraded", "fresh command"): "driving",
+    ("degraded", "long silence"): "safe_stop",
+    **{(state, trigger): "safe_stop" for state in ("driving", "degraded")
+       for trigger in ("stop asked", "camera fault", "released")},
+    **{(state, "emergency stop"): "emergency_stop"
+       for state in ("disarmed", "arming", "driving", "degraded", "safe_stop")},
+    ("emergency_stop", "cleared"): "disarmed",
+}  # fmt: skip
+"""What leads from where to where. What is not in the table changes nothing."""
+
+BECAUSE: dict[Trigger, str] = {
+    "arming begins": "standing, brake on, input neutral, pictures fresh: holding for 1 s",
+    "arming broken": "a condition of arming did not hold",
+    "arming held": "armed by the client",
+    "silence": "no command from a newer picture",
+    "fresh command": "commands from newer pictures again",
+    "long silence": "no command from a newer picture for too long",
+    "stop asked": "the client asked for a stop",
+    "camera fault": "the camera gives the same picture again and again",
+    "emergency stop": "emergency stop",
+    "cleared": "the emergency stop was cleared",
+    "released": "the client released the vehicle",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a command; `reason` is empty when it was obeyed."""
+
+    obeyed: bool
+    reason: str
+
+
+OBEYED = Verdict(True, "")
+
+
+class SafetyGate:
+    """Holds the session, admits or refuses commands, and says what the vehicle shall do now."""
+
+    def __init__(
+        self,
+        limits: Limits,
+        limiter: Limiter,
+        *,
+        new_epoch: Callable[[], int],
+        new_token: Callable[[], bytes],
+        host: str = "",
+        video_port: int = 0,
+    ) -> None:
+        self.limits = limits
+        self.limiter = limiter
+        self.written = WrittenStamps(limits.stamp_memory_ns, limits.frozen_frames)
+        self.state: SafetyState = "disarmed"
+        self.because = "nobody has armed the vehicle yet"
+        self.refused = ""
+        self.counts: Counter[str] = Counter()
+        self.holder: tuple[str, int] | None = None
+        self.token = b""
+        self.applied_sequence = -1
+        self._new_epoch = new_epoch
+        self._new_token = new_token
+        self._host = host
+        self._video_port = video_port
+        self._epoch = new_epoch()
+        self._sequence = -1
+        self._newest_frame = -1
+        self._fresh_ns = 0
+        self._arming_since_ns = 0
+        self._emergency_number = 0
+        self._command: Command | None = None
+        self._transitions: list[tuple[SafetyState, SafetyState, str]] = []
+
+    # The session: who holds the vehicle.
+
+    def answer(self, request: SessionRequest, vehicle: VehicleState) -> SessionReply:
+        """Decide on a session query; only its holder can change the session, anybody can stop the vehicle."""
+        refusal = self._OPERATIONS[request.operation](self, request, vehicle)
+        granted = refusal == ""
+        self.counts[f"session {request.operation} {'granted' if granted else 'refused'}"] += 1
+        return SessionReply(
+            granted, refusal, self._epoch if granted else 0, self.token if granted else b"", self._video_port,
+            self._host, self._emergency_number,
+        )  # fmt: skip
+
+    def _hold(self, request: SessionRequest, vehicle: VehicleState) -> str:
+        asker = (request.who, request.instance)
+        if asker == self.holder:
+            return ""
+        if self.holder is not None and (self.state in ACTIVE or not self.stands(vehicle)):
+            return f"held by {self.holder[0]}, and the vehicle is not disarmed at standstill"
+        self.holder = asker
+        self.token = self._new_token()
+        self._renew_epoch()
+        return ""
+
+    def _release(self, request: SessionRequest, _vehicle: VehicleState) -> str:
+        if (request.who, request.instance) != self.holder:
+            return "only who holds the vehicle can release it"
+        self._trigger("released")
+        self.holder = None
+        self.token = b""
+        self._renew_epoch()
+        return ""
+
+    def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState) -> str:
+        return "" if self._stop_at_once(request.number) else "the number of this emergency stop is not a new one"
+
+    def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState) -> str:
+        if (request.who, request.instance) != self.holder:
+            return "only who holds the vehicle can clear its emergency stop"
+        if not self.stands(vehicle):
+            return "the vehicle does not stand yet"
+        self._trigger("cleared")
+        return ""
+
+    _OPERATIONS = {
+        "hold": _hold,
+        "release": _release,
+        "emergency_stop": _emergency_stop,
+        "clear_emergency_stop": _clear_emergency_stop,
+    }
+
+    # What is obeyed.
+
+    def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> Verdict:
+        """Obey `command` or refuse it, at `now_ns`, when it was received."""
+        if command.emergency_stop:
+            self._stop_at_once(command.emergency_stop)
+        reason = self._objection(command, vehicle, now_ns)
+        if reason:
+            self.refused = reason
+            self.counts[f"refused: {reason}"] += 1
+            return Verdict(False, reason)
+        self._sequence = self.applied_sequence = command.sequence
+        newer = self.written.number(command.stamp_ns) > self._newest_frame
+        if newer:
+            self._newest_frame = self.written.number(command.stamp_ns)
+            self._fresh_ns = now_ns
+        if command.mode == "arm":
+            self._arm(command, vehicle, now_ns)
+        elif command.mode == "stop":
+            self._trigger("stop asked")
+        else:
+            self._command = command
+            if newer:
+                self._trigger("fresh command")
+        return OBEYED
+
+    def _objection(self, command: Command, vehicle: VehicleState, now_ns: int) -> str:
+        """Say why `command` is not obeyed; empty: it is. The cheap checks come first."""
+        if self.holder is None or command.epoch != self._epoch:
+            return "not the epoch in force"
+        if command.sequence <= self._sequence:
+            return "not newer than the last command"
+        written_ns = self.written.mono_ns(command.stamp_ns, now_ns)
+        if written_ns is None:
+            return "a stamp that this server did not write lately"
+        if now_ns - written_ns > self.limits.picture_age_limit_ns:
+            return "made from a picture that is too old"
+        if command.mode == "drive" and self.state not in ("driving", "degraded"):
+            return "the vehicle is not armed"
+        if command.mode == "arm" and self.state in ("driving", "degraded"):
+            return "the vehicle is armed already"
+        if command.mode == "arm" and self.state == "emergency_stop":
+            return "the emergency stop must be cleared first"
+        if command.mode == "arm" and not self.stands(vehicle):
+            return "arming needs standstill"
+        return ""
+
+    def _arm(self, command: Command, vehicle: VehicleState, now_ns: int) -> None:
+        neutral = command.throttle == 0 and abs(command.steering_rad) <= self.limits.arming_steering_rad
+        if not neutral or command.brake < self.limits.arming_brake or self.written.frozen:
+            self._trigger("arming broken")
+        elif self.state != "arming":
+            self._arming_since_ns = now_ns
+            self._trigger("arming begins")
+        elif now_ns - self._arming_since_ns >= self.limits.arming_hold_ns:
+            self._command = None
+            self.limiter.start(vehicle.steering_rad, now_ns)
+            self._trigger("arming held")
+
+    def _stop_at_once(self, number: int) -> bool:
+        if number <= self._emergency_number:
+            self.counts["emergency stop with an old number"] += self.state != "emergency_stop"
+            return False
+        self._emergency_number = number
+        self._trigger("emergency stop")
+        return True
+
+    # What happens without a command.
+
+    def watch(self, now_ns: int) -> None:
+        """Look at the clock: what silence and frozen pictures lead to."""
+        if self.written.frozen:
+            self._trigger("camera fault")
+        silence_ns = now_ns - self._fresh_ns
+        if silence_ns >= self.limits.degraded_after_ns:
+            self._trigger("arming broken")
+            self._trigger("silence")
+        if silence_ns >= self.limits.stop_after_ns:
+            self._trigger("long silence")
+
+    def next_wake_ns(self) -> int | None:
+        """When `watch` has something to see next, if nothing comes."""
+        if self.state not in ACTIVE:
+            return None
+        after_ns = self.limits.stop_after_ns if self.state == "degraded" else self.limits.degraded_after_ns
+        return self._fresh_ns + after_ns
+
+    def actuation(self, vehicle: VehicleState, now_ns: int) -> Actuation:
+        """Say what the vehicle shall do now: the command in force within all limits, or what its state asks for."""
+        asked = self._command if self.state in ("driving", "degraded") else None
+        pedals = {
+            "driving": (asked.throttle, asked.brake) if asked else (0.0, self.limits.arming_brake),
+            "degraded": (0.0, self._pedal(self.limits.degraded_deceleration_mps2)),
+            "safe_stop": (0.0, self._pedal(self.limits.stop_deceleration_mps2)),
+        }.get(self.state, (0.0, 1.0))
+        target_rad = asked.steering_rad if asked else self.limiter.target_rad(vehicle)
+        return self.limiter.limit(Actuation(target_rad, *pedals), vehicle, now_ns)
+
+    def end_drive(self) -> None:
+        """The drive is over: stop."""
+        self._trigger("stop asked")
+
+    def take_transitions(self) -> list[tuple[SafetyState, SafetyState, str]]:
+        """Take the transitions since the last call: from, to, why."""
+        transitions, self._transitions = self._transitions, []
+        return transitions
+
+    # Small print.
+
+    def _trigger(self, trigger: Trigger) -> None:
+        after = TRANSITIONS.get((self.state, trigger))
+        if after is None:
+            return
+        self._transitions.append((self.state, after, BECAUSE[trigger]))
+        self.state, self.because = after, BECAUSE[trigger]
+        if after in ("safe_stop", "emergency_stop"):
+            self._renew_epoch()
+
+    def _renew_epoch(self) -> None:
+        """Nothing sent under the old epoch is obeyed ever again."""
+        self._epoch = self._new_epoch()
+        self._sequence = self.applied_sequence = -1
+        self._command = None
+
+    def _pedal(self, deceleration_mps2: float) -> float:
+        return min(1.0, deceleration_mps2 / self.limiter.max_braking_mps2)
+
+    def stands(self, vehicle: VehicleState) -> bool:
+        """Whether the vehicle is at standstill."""
+        return abs(vehicle.speed_mps) < self.limits.standstill_mps

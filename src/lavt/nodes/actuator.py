@@ -1,0 +1,212 @@
+"""Steps 12 and 13 of the life of a frame: the command is admitted or refused, and the vehicle obeys."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lavt.control.safety import ACTIVE, SafetyGate, Verdict
+from lavt.domain import NS_PER_MS, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
+from lavt.errors import BadMessage
+from lavt.node import WAKE, Hop, Message, Send
+from lavt.nodes.reports import Admission, Event, FrameWritten, Route
+from lavt.transport.messages import decode, encode
+from lavt.vehicle.vehicle import Vehicle
+
+STATE_PERIOD_NS = 20 * NS_PER_MS
+LATE_NS = 50 * NS_PER_MS
+"""Physics that is this late is counted: the vehicle stood still in the world for so long."""
+
+ENDINGS: dict[str, Ending] = {
+    "completed": "completed",
+    "collision": "collision",
+    "off_road": "off_road",
+    "timeout": "timeout",
+}
+"""Events that end a drive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A command as it came in."""
+
+    command: Command
+    arrived: Now
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the picture it was made from."""
+        return self.command.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A command with what was decided on it."""
+
+    received: Received
+    stamp_ns: int
+    verdict: Verdict
+    limited: tuple[str, ...] = ()
+
+
+class ActuatorNode:
+    """The only one who talks to the vehicle: lets it live, watches, admits commands, and tells its state."""
+
+    name = "actuator"
+
+    def __init__(self, vehicle: Vehicle, gate: SafetyGate, *, start_ns: int, route: Route | None = None) -> None:
+        self.counts: Counter[str] = Counter()
+        self.gate = gate
+        self.vehicle = vehicle
+        self._route = route
+        self._publish_ns = start_ns
+        self._advanced_ns = start_ns
+        self._ending: str | None = None
+        self._driving = False
+        self.chains: Mapping[str, Sequence[Hop]] = {
+            "control": (
+                ("decode", self._decode),
+                ("admit", self._admit),
+                ("apply", self._apply),
+                ("report", self._report),
+            ),
+            "session": (("answer", self._answer),),
+            "frame": (("note", self._note_frame),),
+            WAKE: (("advance", self._advance), ("publish", self._publish)),
+        }
+
+    def next_wake_ns(self) -> int:
+        """When the vehicle, the watchdog or the state is due."""
+        watch_ns = self.gate.next_wake_ns()
+        due_ns = min(self.vehicle.next_wake_ns(), self._publish_ns)
+        return due_ns if watch_ns is None else min(due_ns, watch_ns)
+
+    # A command comes.
+
+    def _decode(self, message: Message, _now: Now) -> Received | None:
+        try:
+            return Received(decode(Command, message.payload), message.arrived)
+        except BadMessage:
+            self.counts["commands_unreadable"] += 1
+            return None
+
+    def _admit(self, received: Received, _now: Now) -> Judged:
+        verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
+        return Judged(received, received.stamp_ns, verdict)
+
+    def _apply(self, judged: Judged, now: Now) -> Judged:
+        if not judged.verdict.obeyed:
+            return judged
+        self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
+        return Judged(judged.received, judged.stamp_ns, judged.verdict, self.gate.limiter.changed)
+
+    def _report(self, judged: Judged, now: Now) -> list[Send]:
+        command, arrived = judged.received.command, judged.received.arrived
+        obeyed = judged.verdict.obeyed
+        self.counts["commands_limited"] += bool(judged.limited)
+        admission = Admission(
+            epoch=command.epoch,
+            sequence=command.sequence,
+            stamp_ns=command.stamp_ns,
+            sent_wall_ns=command.sent_wall_ns,
+            stamp_received_wall_ns=command.stamp_received_wall_ns,
+            received_mono_ns=arrived.mono_ns,
+            received_wall_ns=arrived.wall_ns,
+            applied_mono_ns=now.mono_ns if obeyed else None,
+            verdict="obeyed" if obeyed else "refused",
+            reason=judged.verdict.reason,
+            limited=", ".join(judged.limited),
+            mode=command.mode,
+            steering_rad=command.steering_rad,
+            throttle=command.throttle,
+            brake=command.brake,
+        )
+        return [*self._changes(now), Send("admission", admission)]
+
+    # Somebody asks.
+
+    def _answer(self, message: Message, now: Now) -> list[Send]:
+        try:
+            request = decode(SessionRequest, message.payload)
+        except BadMessage:
+            self.counts["session_requests_unreadable"] += 1
+            return []
+        token = self.gate.token
+        reply = self.gate.answer(request, self.vehicle.state())
+        sends = [*self._changes(now), Send("session_reply", encode(reply), message.peer)]
+        if self.gate.token != token:
+            sends.append(Send("video_token", self.gate.token or None))
+        said = "granted" if reply.granted else f"refused: {reply.because}"
+        sends.append(Send("event", Event(now.mono_ns, "session", f"{request.operation} by {request.who} {said}")))
+        return sends
+
+    def _note_frame(self, message: Message, _now: Now) -> None:
+        frame: FrameWritten = message.payload
+        self.gate.written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+
+    # Time goes on.
+
+    def _advance(self, message: Message, now: Now) -> list[VehicleEvent]:
+        due_ns = min(self.vehicle.next_wake_ns(), message.arrived.mono_ns)
+        self.counts["physics_late"] += now.mono_ns - due_ns > LATE_NS
+        events = self.vehicle.advance(now.mono_ns)
+        self.gate.watch(now.mono_ns)
+        self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
+        return events
+
+    def _publish(self, events: list[VehicleEvent], now: Now) -> list[Send]:
+        sends = []
+        truth = self.vehicle.ground_truth()
+        if truth is not None:
+            sends.append(Send("pose", Pose(truth.mono_ns, truth.x_m, truth.y_m, truth.heading_rad)))
+        for event in events:
+            sends.append(Send("event", Event(event.mono_ns, event.kind, event.detail)))
+            if event.kind in ENDINGS:
+                sends += self._end(ENDINGS[event.kind], now)
+        sends += self._changes(now)
+        if now.mono_ns >= self._publish_ns:
+            self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
+            sends.append(Send("state", encode(self._state(now))))
+            if truth is not None:
+                sends.append(Send("truth", truth))
+            if self._route is not None:
+                sends.append(Send("route", self._route))
+                self._route = None
+        return sends
+
+    def _state(self, now: Now) -> State:
+        vehicle = self.vehicle.state()
+        return State(
+            sent_wall_ns=now.wall_ns,
+            state_mono_ns=vehicle.mono_ns,
+            speed_mps=vehicle.speed_mps,
+            steering_rad=vehicle.steering_rad,
+            gear=vehicle.gear,
+            safety=self.gate.state,
+            because=self.gate.because,
+            applied_sequence=self.gate.applied_sequence,
+            refused=self.gate.refused,
+        )
+
+    # What changed is told.
+
+    def _changes(self, now: Now) -> list[Send]:
+        """Tell every transition of the safety state, the begin of a drive, and its end by a stop."""
+        sends = []
+        for before, after, because in self.gate.take_transitions():
+            sends.append(Send("event", Event(now.mono_ns, "safety", f"{before} -> {after}: {because}")))
+            if before == "arming" and after == "driving":
+                self._driving, self._ending = True, None
+                sends.append(Send("event", Event(now.mono_ns, "drive_began", "")))
+        stopped = self.gate.state not in ACTIVE and self.gate.stands(self.vehicle.state())
+        if self._driving and self._ending is None and stopped:
+            sends += self._end("safe_stop", now)
+        return sends
+
+    def _end(self, ending: Ending, now: Now) -> list[Send]:
+        if not self._driving or self._ending is not None:
+            return []
+        self._driving, self._ending = False, ending
+        self.gate.end_drive()
+        return [Send("event", Event(now.mono_ns, "ending", ending))]

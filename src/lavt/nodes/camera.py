@@ -1,0 +1,159 @@
+"""Steps 1 to 4 of the life of a frame: picture, stamp, H.264, RTP."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lavt.domain import NS_PER_S, Now, Picture, Pose
+from lavt.errors import BadPacket
+from lavt.node import WAKE, Hop, Message, Send
+from lavt.nodes.reports import FrameWritten, VideoUnit
+from lavt.transport.h264 import Encoder
+from lavt.transport.rtcp import is_rtcp, parse_feedback
+from lavt.transport.rtp import Packetizer
+from lavt.transport.stamp import rtp_timestamp, write_stamp
+from lavt.transport.video_path import PathServer
+from lavt.vehicle.camera import Camera, CapturedFrame
+
+KEYFRAME_PAUSE_NS = NS_PER_S // 10
+"""No more than one keyframe on request in this time, so that requests cannot fill the link."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """A picture with its send time in its pixels."""
+
+    frame: CapturedFrame
+    pixel_crc: int
+    stamp_ns: int
+    stamped_mono_ns: int
+    picture: Picture
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A stamped picture as H.264."""
+
+    stamped: Stamped
+    stamp_ns: int
+    access_unit: bytes
+
+
+class CameraNode:
+    """Takes a picture whenever one is due, and sends it to whoever has proven to be there.
+
+    Late wakes skip frames and count them; a picture is taken at the time it was due. `send_to` names plain receivers.
+    """
+
+    name = "camera"
+
+    def __init__(
+        self,
+        camera: Camera,
+        encoder: Encoder,
+        packetizer: Packetizer,
+        path: PathServer,
+        *,
+        start_ns: int,
+        send_to: Sequence[tuple[str, int]] = (),
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._camera = camera
+        self._encoder = encoder
+        self._packetizer = packetizer
+        self._path = path
+        self._start_ns = start_ns + camera.phase_ns
+        self._send_to = tuple(send_to)
+        self._next_frame = 0
+        self._poses: deque[Pose] = deque(maxlen=32)
+        self._keyframe_wanted = False
+        self._keyframe_ns = 0
+        self._last_stamp_ns = 0
+        self.chains: Mapping[str, Sequence[Hop]] = {
+            WAKE: (
+                ("capture", self._capture),
+                ("stamp", self._stamp),
+                ("encode", self._encode),
+                ("packetize", self._packetize),
+            ),
+            "pose": (("note", self._note_pose),),
+            "video_token": (("note", self._note_token),),
+            "feedback": (("feedback", self._hear),),
+        }
+
+    def next_wake_ns(self) -> int:
+        """When the next frame is due."""
+        return self._due_ns(self._next_frame)
+
+    def _due_ns(self, number: int) -> int:
+        return self._start_ns + round(number * NS_PER_S / self._camera.rate_hz)
+
+    def _capture(self, _message: Message, now: Now) -> CapturedFrame | None:
+        number = self._next_frame
+        while self._due_ns(number + 1) <= now.mono_ns:
+            number += 1
+        self.counts["frames_skipped"] += number - self._next_frame
+        self._next_frame = number + 1
+        due_ns = self._due_ns(number)
+        pose = next((pose for pose in reversed(self._poses) if pose.mono_ns <= due_ns), None)
+        frame = self._camera.capture(number, due_ns, pose)
+        if frame is None:
+            self.counts["frames_missing"] += 1
+        return frame
+
+    def _stamp(self, frame: CapturedFrame, now: Now) -> Stamped:
+        pixel_crc = zlib.crc32(frame.picture.data)
+        stamp_ns = now.wall_ns
+        if stamp_ns == self._last_stamp_ns:  # a clock that stands still or was stepped back must not write one twice
+            stamp_ns += 1
+        self._last_stamp_ns = stamp_ns
+        write_stamp(frame.picture, stamp_ns)
+        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, frame.picture)
+
+    def _encode(self, stamped: Stamped, now: Now) -> Encoded:
+        keyframe = self._keyframe_wanted and now.mono_ns - self._keyframe_ns >= KEYFRAME_PAUSE_NS
+        if keyframe:
+            self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
+            self.counts["keyframes_on_request"] += 1
+        return Encoded(stamped, stamped.stamp_ns, self._encoder.encode(stamped.picture, keyframe=keyframe))
+
+    def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:
+        stamped, unit = encoded.stamped, encoded.access_unit
+        packets = self._packetizer.packetize(unit, rtp_timestamp(encoded.stamp_ns))
+        proven = self._path.open_address(now.mono_ns)
+        addresses = self._send_to if proven is None else (proven, *self._send_to)
+        self.counts["frames_sent"] += 1
+        self.counts["frames_without_receiver"] += not addresses
+        frame = FrameWritten(
+            stamped.frame.number, encoded.stamp_ns, stamped.stamped_mono_ns, stamped.frame.capture_ns,
+            stamped.pixel_crc, len(unit),
+        )  # fmt: skip
+        sends = [Send("frame", frame)]
+        sends += [Send("rtp", packet, address) for address in addresses for packet in packets]
+        return [*sends, Send("video", VideoUnit(encoded.stamp_ns, unit))]
+
+    def _note_pose(self, message: Message, _now: Now) -> None:
+        self._poses.append(message.payload)
+
+    def _note_token(self, message: Message, _now: Now) -> None:
+        self._path.set_token(message.payload)
+
+    def _hear(self, message: Message, now: Now) -> list[Send] | None:
+        """A datagram from somewhere: part of proving the path, or RTCP, which counts from an open path only."""
+        if not is_rtcp(message.payload):
+            answer = self._path.receive(message.payload, message.peer, now.mono_ns)
+            return None if answer is None else [Send("rtp", answer, message.peer)]
+        if not self._path.rtcp_admitted(message.peer):
+            self.counts["feedback_from_strangers"] += 1
+            return None
+        try:
+            feedback = parse_feedback(message.payload)
+        except BadPacket:
+            self.counts["feedback_unreadable"] += 1
+            return None
+        self._path.report(message.peer, now.mono_ns)
+        self._keyframe_wanted |= feedback.picture_loss
+        return None

@@ -1,0 +1,202 @@
+"""Steps 7 to 10 of the life of a frame: picture, stamp, lane, command."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lavt.control.drive_controller import DriveController, LaneWatch
+from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, State
+from lavt.errors import BadMessage
+from lavt.node import WAKE, Hop, Message, Send
+from lavt.nodes.client_session import ClientSession
+from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, View, VideoUnit
+from lavt.perception.lane_detector import LaneDetector
+from lavt.transport.h264 import DecodedPicture, Decoder
+from lavt.transport.messages import decode, encode
+from lavt.transport.stamp import read_stamp, stamp_agrees
+from lavt.control.limits import ClientLimits
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A received access unit and the picture that came of it."""
+
+    unit: ReceivedUnit
+    picture: DecodedPicture | None
+    decoded_mono_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class StampRead:
+    """A decoded picture with its stamp; 0 where it could not be read."""
+
+    decoded: Decoded
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A view and the lane that perception found in it."""
+
+    view: View
+    stamp_ns: int
+    lane: Lane
+
+
+class DriverNode:
+    """Drives by the received pictures and the speed that the vehicle reports, and by nothing else.
+
+    Every picture is decoded; when pictures wait, only the newest is looked at. A command leaves as soon as a picture has
+    been looked at, and never later than `limits.command_period_ns` after the one before.
+    """
+
+    name = "driver"
+
+    def __init__(
+        self,
+        decoder: Decoder,
+        detector: LaneDetector,
+        controller: DriveController,
+        session: ClientSession,
+        limits: ClientLimits,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.session = session
+        self._decoder = decoder
+        self._detector = detector
+        self._controller = controller
+        self._watch = LaneWatch()
+        self._limits = limits
+        self._sequence = 0
+        self._view: View | None = None
+        self._view_ns = 0
+        self._decision: Decision | None = None
+        self._lane_says = "ok"
+        self._speed_mps = 0.0
+        self._command_ns: int | None = None
+        self.chains: Mapping[str, Sequence[Hop]] = {
+            "access_unit": (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show)),
+            "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
+            "state": (("note", self._note_state),),
+            "session_reply": (("note", self._note_reply),),
+            WAKE: (("command", self._wake),),
+        }
+
+    def next_wake_ns(self) -> int | None:
+        """When the next command or session query is due."""
+        times = (self.session.next_wake_ns(), self._command_ns)
+        return min((time for time in times if time is not None), default=None)
+
+    # A picture comes.
+
+    def _decode(self, message: Message, now: Now) -> Decoded:
+        unit: ReceivedUnit = message.payload
+        return Decoded(unit, self._decoder.decode(unit.data), now.mono_ns)
+
+    def _read_stamp(self, decoded: Decoded, now: Now) -> StampRead:
+        decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
+        if decoded.picture is None:
+            return StampRead(decoded, 0, "no picture")
+        stamp_ns = read_stamp(decoded.picture.luma)
+        if not stamp_agrees(stamp_ns, decoded.unit.rtp_timestamp):
+            return StampRead(decoded, 0, "stamp and RTP timestamp disagree")
+        return StampRead(decoded, stamp_ns, "")
+
+    def _show(self, read: StampRead, now: Now) -> list[Send]:
+        decoded, unit = read.decoded, read.decoded.unit
+        readable = read.reason == ""
+        self.counts["frames_decoded"] += decoded.picture is not None
+        self.counts["frames_unreadable"] += not readable
+        picture = PictureRead(
+            read.stamp_ns, readable, read.reason, unit.rtp_timestamp, unit.packet_mono_ns, decoded.decoded_mono_ns,
+            now.mono_ns, now.wall_ns,
+        )  # fmt: skip
+        sends = [Send("video", VideoUnit(read.stamp_ns, unit.data)), Send("picture", picture)]
+        if readable and decoded.picture is not None:
+            sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture.picture)))
+        return sends
+
+    # A picture is looked at.
+
+    def _perceive(self, message: Message, _now: Now) -> Seen:
+        view: View = message.payload
+        return Seen(view, view.stamp_ns, self._detector.detect(view.picture))
+
+    def _decide(self, seen: Seen, now: Now) -> Seen:
+        self._lane_says = self._watch.judge(seen.lane.confidence, now.mono_ns)
+        self._decision = self._controller.decide(seen.lane, self._speed_mps, now.mono_ns)
+        self._view, self._view_ns = seen.view, now.mono_ns
+        return seen
+
+    def _command_now(self, seen: Seen, now: Now) -> list[Send]:
+        return [*self._command(now), Send("lane", LaneSeen(seen.stamp_ns, seen.lane))]
+
+    # A command is due.
+
+    def _wake(self, _message: Message, now: Now) -> list[Send]:
+        sends = []
+        if self._command_ns is not None and now.mono_ns >= self._command_ns:
+            sends += self._command(now)
+        request = self.session.request_due(now.mono_ns)
+        if request is not None:
+            sends.append(Send("session", encode(request)))
+        return sends
+
+    def _command(self, now: Now) -> list[Send]:
+        """Make the command of this moment from what is known; none without a session or a picture."""
+        self._command_ns = None
+        if self._view is None or self._decision is None or not self.session.commanding:
+            return []
+        self._command_ns = now.mono_ns + self._limits.command_period_ns
+        self._sequence += 1
+        mode, decision = self._intention(self._decision, now.mono_ns)
+        command = Command(
+            epoch=self.session.epoch,
+            sequence=self._sequence,
+            sent_wall_ns=now.wall_ns,
+            stamp_ns=self._view.stamp_ns,
+            stamp_received_wall_ns=self._view.read_wall_ns,
+            steering_rad=decision.steering_rad,
+            throttle=decision.throttle,
+            brake=decision.brake,
+            path_curvature_per_m=decision.path_curvature_per_m,
+            mode=mode,
+            emergency_stop=self.session.emergency_stop,
+        )
+        return [Send("control", encode(command))]
+
+    def _intention(self, decision: Decision, now_ns: int) -> tuple[Mode, Decision]:
+        if self.session.phase != "driving":
+            return "arm", Decision(0.0, 0.0, 1.0, decision.path_curvature_per_m)
+        blind_ns = now_ns - self._view_ns
+        if self._lane_says == "stop" or blind_ns >= self._limits.no_picture_stop_ns:
+            return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
+        if self._lane_says == "brake" or blind_ns >= self._limits.no_picture_brake_ns:
+            brake = max(decision.brake, self._limits.brake)
+            return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
+        return "drive", decision
+
+    # The vehicle tells.
+
+    def _note_state(self, message: Message, now: Now) -> None:
+        try:
+            state = decode(State, message.payload)
+        except BadMessage:
+            self.counts["states_unreadable"] += 1
+            return
+        self._speed_mps = state.speed_mps
+        self.session.note_state(state, now.mono_ns)
+
+    def _note_reply(self, message: Message, now: Now) -> list[Send]:
+        try:
+            reply = decode(SessionReply, message.payload)
+        except BadMessage:
+            self.counts["session_replies_unreadable"] += 1
+            return []
+        self.session.note_reply(reply, now.mono_ns)
+        return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted else []
+
+

@@ -1,0 +1,132 @@
+"""What nodes tell each other on one side, and what they write down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lavt.domain import Lane, Picture
+
+
+@dataclass(frozen=True, slots=True)
+class FrameWritten:
+    """A frame was stamped and encoded on the server."""
+
+    number: int
+    stamp_ns: int
+    stamped_mono_ns: int
+    capture_ns: int | None
+    pixel_crc: int
+    """CRC-32 of the pixels before the stamp."""
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class VideoUnit:
+    """One H.264 access unit as it was sent or received."""
+
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedUnit:
+    """An access unit out of the network; the times are the client's monotonic clock."""
+
+    data: bytes
+    rtp_timestamp: int
+    complete: bool
+    keyframe: bool
+    packet_mono_ns: int
+    """Arrival of its last packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A decoded picture with a stamp that could be read."""
+
+    stamp_ns: int
+    read_wall_ns: int
+    picture: Picture
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRead:
+    """What became of a received access unit."""
+
+    stamp_ns: int
+    """0 where it could not be read."""
+    readable: bool
+    reason: str
+    rtp_timestamp: int
+    packet_mono_ns: int
+    decoded_mono_ns: int
+    read_mono_ns: int
+    read_wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSeen:
+    """What perception made of a picture."""
+
+    stamp_ns: int
+    lane: Lane
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """What became of a command on the server."""
+
+    epoch: int
+    sequence: int
+    stamp_ns: int
+    sent_wall_ns: int
+    stamp_received_wall_ns: int
+    received_mono_ns: int
+    received_wall_ns: int
+    applied_mono_ns: int | None
+    verdict: str
+    reason: str
+    limited: str
+    """Names of the limits that changed it, with commas."""
+    mode: str
+    steering_rad: float
+    throttle: float
+    brake: float
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something worth a line in the record of the server."""
+
+    mono_ns: int
+    kind: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """The road that is driven: the middle of its lane, once at the start of a record."""
+
+    name: str
+    length_m: float
+    points: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PathToken:
+    """The client may open the path of the video with this."""
+
+    token: bytes
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSample:
+    """A clock report beside a reading of both clocks."""
+
+    mono_ns: int
+    wall_ns: int
+    host: str
+    source: str
+    correction_s: float
+    bound_s: float | None

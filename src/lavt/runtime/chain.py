@@ -1,0 +1,53 @@
+"""Walking a message through a node's hops, each with its own `now`, and writing down when each was done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from lavt.domain import Now
+from lavt.node import Hop, Message, Send
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """When each hop of a chain was done, on the host's monotonic clock.
+
+    The first entry is "wait": when the first hop began; `arrived_mono_ns` is when the message came.
+    """
+
+    node: str
+    channel: str
+    stamp_ns: int
+    arrived_mono_ns: int
+    hops: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Walked:
+    """What came of a message: what to send, when the node was done, and the timeline where there is a stamp."""
+
+    sends: list[Send]
+    end: Now
+    timeline: Timeline | None
+
+
+def walk(
+    node: str, hops: Sequence[Hop], message: Message, start: Now, after: Callable[[str, Now], Now]
+) -> Walked:
+    """Call hop after hop; `after(name, before)` tells the time when hop `name`, begun at `before`, is done."""
+    value: object = message
+    now = start
+    stamp_ns: int | None = None
+    done = [("wait", start.mono_ns)]
+    for name, hop in hops:
+        value = hop(value, now)
+        now = after(name, now)
+        done.append((name, now.mono_ns))
+        stamp_ns = getattr(value, "stamp_ns", stamp_ns)
+        if value is None:
+            break
+    timeline = None
+    if stamp_ns:
+        timeline = Timeline(node, message.channel, stamp_ns, message.arrived.mono_ns, tuple(done))
+    return Walked(value if isinstance(value, list) else [], now, timeline)

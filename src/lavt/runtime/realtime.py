@@ -1,0 +1,162 @@
+"""Real time: sockets, Zenoh, a thread and an inbox for each node, the machine's clocks."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+from lavt.clock import Clock
+from lavt.domain import NS_PER_S, Now
+from lavt.node import WAKE, Message, Node, Peer, Send
+from lavt.runtime.chain import walk
+from lavt.runtime.inbox import Inbox
+from lavt.runtime.recording import Recorder, record
+from lavt.transport.channels import CHANNELS
+from lavt.transport.clock_offset import ClockReport
+
+SWITCH_INTERVAL_S = 0.0005
+"""Python's default of 5 ms lets one busy thread hold up every other for that long."""
+
+log = logging.getLogger(__name__)
+
+
+class Link(Protocol):
+    """What carries messages to the other side."""
+
+    def send(self, send: Send) -> None:
+        """Carry a message; never waits, never raises for what the network does."""
+        ...
+
+
+class RealRuntime:
+    """Drives the nodes of one side by the machine's clocks.
+
+    `links` carries what crosses the network, by carrier. A node that fails ends the run: `failed` says why.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        nodes: Sequence[Node],
+        recorder: Recorder,
+        clock_source: Callable[[], ClockReport],
+    ) -> None:
+        self.links: dict[str, Link] = {}
+        self.failed: BaseException | None = None
+        self.stopped = threading.Event()
+        self._clock = clock
+        self._recorder = recorder
+        self._clock_source = clock_source
+        self._workers = {node.name: _Worker(self, node) for node in nodes}
+
+    def start(self, links: Mapping[str, Link]) -> None:
+        """Begin: from here on nodes are woken and messages delivered."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        gc.collect()
+        gc.freeze()  # what exists by now stays: a full collection over it would be a hitch
+        self.links.update(links)
+        for worker in self._workers.values():
+            worker.thread.start()
+
+    def stop(self) -> None:
+        """End all threads and write the counters down."""
+        self.stopped.set()
+        for worker in self._workers.values():
+            worker.notify()
+        for worker in self._workers.values():
+            if worker.thread.is_alive():
+                worker.thread.join()
+        now = self._clock.now()
+        for worker in self._workers.values():
+            counts = {**worker.node.counts, **worker.inbox.counts}
+            self._recorder.write("counts", {"node": worker.node.name, **counts}, now)
+
+    def deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer = None) -> None:
+        """Let a message wait for its receivers; links call this, from threads of their own."""
+        row = CHANNELS[channel]
+        if row.carrier != "local":
+            record(self._recorder, channel, payload, arrived)
+        for receiver in row.receivers:
+            self._workers[receiver].put(Message(channel, payload, arrived, peer))
+
+    def fail(self, error: BaseException) -> None:
+        """A thread ended with an error: so does the run."""
+        log.critical("%s: %s", type(error).__name__, error, exc_info=error)
+        self.failed = error
+        self.stopped.set()
+
+    def run_chain(self, node: Node, message: Message) -> None:
+        """Walk a message through its hops and send what comes out."""
+        walked = walk(
+            node.name, node.chains[message.channel], message, self._clock.now(), lambda _hop, _before: self._clock.now()
+        )
+        for send in walked.sends:
+            self._send(send)
+        if walked.timeline is not None:
+            self._recorder.write("timeline", walked.timeline, walked.end)
+
+    def now(self) -> Now:
+        """Read the clocks."""
+        return self._clock.now()
+
+    def _send(self, send: Send) -> None:
+        now = self._clock.now()
+        carrier = CHANNELS[send.channel].carrier
+        if carrier == "local":
+            self.deliver(send.channel, send.payload, now)
+        elif carrier == "clock":
+            threading.Thread(target=self._report_clock, name="clock source", daemon=True).start()
+        elif carrier != "record":
+            self.links[carrier].send(send)
+        record(self._recorder, send.channel, send.payload, now)
+
+    def _report_clock(self) -> None:
+        """Asking chrony takes a process of its own and some milliseconds: no node waits for it."""
+        self.deliver("clock_report", self._clock_source(), self._clock.now())
+
+
+class _Worker:
+    """A node's thread: wakes it when it asked, hands it what waits, sleeps in between."""
+
+    def __init__(self, runtime: RealRuntime, node: Node) -> None:
+        self.node = node
+        self.inbox = Inbox()
+        self.thread = threading.Thread(target=self._work, name=node.name, daemon=True)
+        self._runtime = runtime
+        self._condition = threading.Condition()
+
+    def put(self, message: Message) -> None:
+        with self._condition:
+            self.inbox.put(message)
+            self._condition.notify()
+
+    def notify(self) -> None:
+        with self._condition:
+            self._condition.notify()
+
+    def _work(self) -> None:
+        try:
+            while not self._runtime.stopped.is_set():
+                message = self._next()
+                if message is not None:
+                    self._runtime.run_chain(self.node, message)
+        except BaseException as error:  # whatever ends a node's thread must end the run, not leave half of it alive
+            self._runtime.fail(error)
+
+    def _next(self) -> Message | None:
+        """What the node does next: a wake that is due comes first, then what waits; else sleep until either."""
+        now = self._runtime.now()
+        wake_ns = self.node.next_wake_ns()
+        if wake_ns is not None and wake_ns <= now.mono_ns:
+            return Message(WAKE, None, now)
+        with self._condition:
+            message = self.inbox.take()
+            if message is None:
+                pause_s = None if wake_ns is None else (wake_ns - now.mono_ns) / NS_PER_S
+                if not self._runtime.stopped.is_set():
+                    self._condition.wait(pause_s)
+            return message

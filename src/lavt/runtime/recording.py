@@ -1,0 +1,104 @@
+"""What of the messages in and out goes into the record, and the queue in front of it."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
+
+from lavt.domain import Command, Now, SessionReply, SessionRequest, State
+from lavt.errors import BadMessage
+from lavt.transport.messages import decode
+
+
+class Recorder(Protocol):
+    """Something that keeps a record."""
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Write one entry."""
+        ...
+
+
+def _decoded(kind: type[Any]) -> Callable[[bytes], object]:
+    def read(data: bytes) -> object:
+        try:
+            return decode(kind, data)
+        except BadMessage:
+            return {"unreadable": data[:64].hex(), "size_bytes": len(data)}
+
+    return read
+
+
+def _without_token(data: bytes) -> object:
+    """The token opens the path of the video; it is not for the record."""
+    reply = _decoded(SessionReply)(data)
+    return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
+
+
+def _packet(data: bytes) -> object:
+    """Sequence and timestamp of an RTP packet (RFC 3550, section 5.1), and its size."""
+    if len(data) < 12 or data[0] >> 6 != 2:
+        return {"sequence": None, "timestamp": None, "size_bytes": len(data)}
+    return {
+        "sequence": int.from_bytes(data[2:4], "big"),
+        "timestamp": int.from_bytes(data[4:8], "big"),
+        "size_bytes": len(data),
+    }
+
+
+def _size(data: bytes) -> object:
+    return {"size_bytes": len(data)}
+
+
+WIRE: dict[str, Callable[[bytes], object]] = {
+    "rtp": _packet,
+    "feedback": _size,
+    "control": _decoded(Command),
+    "state": _decoded(State),
+    "session": _decoded(SessionRequest),
+    "session_reply": _without_token,
+}
+"""How the bytes of a channel that crosses the network are written down."""
+
+UNRECORDED = ("pose", "view", "video_token", "path_token", "access_unit", "clock_query", "clock_report")
+"""Written down elsewhere (the truth, the pictures' units, the clock samples), or secret."""
+
+
+def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
+    """Write down a message, if it belongs into the record."""
+    if channel not in UNRECORDED:
+        recorder.write(channel, WIRE[channel](payload) if channel in WIRE else payload, now)
+
+
+class QueuedRecorder:
+    """A recorder behind a bounded queue and a thread of its own, so that no node ever waits for a disk.
+
+    What does not fit is counted in `overflow`; a run with an overflow is invalid.
+    """
+
+    def __init__(self, recorder: Recorder, capacity: int = 8192) -> None:
+        self.overflow = 0
+        self._recorder = recorder
+        self._queue: queue.Queue[tuple[str, Any, Now] | None] = queue.Queue(capacity)
+        self._thread = threading.Thread(target=self._drain, name="recorder", daemon=True)
+        self._thread.start()
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Queue one entry, or count it as lost."""
+        try:
+            self._queue.put_nowait((topic, payload, now))
+        except queue.Full:
+            self.overflow += 1
+
+    def close(self, now: Now) -> None:
+        """Write what is queued, and how much was lost."""
+        self._queue.put(None)
+        self._thread.join()
+        self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
+
+    def _drain(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            self._recorder.write(*entry)

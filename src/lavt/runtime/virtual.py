@@ -1,0 +1,219 @@
+"""Virtual time: one heap of events, simulated links, hosts with clocks of their own, as fast as the machine goes.
+
+Real pixels, the real codec and real packets pass through the nodes; only waiting is skipped. The same seed and the same
+configuration give the same result, bit for bit.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lavt.domain import NS_PER_S, Now
+from lavt.node import WAKE, Message, Node, Peer, Send
+from lavt.runtime.chain import walk
+from lavt.runtime.inbox import Inbox
+from lavt.runtime.recording import Recorder, record
+from lavt.transport.channels import CHANNELS
+from lavt.transport.clock_offset import ClockReport
+from lavt.transport.delay import DelayLine
+
+NS_PER_PPB = 1_000_000_000
+
+
+@dataclass
+class HostClock:
+    """Both clocks of a virtual host, as exact functions of the true time.
+
+    `offset_ns` is the wall clock's at true time 0, `drift_ppb` how much too fast the host's oscillator is (parts in
+    10^9, in both clocks), and `steps` are sudden changes of the wall clock: (true time, change), in order.
+    """
+
+    mono_start_ns: int
+    wall_start_ns: int
+    offset_ns: int = 0
+    drift_ppb: int = 0
+    steps: Sequence[tuple[int, int]] = ()
+
+    def at(self, true_ns: int) -> Now:
+        """Read both clocks at a true time."""
+        gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB
+        stepped_ns = sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
+        wall_ns = self.wall_start_ns + self.offset_ns + gone_ns + stepped_ns
+        return Now(self.mono_start_ns + gone_ns, wall_ns)
+
+    def true_ns(self, mono_ns: int) -> int:
+        """Tell the first true time at which the monotonic clock shows at least `mono_ns`."""
+        gone_ns = mono_ns - self.mono_start_ns
+        guess_ns = gone_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
+        while self.at(guess_ns).mono_ns < mono_ns:
+            guess_ns += 1
+        return guess_ns
+
+
+@dataclass
+class VirtualLink:
+    """A simulated link of one channel: a delay line, and how its packets are numbered for the delay law."""
+
+    line: DelayLine
+    index: Callable[[bytes, int], int]
+    """(payload, number of the packet) to the index of its delay; packets of one frame share theirs."""
+    count: int = 0
+    open: bool = True
+    """A closed link loses what is sent."""
+
+
+@dataclass
+class VirtualHost:
+    """One side: its clock, nodes, record, the cost of each hop, and its source of clock reports."""
+
+    side: str
+    clock: HostClock
+    nodes: Sequence[Node]
+    recorder: Recorder
+    costs_ns: Mapping[tuple[str, str], int]
+    """(node, hop) to its cost; what is not named costs nothing."""
+    clock_source: Callable[[int], ClockReport]
+    peer: Peer = None
+    """How this host looks from the other side."""
+    running: dict[str, _Running] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.running = {node.name: _Running(self, node) for node in self.nodes}
+
+
+class _Running:
+    """A node at work: what waits for it, until when it is busy, and when it is looked at next."""
+
+    def __init__(self, host: VirtualHost, node: Node) -> None:
+        self.host = host
+        self.node = node
+        self.inbox = Inbox()
+        self.free_ns = 0
+        self.poke_ns: int | None = None
+
+
+class VirtualRuntime:
+    """Drives the nodes of two hosts and the links between them through virtual time."""
+
+    def __init__(self, hosts: Sequence[VirtualHost], links: Mapping[str, VirtualLink]) -> None:
+        self.true_ns = 0
+        self.hosts = {host.side: host for host in hosts}
+        self.links = dict(links)
+        self._heap: list[tuple[int, int, Callable[[], None]]] = []
+        self._number = 0
+        for host in hosts:
+            for running in host.running.values():
+                self._poke(running, 0)
+
+    def at(self, true_ns: int, action: Callable[[], None]) -> None:
+        """Call `action` at a true time."""
+        self._number += 1
+        heapq.heappush(self._heap, (true_ns, self._number, action))
+
+    def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
+        """Run until `finished()` or to the limit; tell whether it finished."""
+        while self._heap and self._heap[0][0] <= limit_ns:
+            self.true_ns, _, action = heapq.heappop(self._heap)
+            action()
+            if finished():
+                return True
+        return False
+
+    def close(self) -> None:
+        """Write the counters of nodes and inboxes into the records."""
+        for host in self.hosts.values():
+            now = host.clock.at(self.true_ns)
+            for name, running in host.running.items():
+                counts: dict[str, Any] = {**running.node.counts, **running.inbox.counts}
+                host.recorder.write("counts", {"node": name, **counts}, now)
+
+    def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
+        """Let a message arrive on a side, now; what came over the network is written down."""
+        host = self.hosts[side]
+        arrived = host.clock.at(self.true_ns)
+        row = CHANNELS[channel]
+        if row.carrier != "local":
+            record(host.recorder, channel, payload, arrived)
+        for receiver in row.receivers:
+            running = host.running[receiver]
+            running.inbox.put(Message(channel, payload, arrived, peer))
+            self._poke(running, max(self.true_ns, running.free_ns))
+
+    def _poke(self, running: _Running, true_ns: int) -> None:
+        """Look at a node at `true_ns`, unless it is looked at before anyway."""
+        if running.poke_ns is None or true_ns < running.poke_ns:
+            running.poke_ns = true_ns
+            self.at(true_ns, lambda: self._look(running, true_ns))
+
+    def _look(self, running: _Running, true_ns: int) -> None:
+        if running.poke_ns != true_ns:
+            return  # it was looked at earlier, and has asked anew
+        running.poke_ns = None
+        now = running.host.clock.at(true_ns)
+        wake_ns = running.node.next_wake_ns()
+        if wake_ns is not None and wake_ns <= now.mono_ns:
+            self._walk(running, Message(WAKE, None, now), now)
+        elif (message := running.inbox.take()) is not None:
+            self._walk(running, message, now)
+        elif wake_ns is not None:
+            self._poke(running, running.host.clock.true_ns(wake_ns))
+
+    def _walk(self, running: _Running, message: Message, start: Now) -> None:
+        host, node = running.host, running.node
+        spent_ns = 0
+
+        def after(hop: str, _before: Now) -> Now:
+            nonlocal spent_ns
+            spent_ns += host.costs_ns.get((node.name, hop), 0)
+            return host.clock.at(self.true_ns + spent_ns)
+
+        walked = walk(node.name, node.chains[message.channel], message, start, after)
+        running.free_ns = self.true_ns + spent_ns
+        if walked.timeline is not None:
+            host.recorder.write("timeline", walked.timeline, walked.end)
+        if walked.sends:
+            if spent_ns:
+                self.at(running.free_ns, lambda: self._send_all(host, walked.sends))
+            else:
+                self._send_all(host, walked.sends)
+        self._poke(running, running.free_ns)
+
+    def _send_all(self, host: VirtualHost, sends: Sequence[Send]) -> None:
+        now = host.clock.at(self.true_ns)
+        for send in sends:
+            record(host.recorder, send.channel, send.payload, now)
+            carrier = CHANNELS[send.channel].carrier
+            if carrier == "local":
+                self.deliver(host.side, send.channel, send.payload)
+            elif carrier == "clock":
+                self.deliver(host.side, "clock_report", host.clock_source(self.true_ns))
+            elif carrier != "record":
+                self._carry(host, send)
+
+    def _carry(self, host: VirtualHost, send: Send) -> None:
+        link = self.links[send.channel]
+        link.count += 1
+        if not link.open:
+            return
+        due_ns = link.line.push((send.payload, host.peer), self.true_ns, link.index(send.payload, link.count))
+        other = next(side for side in self.hosts if side != host.side)
+        self.at(due_ns, lambda: self._arrive(link, send.channel, other))
+
+    def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
+        for payload, peer in link.line.pop_due(self.true_ns):
+            self.deliver(side, channel, payload, peer)
+
+
+def modelled_clock_source(
+    clock: HostClock, host: str, error_s: float, bound_s: float
+) -> Callable[[int], ClockReport]:
+    """Model chrony on a virtual host: it reports the truth plus `error_s`, which lies inside its stated `bound_s`."""
+
+    def report(true_ns: int) -> ClockReport:
+        ahead_ns = clock.at(true_ns).wall_ns - (clock.wall_start_ns + true_ns)
+        return ClockReport(host, "model", -ahead_ns / NS_PER_S + error_s, bound_s)
+
+    return report

@@ -1,0 +1,58 @@
+"""One table of all channels: who sends, who listens, what carries it, and what happens to what has to wait."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Carrier = Literal["local", "video", "zenoh", "clock", "record"]
+"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. clock: the host's source
+of clock reports. record: nobody listens, it is written down."""
+
+Waiting = Literal["queue", "newest"]
+"""queue: kept in order, the oldest dropped when full. newest: a new one replaces the one that waits."""
+
+QUEUE_LENGTH = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One row of the table."""
+
+    carrier: Carrier
+    sender: str
+    receivers: tuple[str, ...] = ()
+    waiting: Waiting = "queue"
+
+
+CHANNELS: dict[str, Channel] = {
+    # server, between its nodes
+    "pose": Channel("local", "actuator", ("camera",), "newest"),
+    "frame": Channel("local", "camera", ("actuator",)),
+    "video_token": Channel("local", "actuator", ("camera",)),
+    # client, between its nodes
+    "access_unit": Channel("local", "receiver", ("driver",)),
+    "view": Channel("local", "driver", ("driver",), "newest"),
+    "path_token": Channel("local", "driver", ("receiver",)),
+    # across the network
+    "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
+    "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
+    "control": Channel("zenoh", "driver", ("actuator",)),
+    "state": Channel("zenoh", "actuator", ("driver",), "newest"),
+    "session": Channel("zenoh", "driver", ("actuator",)),
+    "session_reply": Channel("zenoh", "actuator", ("driver",)),
+    # each host and its own clock
+    "clock_query": Channel("clock", "clock_sync"),
+    "clock_report": Channel("local", "clock_source", ("clock_sync",)),
+    # written down only
+    "video": Channel("record", "camera"),
+    "admission": Channel("record", "actuator"),
+    "truth": Channel("record", "actuator"),
+    "route": Channel("record", "actuator"),
+    "event": Channel("record", "actuator"),
+    "picture": Channel("record", "driver"),
+    "lane": Channel("record", "driver"),
+    "clock": Channel("record", "clock_sync"),
+    "counts": Channel("record", "runtime"),
+    "timeline": Channel("record", "runtime"),
+}

@@ -1,0 +1,121 @@
+"""Messages between the two sides: msgpack arrays with a version first, checked before anything else sees them.
+
+A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` refuses whatever is
+too long, not msgpack, of another version or shape, not finite, or out of range, with `BadMessage`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import msgpack
+
+from lavt.domain import PATH_POINTS, Command, SessionReply, SessionRequest, State
+from lavt.errors import BadMessage
+
+VERSION = 1
+MAX_MESSAGE_BYTES = 1024
+NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")
+"""What a vehicle and a client may be called: nothing that means something in a Zenoh key."""
+
+Check = Callable[[Any], bool]
+
+
+def _integer(low: int, high: int) -> Check:
+    return lambda value: type(value) is int and low <= value <= high
+
+
+def _number(low: float, high: float) -> Check:
+    return lambda value: type(value) in (int, float) and math.isfinite(value) and low <= value <= high
+
+
+def _text(longest: int) -> Check:
+    return lambda value: type(value) is str and len(value) <= longest
+
+
+def _one_of(*choices: str) -> Check:
+    return lambda value: type(value) is str and value in choices
+
+
+def _curvatures(value: object) -> bool:
+    bend = _number(-1.0, 1.0)
+    return isinstance(value, list) and len(value) == PATH_POINTS and all(bend(each) for each in value)
+
+
+U64 = _integer(0, 2**64 - 1)
+TIME = _integer(0, 2**63 - 1)
+ROAD_WHEEL = _number(-1.0, 1.0)
+UNIT = _number(0.0, 1.0)
+
+CHECKS: dict[type, dict[str, Check]] = {
+    Command: {
+        "epoch": U64,
+        "sequence": TIME,
+        "sent_wall_ns": TIME,
+        "stamp_ns": TIME,
+        "stamp_received_wall_ns": TIME,
+        "steering_rad": ROAD_WHEEL,
+        "throttle": UNIT,
+        "brake": UNIT,
+        "path_curvature_per_m": _curvatures,
+        "mode": _one_of("arm", "drive", "stop"),
+        "emergency_stop": TIME,
+    },
+    State: {
+        "sent_wall_ns": TIME,
+        "state_mono_ns": TIME,
+        "speed_mps": _number(-100.0, 100.0),
+        "steering_rad": ROAD_WHEEL,
+        "gear": _one_of("park", "reverse", "neutral", "drive"),
+        "safety": _one_of("disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"),
+        "because": _text(200),
+        "applied_sequence": _integer(-1, 2**63 - 1),
+        "refused": _text(200),
+    },
+    SessionRequest: {
+        "operation": _one_of("hold", "release", "emergency_stop", "clear_emergency_stop"),
+        "who": lambda value: type(value) is str and NAME.match(value) is not None,
+        "instance": U64,
+        "number": TIME,
+    },
+    SessionReply: {
+        "granted": lambda value: type(value) is bool,
+        "because": _text(200),
+        "epoch": U64,
+        "token": lambda value: type(value) is bytes and len(value) in (0, 16),
+        "video_port": _integer(0, 65535),
+        "host": _text(64),
+        "emergency_stop": TIME,
+    },
+}
+
+Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply)
+
+
+def encode(message: Command | State | SessionRequest | SessionReply) -> bytes:
+    """Put `message` into bytes for the wire."""
+    packed: bytes = msgpack.packb([VERSION, *(getattr(message, field.name) for field in fields(message))])
+    return packed
+
+
+def decode(kind: type[Kind], data: bytes) -> Kind:
+    """Read a message of class `kind`; raises `BadMessage` for anything that is not one, and nothing else."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise BadMessage(f"{len(data)} bytes are more than a message may have ({MAX_MESSAGE_BYTES})")
+    try:
+        values = msgpack.unpackb(data, use_list=True, raw=False, strict_map_key=True)
+    except Exception as error:  # the parser has half a dozen kinds of error, and bytes from outside may cause any
+        raise BadMessage("not msgpack") from error
+    checks = CHECKS[kind]
+    if not isinstance(values, list) or len(values) != 1 + len(checks):
+        raise BadMessage(f"not the shape of a {kind.__name__}")
+    if type(values[0]) is not int or values[0] != VERSION:
+        raise BadMessage("a message of another version")
+    for (name, check), value in zip(checks.items(), values[1:], strict=True):
+        if not check(value):
+            raise BadMessage(f"{kind.__name__}.{name} is out of range")
+    return kind(*(tuple(value) if isinstance(value, list) else value for value in values[1:]))

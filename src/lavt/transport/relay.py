@@ -1,0 +1,234 @@
+"""Delay without netem: a process with one thread that carries two UDP flows and holds back what the design names.
+
+Video, server to client: RTP and sender reports wait; the rest of that flow (challenges) does not. Control: what the
+client's router sends to the server's waits; what comes back waits only where the state is to be delayed too. Nothing
+upstream of the video (hellos, RTCP) ever waits.
+"""
+
+from __future__ import annotations
+
+import heapq
+import selectors
+import socket
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from lavt.clock import Clock
+from lavt.domain import NS_PER_S
+from lavt.errors import UserError
+from lavt.transport.delay import DelayLaw, DelayLine
+
+LONGEST_DATAGRAM = 65_535
+BUFFER_BYTES = 4 * 1024 * 1024
+LONGEST_PAUSE_S = 0.05
+CLIENT_SILENCE_NS = 30 * NS_PER_S
+"""A client that sent nothing for so long loses its socket."""
+
+Address = tuple[str, int]
+NONE = DelayLaw(0.0)
+
+
+def is_delayed_video(datagram: bytes) -> bool:
+    """Whether a datagram from the server is RTP or RTCP (version 2) and not part of proving the path."""
+    return len(datagram) >= 2 and datagram[0] >> 6 == 2
+
+
+def video_index(datagram: bytes) -> int:
+    """Index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay."""
+    return int(struct.unpack_from(">I", datagram, 4)[0]) if len(datagram) >= 8 else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """One UDP flow through the relay: where clients reach it, where the server is, and what waits in each direction."""
+
+    name: str
+    listen: Address
+    server: Address
+    upstream: DelayLaw
+    downstream: DelayLaw
+    held_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    index_downstream: Callable[[bytes], int] | None = None
+    """From a datagram to the index of its delay; None: datagrams are counted."""
+
+
+@dataclass
+class _Way:
+    """One direction of a client's flow: its delay line, and how what comes out of it is sent."""
+
+    line: DelayLine
+    send: Callable[[bytes], object]
+    index: Callable[[bytes], int] | None
+    held: Callable[[bytes], bool]
+    count: int = 0
+    in_heap: bool = False
+
+
+@dataclass
+class _Client:
+    """A client of a flow: the socket that stands for it towards the server."""
+
+    upstream_socket: socket.socket
+    up: _Way
+    down: _Way
+    heard_ns: int
+
+
+class Relay:
+    """Carries flows, one upstream socket for each client, in one thread."""
+
+    def __init__(self, clock: Clock, flows: list[Flow]) -> None:
+        self._clock = clock
+        self._selector = selectors.DefaultSelector()
+        self._heap: list[tuple[int, int, _Way]] = []
+        self._number = 0
+        self.not_sent = 0
+        self._flows = [_OpenFlow(self, flow) for flow in flows]
+
+    def ports(self) -> dict[str, int]:
+        """Tell the port that was opened for each flow."""
+        return {each.flow.name: each.port for each in self._flows}
+
+    def step(self) -> None:
+        """Wait for what comes first, a datagram or one that is due, and deal with it."""
+        self._release()
+        pause_s = LONGEST_PAUSE_S
+        if self._heap:
+            pause_s = max(0.0, min(pause_s, (self._heap[0][0] - self._clock.now().mono_ns) / NS_PER_S))
+        for key, _events in self._selector.select(pause_s):
+            key.data()
+        self._release()
+
+    def close(self) -> None:
+        """Close all sockets; what waits is lost."""
+        for each in self._flows:
+            each.close()
+        self._selector.close()
+
+    def watch(self, opened: socket.socket, ready: Callable[[], None]) -> None:
+        """Call `ready` when a socket has something."""
+        opened.setblocking(False)
+        self._selector.register(opened, selectors.EVENT_READ, ready)
+
+    def unwatch(self, opened: socket.socket) -> None:
+        """Forget a socket and close it."""
+        self._selector.unregister(opened)
+        opened.close()
+
+    def now_ns(self) -> int:
+        """Read the monotonic clock."""
+        return self._clock.now().mono_ns
+
+    def pass_on(self, way: _Way, datagram: bytes) -> None:
+        """Send a datagram its way, at once or when it is due."""
+        if not way.held(datagram):
+            self._send(way, datagram)
+            return
+        way.count += 1
+        index = way.count if way.index is None else way.index(datagram)
+        way.line.push(datagram, self.now_ns(), index)
+        self._schedule(way)
+
+    def _schedule(self, way: _Way) -> None:
+        due_ns = way.line.next_due_ns()
+        if due_ns is not None and not way.in_heap:
+            self._number += 1
+            way.in_heap = True
+            heapq.heappush(self._heap, (due_ns, self._number, way))
+
+    def _release(self) -> None:
+        while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
+            _, _, way = heapq.heappop(self._heap)
+            way.in_heap = False
+            for datagram in way.line.pop_due(now_ns):
+                self._send(way, datagram)
+            self._schedule(way)
+
+    def _send(self, way: _Way, datagram: bytes) -> None:
+        try:
+            way.send(datagram)
+        except OSError:  # the other end is not there, or its buffer is full: as on any network, it is lost
+            self.not_sent += 1
+
+
+class _OpenFlow:
+    """A flow at work: the socket that clients reach, and what is known of each of them."""
+
+    def __init__(self, relay: Relay, flow: Flow) -> None:
+        self.flow = flow
+        self._relay = relay
+        self._clients: dict[Address, _Client] = {}
+        self._socket = _bound_socket(flow.listen, flow.name)
+        self.port = int(self._socket.getsockname()[1])
+        relay.watch(self._socket, self._from_clients)
+
+    def close(self) -> None:
+        for client in self._clients.values():
+            self._relay.unwatch(client.upstream_socket)
+        self._relay.unwatch(self._socket)
+
+    def _from_clients(self) -> None:
+        for datagram, address in _drain(self._socket):
+            client = self._clients.get(address) or self._new_client(address)
+            client.heard_ns = self._relay.now_ns()
+            self._relay.pass_on(client.up, datagram)
+
+    def _new_client(self, address: Address) -> _Client:
+        self._forget_silent()
+        towards_server = _bound_socket(("", 0), self.flow.name)
+        flow = self.flow
+        client = _Client(
+            towards_server,
+            _Way(DelayLine(flow.upstream), lambda data: towards_server.sendto(data, flow.server), None, _always),
+            _Way(
+                DelayLine(flow.downstream), lambda data: self._socket.sendto(data, address), flow.index_downstream,
+                flow.held_downstream,
+            ),
+            self._relay.now_ns(),
+        )  # fmt: skip
+        self._clients[address] = client
+        self._relay.watch(towards_server, lambda: self._from_server(client))
+        return client
+
+    def _from_server(self, client: _Client) -> None:
+        for datagram, address in _drain(client.upstream_socket):
+            if address == self.flow.server:
+                self._relay.pass_on(client.down, datagram)
+
+    def _forget_silent(self) -> None:
+        now_ns = self._relay.now_ns()
+        for address, client in list(self._clients.items()):
+            if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
+                self._relay.unwatch(self._clients.pop(address).upstream_socket)
+
+
+def _always(_datagram: bytes) -> bool:
+    return True
+
+
+def _bound_socket(address: Address, name: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        opened.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+    try:
+        opened.bind(address)
+    except OSError as error:
+        opened.close()
+        raise UserError(
+            f"the relay's {name} port {address[0]}:{address[1]} cannot be opened ({error.strerror}): name another, or 0"
+        ) from error
+    return opened
+
+
+def _drain(opened: socket.socket) -> list[tuple[bytes, Address]]:
+    """Take all datagrams that wait, up to a number that lets the other sockets have their turn."""
+    datagrams = []
+    for _ in range(64):
+        try:
+            datagrams.append(opened.recvfrom(LONGEST_DATAGRAM))
+        except BlockingIOError:
+            break
+        except OSError:  # an ICMP error of an earlier datagram
+            continue
+    return datagrams

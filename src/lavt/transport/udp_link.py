@@ -1,0 +1,111 @@
+"""The video's UDP sockets, one on each side, with the kernel's time of arrival."""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from lavt.clock import Clock
+from lavt.domain import NS_PER_S, Now
+from lavt.errors import UserError
+from lavt.node import Send
+
+Deliver = Callable[[str, Any, Now, Any], None]
+"""(channel, payload, arrived, peer): what a link does with what comes in."""
+
+SO_TIMESTAMPNS = 35
+"""Linux: time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; `socket` does not name it."""
+RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
+LONGEST_DATAGRAM = 65_535
+QUEUED_LONGEST_NS = 10 * NS_PER_S
+"""A kernel's stamp further back than this is not believed: the wall clock was stepped in between."""
+
+
+class UdpLink:
+    """A UDP socket and a thread that receives.
+
+    `channel` names what comes in. `peer` of what goes out is an address, or for a client, whose server is known by
+    `remote`, the port (0: the one in `remote`).
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        channel: str,
+        deliver: Deliver,
+        *,
+        bind: tuple[str, int],
+        remote: tuple[str, int] | None = None,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._clock = clock
+        self._channel = channel
+        self._deliver = deliver
+        self._remote = remote
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        try:
+            self._socket.bind(bind)
+        except OSError as error:
+            self._socket.close()
+            raise UserError(
+                f"the video port {bind[0]}:{bind[1]} cannot be opened ({error.strerror}): choose another, or 0 for any"
+            ) from error
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
+
+    @property
+    def port(self) -> int:
+        """The port that was opened."""
+        return int(self._socket.getsockname()[1])
+
+    def start(self) -> None:
+        """Begin to receive."""
+        self._thread.start()
+
+    def send(self, send: Send) -> None:
+        """Send a datagram; what the network refuses is counted."""
+        address = send.peer
+        if self._remote is not None:
+            address = (self._remote[0], self._remote[1] or send.peer)
+        try:
+            self._socket.sendto(send.payload, address)
+        except OSError:
+            self.counts["datagrams_not_sent"] += 1
+
+    def close(self) -> None:
+        """Stop receiving and close the socket."""
+        self._wake_writer.send(b"x")
+        if self._thread.is_alive():
+            self._thread.join()
+        for each in (self._socket, self._wake_reader, self._wake_writer):
+            each.close()
+
+    def _receive(self) -> None:
+        while True:
+            ready, _, _ = select.select((self._socket, self._wake_reader), (), ())
+            if self._wake_reader in ready:
+                return
+            try:
+                datagram, ancillary, _flags, address = self._socket.recvmsg(LONGEST_DATAGRAM, 64)
+            except OSError:  # an ICMP error of an earlier datagram
+                self.counts["datagrams_refused"] += 1
+                continue
+            self._deliver(self._channel, datagram, self._arrival(ancillary), address)
+
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> Now:
+        """Bring the kernel's stamp, which is wall time, to both clocks; without one it is now."""
+        now = self._clock.now()
+        for level, kind, data in ancillary:
+            if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= 16:
+                seconds, nanoseconds = struct.unpack_from("qq", data)
+                queued_ns = now.wall_ns - (seconds * NS_PER_S + nanoseconds)
+                if 0 <= queued_ns < QUEUED_LONGEST_NS:
+                    return now.later(-queued_ns)
+        return now

@@ -1,0 +1,188 @@
+"""Commands, state and session over Zenoh; the only module that knows it.
+
+Each side has a session to a router on its own machine; the routers talk to each other. Zenoh is not trusted with safety:
+after an outage it may deliver seconds of old commands, and its liveliness is as slow as its lease (see the safety gate).
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import zenoh
+
+from lavt.clock import Clock
+from lavt.domain import Now
+from lavt.errors import UserError, WorkError
+from lavt.node import Send
+from lavt.transport.messages import NAME
+
+Deliver = Callable[[str, Any, Now, Any], None]
+
+REPLY_TIMEOUT_S = 2.0
+ROUTER_READY_S = 5.0
+CONTROL = {
+    "congestion_control": zenoh.CongestionControl.DROP,
+    "priority": zenoh.Priority.REAL_TIME,
+    "express": True,
+    "reliability": zenoh.Reliability.BEST_EFFORT,
+}
+"""A command that is late is worthless: never re-sent, never blocked, never batched, before everything else."""
+STATE = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
+
+
+def quiet_logs() -> None:
+    """Let Zenoh log errors only (it logs to standard output), unless RUST_LOG says otherwise."""
+    zenoh.init_log_from_env_or("error")
+
+
+def check_name(what: str, name: str) -> str:
+    """Return `name` if it may be part of a key; raises `UserError` otherwise, and says what `what` may be called."""
+    if not NAME.match(name):
+        raise UserError(
+            f"{what} {name!r} cannot be part of a Zenoh key: use 1 to 32 letters, digits, _ or -, a letter or digit first"
+        )
+    return name
+
+
+def _load(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
+    """Read a config file and set `overrides` (keys with slashes) in it."""
+    if not path.is_file():
+        raise UserError(f"there is no Zenoh config {path}: the shipped ones are in zenoh-configs/")
+    try:
+        config = zenoh.Config.from_file(str(path))
+        for key, value in overrides.items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise UserError(f"{path} is not a Zenoh config: {_plain(error)}") from error
+    return config
+
+
+def _plain(error: Exception) -> str:
+    """Error text of Zenoh without the places in its own source."""
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))
+
+
+class Router:
+    """A Zenoh router in this process, from a config file with `mode: "router"`."""
+
+    def __init__(self, path: Path, overrides: Mapping[str, Any]) -> None:
+        config = _load(path, overrides)
+        if json.loads(config.get_json("mode")) != "router":
+            raise UserError(f'{path} is not the config of a router: it must say mode: "router"')
+        if not json.loads(config.get_json("listen/endpoints")):
+            raise UserError(f"{path} names no listen endpoints; without them Zenoh would listen on all interfaces")
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise UserError(f"the router of {path} does not start: {_plain(error)}; name other endpoints") from error
+
+    def locators(self) -> list[str]:
+        """Where it listens, with the real port where the config said 0."""
+        selector = f"@/{self._session.info.zid()}/router"
+        for reply in self._session.get(selector, timeout=ROUTER_READY_S):
+            if reply.ok is not None:
+                locators: list[str] = json.loads(reply.ok.payload.to_string())["locators"]
+                return locators
+        raise WorkError("the router does not tell where it listens: its config must enable adminspace")
+
+    def close(self) -> None:
+        """Stop routing."""
+        self._session.close()
+
+
+class ZenohLink:
+    """One side's session: publishes and subscribes what the side sends and hears, and carries the session query."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        deliver: Deliver,
+        *,
+        side: Literal["server", "client"],
+        path: Path,
+        router: str,
+        vehicle: str,
+        who: str,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._clock = clock
+        self._deliver = deliver
+        self._side = side
+        self._base = f"lavt/{check_name('the vehicle', vehicle)}"
+        self._who = check_name("the client", who)
+        self._queries: dict[int, zenoh.Query] = {}
+        self._number = itertools.count()
+        config = _load(path, {"connect/endpoints": [router]} if router else {})
+        endpoints = json.loads(config.get_json("connect/endpoints"))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise UserError(
+                f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or name another ({_plain(error)})"
+            ) from error
+        self._declared: list[Any] = []
+
+    def start(self) -> None:
+        """Begin to send and to hear; from here on messages are delivered."""
+        heard, said, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
+        listener = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
+        self._publisher = self._session.declare_publisher(f"{self._base}/{said}", **qos)
+        self._declared.append(self._session.declare_subscriber(f"{self._base}/{heard}", listener))
+        if self._side == "server":
+            asked = zenoh.handlers.Callback(self._asked, indirect=False)
+            self._declared.append(self._session.declare_queryable(f"{self._base}/session", asked))
+        self._declared.append(self._session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
+
+    def send(self, send: Send) -> None:
+        """Carry a message of this side; what cannot be sent now is counted, for there is always a newer one."""
+        try:
+            if send.channel == "session":
+                self._ask(send.payload)
+            elif send.channel == "session_reply":
+                self._reply(send.peer, send.payload)
+            else:
+                self._publisher.put(send.payload)
+        except zenoh.ZError:
+            self.counts[f"{send.channel}_not_sent"] += 1
+
+    def close(self) -> None:
+        """Leave: without it the process would not end."""
+        for declared in self._declared:
+            declared.undeclare()
+        self._session.close()
+
+    def _hear(self, channel: str, sample: zenoh.Sample) -> None:
+        self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
+
+    def _ask(self, payload: bytes) -> None:
+        answered = zenoh.handlers.Callback(self._answered, indirect=False)
+        self._session.get(
+            f"{self._base}/session", answered, payload=payload, timeout=REPLY_TIMEOUT_S,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )  # fmt: skip
+
+    def _answered(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._deliver("session_reply", reply.ok.payload.to_bytes(), self._clock.now(), None)
+        else:
+            self.counts["session_unanswered"] += 1
+
+    def _asked(self, query: zenoh.Query) -> None:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        number = next(self._number)
+        self._queries[number] = query
+        while len(self._queries) > 64:  # nobody answers what cannot be read: let the oldest go
+            self._queries.pop(next(iter(self._queries))).drop()
+        self._deliver("session", payload, self._clock.now(), number)
+
+    def _reply(self, number: int, payload: bytes) -> None:
+        query = self._queries.pop(number, None)
+        if query is not None:
+            query.reply(f"{self._base}/session", payload)
+            query.drop()
