@@ -77,6 +77,8 @@ class ControllerConfig(Section):
 
     kind: str = "lane_keeper"
     preset: str = "designed"
+    wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
+    """Of the vehicle that is driven; the built-in car's."""
     rearm: bool = False
     """Arm again by itself after a safe stop."""
 

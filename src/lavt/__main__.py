@@ -1,0 +1,5 @@
+"""`python -m lavt` is `lavt`."""
+
+from lavt.cli.main import main
+
+main()

@@ -1,0 +1,40 @@
+"""`lavt client`: the remote side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lavt.build import MachineEntropy, build_client
+from lavt.cli import console
+from lavt.cli.side import Side, run_side
+from lavt.clock import MachineClock
+from lavt.config import ClientConfig, load_config
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("client")(client)
+
+
+def client(
+    config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
+    out: console.Out = None,
+    changes: console.Set = None,
+    as_json: console.Json = False,
+) -> None:
+    """Ask for the vehicle, arm it, and drive it by the video that comes.
+
+    Example: lavt client configs/client.yaml --set video.server=192.0.2.7
+    """
+    console.keep_stdout_for_results()
+    settings = load_config(ClientConfig, config, changes or [])
+    clock = MachineClock()
+    with Side(
+        "client", settings, out, clock, vehicle=settings.vehicle_id, who=settings.who, zenoh=settings.zenoh
+    ) as side:
+        side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
+        nodes = build_client(settings, clock.now, MachineEntropy())
+        run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)

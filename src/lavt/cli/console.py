@@ -1,0 +1,70 @@
+"""What all commands share: results on standard output, messages on standard error, exit codes, and a clean end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lavt.errors import LavtError, UserError
+
+Out = Annotated[Path | None, typer.Option(help="Directory for what is written.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Change a config value: a.b=value, as often as needed.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+
+
+def say(text: str) -> None:
+    """Print a message for the user to standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def show(text: str) -> None:
+    """Print a result to standard output."""
+    print(text, flush=True)
+
+
+def show_json(value: Any) -> None:
+    """Print a result as one line of JSON."""
+    show(json.dumps(value, allow_nan=False))
+
+
+def keep_stdout_for_results() -> None:
+    """Send what libraries write to standard output (Zenoh's log) to standard error; `show` still writes to the old one."""
+    results = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    sys.stdout = results
+
+
+def run_command(command: Callable[[], None]) -> None:
+    """Run a command and end the process: 0 it did its job, 2 the input was wrong, 1 the work failed."""
+    try:
+        command()
+    except UserError as error:
+        say(f"lavt: {error}")
+        raise SystemExit(2) from None
+    except LavtError as error:
+        say(f"lavt: {error}")
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        say("lavt: stopped; what was finished is kept")
+        raise SystemExit(1) from None
+
+
+@contextmanager
+def until_told() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C (SIGINT) or SIGTERM sets, for programs that run until they are told to stop."""
+    told = threading.Event()
+    before = {number: signal.signal(number, lambda *_: told.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield told
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,41 @@
+"""`lavt`: the table of commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import lavt
+from lavt.cli import client, console, demo, relay, report, router, run, server, sweep
+
+app = typer.Typer(
+    name="lavt",
+    help="Measures what network delay does to driving by video.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for command in (demo, run, sweep, report, server, client, router, relay):
+    command.register(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        console.show(f"lavt {lavt.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[  # noqa: ARG001 (typer calls _version with it)
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Measures what network delay does to driving by video."""
+
+
+def main() -> None:
+    """Run the command line; the exit code is that of the command."""
+    console.run_command(app)

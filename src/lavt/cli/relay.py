@@ -1,0 +1,78 @@
+"""`lavt relay`: delay without netem and without root."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lavt.build import parse_address
+from lavt.cli import console
+from lavt.clock import MachineClock
+from lavt.config import DelayConfig, RelayConfig, load_config
+from lavt.errors import UserError
+from lavt.transport.delay import DelayLaw, Lognormal
+from lavt.transport.relay import NONE, Flow, Relay, is_delayed_video, video_index
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("relay")(relay)
+
+
+def relay(
+    config: Annotated[Path, typer.Argument(help="A relay config in YAML.")],
+    changes: console.Set = None,
+    as_json: console.Json = False,
+) -> None:
+    """Carry video and control between two sides and hold back what the config says, until Ctrl-C.
+
+    Example: lavt relay configs/relay.yaml --set video.constant_ms=75
+    """
+    settings = load_config(RelayConfig, config, changes or [])
+    opened = Relay(MachineClock(), flows(settings))
+    with console.until_told() as told:
+        ports = opened.ports()
+        if as_json:
+            console.show_json({"ports": ports})
+        else:
+            console.show(f"relaying video at port {ports['video']} and control at port {ports['control']}; Ctrl-C ends it")
+        while not told.is_set():
+            opened.step()
+    opened.close()
+
+
+def flows(config: RelayConfig) -> list[Flow]:
+    """Give the two flows that are relayed; raises `UserError` for addresses that cannot be used."""
+    seed = config.seed
+    return [
+        Flow(
+            "video", _resolved("video_listen", config.video_listen), _resolved("video_server", config.video_server),
+            upstream=NONE, downstream=_law(config.video, seed, "video inherent"),
+            held_downstream=is_delayed_video, index_downstream=video_index,
+        ),
+        Flow(
+            "control", _resolved("control_listen", config.control_listen),
+            _resolved("control_server", config.control_server),
+            upstream=_law(config.control, seed, "control inherent"),
+            downstream=_law(config.state, seed, "state inherent"),
+        ),
+    ]  # fmt: skip
+
+
+def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
+    jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
+    return DelayLaw(config.constant_ms, jitter, seed, name)
+
+
+def _resolved(key: str, text: str) -> tuple[str, int]:
+    """Read an address and look its host up, once: datagrams are compared with the numeric address."""
+    if text.startswith(("tcp/", "tls/", "quic/")):
+        raise UserError(f"{key}: the relay carries UDP only, not {text!r}: let the routers talk by udp/...?rel=1;mixed_rel=1")
+    host, port = parse_address(key, text)
+    try:
+        return socket.gethostbyname(host), port
+    except OSError as error:
+        raise UserError(f"{key}: the host {host!r} is not known ({error.strerror})") from error

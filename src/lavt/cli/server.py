@@ -1,0 +1,42 @@
+"""`lavt server`: the vehicle's side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lavt.build import MachineEntropy, build_server
+from lavt.cli import console
+from lavt.cli.side import Side, run_side
+from lavt.clock import MachineClock
+from lavt.config import ServerConfig, load_config
+from lavt.transport.clock_offset import kernel_identity
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("server")(server)
+
+
+def server(
+    config: Annotated[Path, typer.Argument(help="A server config in YAML, such as configs/server.yaml.")],
+    out: console.Out = None,
+    changes: console.Set = None,
+    once: Annotated[bool, typer.Option("--once", help="End when the first drive has ended.")] = False,
+    as_json: console.Json = False,
+) -> None:
+    """Stream the camera, obey the client that holds the vehicle, and stop it when no good command comes.
+
+    Example: lavt server configs/server.yaml --out out/server
+    """
+    console.keep_stdout_for_results()
+    settings = load_config(ServerConfig, config, changes or [])
+    clock = MachineClock()
+    with Side(
+        "server", settings, out, clock, vehicle=settings.vehicle_id, who="server", zenoh=settings.zenoh
+    ) as side:
+        port = side.open_video("feedback", bind=(settings.video.bind, settings.video.port))
+        nodes = build_server(settings, clock.now, MachineEntropy(), host=kernel_identity(), video_port=port)
+        run_side(side, nodes.all, once=once, as_json=as_json, ready={"video_port": port})

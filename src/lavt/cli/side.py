@@ -1,0 +1,138 @@
+"""What `lavt server` and `lavt client` share: links, record, runtime, and the lines they print."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel
+
+from lavt.cli import console
+from lavt.cli.router import find
+from lavt.clock import MachineClock
+from lavt.config import ZenohConfig
+from lavt.domain import Now
+from lavt.errors import WorkError
+from lavt.experiment.live import LiveTap
+from lavt.experiment.record import RecordWriter
+from lavt.node import Node
+from lavt.nodes.client_session import ClientSession
+from lavt.runtime.realtime import RealRuntime
+from lavt.runtime.recording import QueuedRecorder, Recorder
+from lavt.transport.clock_offset import read_clock
+from lavt.transport.udp_link import UdpLink
+from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+
+STATUS_PERIOD_S = 0.2
+VERSIONED = ("lavt", "numpy", "opencv-python-headless", "av", "eclipse-zenoh")
+
+
+class NoRecorder:
+    """Keeps nothing."""
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Forget one entry."""
+
+
+class Side:
+    """One side's links and record, opened before its nodes are built and closed after its runtime has ended."""
+
+    def __init__(
+        self,
+        name: Literal["server", "client"],
+        config: BaseModel,
+        out: Path | None,
+        clock: MachineClock,
+        *,
+        vehicle: str,
+        who: str,
+        zenoh: ZenohConfig,
+    ) -> None:
+        self.clock = clock
+        self.runtime: RealRuntime | None = None
+        self._writer: RecordWriter | None = None
+        self._queue: QueuedRecorder | None = None
+        self._udp: UdpLink | None = None
+        quiet_logs()
+        self._zenoh = ZenohLink(
+            clock, self._deliver, side=name, path=find(Path(zenoh.session)), router=zenoh.router, vehicle=vehicle, who=who
+        )
+        recorder: Recorder = NoRecorder()
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+            self._writer = RecordWriter(out / f"{name}.mcap", name)
+            self._writer.annotate("versions", {each: version(each) for each in VERSIONED})
+            self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
+            recorder = self._queue = QueuedRecorder(self._writer)
+        self.tap = LiveTap(recorder)
+
+    def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
+        """Open the video's socket, whose datagrams come in on `channel`, and tell its port."""
+        self._udp = UdpLink(self.clock, channel, self._deliver, bind=bind, remote=remote)
+        return self._udp.port
+
+    def start(self, nodes: Sequence[Node]) -> RealRuntime:
+        """Start the runtime, then let messages in."""
+        assert self._udp is not None, "the video is opened before the nodes are built"  # noqa: S101
+        self.runtime = RealRuntime(self.clock, nodes, self.tap, read_clock)
+        self._zenoh.start()
+        self.runtime.start({"video": self._udp, "zenoh": self._zenoh})
+        self._udp.start()
+        return self.runtime
+
+    def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        if self.runtime is not None and not self.runtime.stopped.is_set():
+            self.runtime.deliver(channel, payload, arrived, peer)
+
+    def __enter__(self) -> Side:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        if self.runtime is not None:
+            self.runtime.stop()
+        if self._udp is not None:
+            self._udp.close()
+        self._zenoh.close()
+        if self._queue is not None and self._writer is not None:
+            self._queue.close(self.clock.now())
+            self._writer.close()
+
+
+def run_side(
+    side: Side,
+    nodes: Sequence[Node],
+    *,
+    once: bool,
+    as_json: bool,
+    ready: Mapping[str, Any],
+    session: ClientSession | None = None,
+) -> None:
+    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print what happens."""
+    told_state = ""
+    with console.until_told() as told:
+        runtime = side.start(nodes)
+        if as_json:
+            console.show_json({"ready": dict(ready)})
+        while not told.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
+            status = side.tap.status()
+            if session is not None:
+                status |= {"phase": session.phase, "session": session.because}
+            if as_json:
+                console.show_json({"status": status, "ending": side.tap.ending})
+            elif (state := f"{status.get('safety', 'waiting')}: {status.get('because', '')}") != told_state:
+                console.show(state)
+                told_state = state
+            if once and side.tap.ending is not None:
+                break
+    if runtime.failed is not None:
+        raise WorkError(f"stopped because a part failed: {runtime.failed}")
+
+

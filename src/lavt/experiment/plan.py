@@ -1,0 +1,84 @@
+"""From a config to the runs it asks for, each with its name, its whole config and its identity."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lavt.build import run_seed
+from lavt.config import RunConfig, SweepConfig, condition, parse_config
+from lavt.errors import UserError
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRun:
+    """One run: `identity` is what its entry in the summary begins with, `seed` is the run's own."""
+
+    name: str
+    config: RunConfig
+    identity: Mapping[str, Any]
+    seed: int
+
+
+def plan_run(config: RunConfig, *, name: str = "run", repetition: int = 0, axes: Mapping[str, Any] | None = None) -> PlannedRun:
+    """Plan one run; raises `UserError` for a condition that does not exist."""
+    asked = condition(config.network.condition)
+    seed = run_seed(config.seed, config.vehicle.route, repetition)
+    identity = {
+        "run": name,
+        "time": config.time,
+        "injection": "model" if config.time == "virtual" else config.network.injection,
+        "inherent": config.network.inherent,
+        "route": config.vehicle.route,
+        "condition": config.network.condition,
+        "controller": config.controller.kind,
+        "preset": config.controller.preset,
+        "driver": config.controller.kind,
+        "participant": config.study.participant,
+        "block": config.study.block,
+        "order": config.study.order,
+        "repetition": repetition,
+        "seed": seed,
+        "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
+        **({"axes": dict(axes)} if axes else {}),
+    }
+    return PlannedRun(name, config, identity, seed)
+
+
+def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
+    """Plan every route under every condition, repeated, over every combination of the further axes."""
+    base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetitions", "axes"})
+    runs = []
+    for values in itertools.product(*sweep.axes.values()):
+        axes = dict(zip(sweep.axes, values, strict=True))
+        for route, name, repetition in itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions)):
+            changes = {"vehicle.route": route, "network.condition": name, **axes}
+            config = parse_config(RunConfig, _changed(base, changes), "the sweep")
+            runs.append(plan_run(config, name=_name(route, name, repetition, axes), repetition=repetition, axes=axes))
+    return runs
+
+
+def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
+    parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
+    return "_".join("".join(c if c.isalnum() or c in "=.-_" else "-" for c in part) for part in parts)
+
+
+def _changed(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy nested sections with some values changed; raises `UserError` for a section that does not exist."""
+    result = dict(base)
+    for key, value in changes.items():
+        _change(result, key.split("."), value, key)
+    return result
+
+
+def _change(section: dict[str, Any], path: Sequence[str], value: Any, key: str) -> None:
+    if len(path) == 1:
+        section[path[0]] = value
+        return
+    inner = section.get(path[0])
+    if not isinstance(inner, Mapping):
+        raise UserError(f"the axis {key!r} names no config value: write it as in the config, such as video.bit_rate_bps")
+    section[path[0]] = dict(inner)
+    _change(section[path[0]], path[1:], value, key)

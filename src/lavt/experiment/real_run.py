@@ -1,0 +1,142 @@
+"""One run in real time on this machine: two routers, a relay, a server and a client, each a process of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+
+from lavt.clock import Clock, MachineClock, pause
+from lavt.config import DelayConfig, RelayConfig, condition
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.errors import WorkError
+from lavt.experiment.network import injected_network
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.processes import Process, Processes
+from lavt.experiment.sides import client_config, server_config
+from lavt.experiment.virtual_run import read_costs
+from lavt.transport.delay import DelayLaw
+
+LOCAL_TCP = "tcp/127.0.0.1:0"
+LOCAL_UDP = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
+BEGIN_S = 40
+"""The drive has begun by then, or the run has failed."""
+LONGEST_S = 900
+STATUS_PERIOD_NS = 200 * NS_PER_MS
+
+Progress = Callable[[dict[str, Any], dict[str, Any]], None]
+"""(status of the server, status of the client), several times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """The processes of a run. With the relay, the client's side knows nothing of the server's ports but through it."""
+
+    server_router: Process
+    server: Process
+    relay: Process | None
+    client_router: Process
+    client: Process
+
+
+def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path, *, rearm: bool = False) -> Loop:
+    """Start everything in order, each part told the ports of those before; records go into `out`."""
+    run = planned.config
+    server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", [])
+    server = processes.start(
+        "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)), "--once",
+        "--out", str(out / "server"),
+    )  # fmt: skip
+    video_port = server.ready()["ready"]["video_port"]
+    relay = None
+    control_port = int(remote.partition("?")[0].rpartition(":")[2])
+    if run.network.injection == "relay":
+        relay = processes.start("relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port)))
+        ports = relay.ready()["ports"]
+        video_port, control_port = ports["video"], ports["control"]
+    dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
+    client_router, local, _ = _start_router(processes, "client-router", "router-client.json5", [dialled])
+    config = client_config(run, router=local, video_port=video_port)
+    config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
+    client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
+    client.ready()
+    return Loop(server_router, server, relay, client_router, client)
+
+
+def drive_real(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None
+) -> None:
+    """Drive once, leaving the two records in `out`; raises `WorkError` where a part ends or nobody gets to drive."""
+    clock = clock or MachineClock()
+    with TemporaryDirectory(prefix="lavt-") as folder:
+        work = Path(folder)
+        with Processes(work) as processes:
+            loop = start_loop(processes, planned, work, work)
+            _wait_for_the_end(processes, loop, clock, progress)
+            loop.client.end()
+            loop.server.end()
+        for side in ("server", "client"):
+            (work / side / f"{side}.mcap").replace(out / f"{side}.mcap")
+
+
+def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: Progress | None) -> None:
+    start_ns = clock.now().mono_ns
+    while loop.server.running and loop.server.latest.get("ending") is None:
+        gone_s = (clock.now().mono_ns - start_ns) / NS_PER_S
+        status = loop.server.latest.get("status", {})
+        ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
+        if ended is not None:
+            raise WorkError(f"{ended.name} ended in the middle of the run: {ended.said()}")
+        if gone_s > LONGEST_S or (gone_s > BEGIN_S and status.get("safety") in (None, "disarmed", "arming")):
+            raise WorkError(f"the drive did not begin or end within {gone_s:.0f} s: {loop.client.latest} {status}")
+        if progress is not None:
+            progress(status, loop.client.latest.get("status", {}))
+        pause(STATUS_PERIOD_NS)
+    if loop.server.popen.poll() not in (None, 0):
+        raise WorkError(f"the server failed: {loop.server.said()}")
+
+
+def _start_router(processes: Processes, name: str, file: str, dialled: list[str]) -> tuple[Process, str, str]:
+    """Start a router on free ports and tell its local and, for the server's, its remote endpoint."""
+    listen = [LOCAL_TCP] if dialled else [LOCAL_TCP, LOCAL_UDP]
+    router = processes.start(
+        name, "router", f"zenoh-configs/{file}", "--set", f"listen.endpoints={yaml.safe_dump(listen, default_flow_style=True).strip()}",
+        "--set", f"connect.endpoints={yaml.safe_dump(dialled, default_flow_style=True).strip()}",
+    )  # fmt: skip
+    locators = router.ready()["locators"]
+    local = next(each for each in locators if each.startswith("tcp/"))
+    return router, local, next((each for each in locators if each.startswith("udp/")), "")
+
+
+def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
+    network = planned.config.network
+    injected = injected_network(
+        network.inherent, condition(network.condition), read_costs(), planned.seed, state_delay=network.state_delay
+    )
+    return RelayConfig(
+        video_server=f"127.0.0.1:{video_port}",
+        control_server=f"127.0.0.1:{control_port}",
+        video=_delay(injected.video),
+        control=_delay(injected.control),
+        state=_delay(injected.state),
+        seed=planned.seed,
+    )
+
+
+def _delay(law: DelayLaw) -> DelayConfig:
+    if law.jitter is None:
+        return DelayConfig(constant_ms=law.constant_ms)
+    return DelayConfig(
+        constant_ms=law.constant_ms, jitter_median_ms=law.jitter.median_ms, jitter_sigma=law.jitter.sigma
+    )
+
+
+def _write(work: Path, name: str, config: BaseModel) -> str:
+    path = work / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    return str(path)

@@ -1,0 +1,27 @@
+"""From the config of a run on one machine to the configs of its two sides."""
+
+from __future__ import annotations
+
+from lavt.config import ClientConfig, ClientVideoConfig, RunConfig, ServerConfig, ServerVideoConfig, ZenohConfig
+
+
+def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
+    """Give the server's part of a run: any free port, loopback only."""
+    return ServerConfig(
+        vehicle=run.vehicle,
+        camera=run.camera,
+        video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
+        zenoh=ZenohConfig(router=router),
+        safety=run.safety,
+        seed=seed,
+    )
+
+
+def client_config(run: RunConfig, *, router: str = "", video_port: int = 0) -> ClientConfig:
+    """Give the client's part of a run."""
+    return ClientConfig(
+        controller=run.controller,
+        camera=run.camera,
+        video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
+        zenoh=ZenohConfig(router=router),
+    )

@@ -1,0 +1,144 @@
+"""One run in virtual time: the two sides of the real thing, joined by simulated links."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lavt.build import ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
+from lavt.config import Costs, RunConfig, condition, load_config, shipped
+from lavt.domain import NS_PER_S, NS_PER_US, Now
+from lavt.experiment.network import Network, injected_network, virtual_network
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.record import RecordWriter
+from lavt.experiment.sides import client_config, server_config
+from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.transport.delay import DelayLaw, DelayLine
+from lavt.transport.relay import video_index
+
+SERVER_MONO_NS = 1_000 * NS_PER_S
+CLIENT_MONO_NS = 7_000 * NS_PER_S
+"""The monotonic clocks of two machines have nothing to do with each other."""
+WALL_NS = 1_790_000_000 * NS_PER_S
+"""True time at the begin of every virtual run: a day of 2026."""
+CLIENT_ADDRESS = ("198.51.100.2", 40_000)
+"""Of the documentation range (RFC 5737): what the server sees the client's datagrams come from."""
+SERVER_VIDEO_PORT = 5600
+ARMING_LIMIT_NS = 30 * NS_PER_S
+LONGEST_NS = 3600 * NS_PER_S
+AFTERWARDS_NS = NS_PER_S // 5
+"""So much is recorded after the ending."""
+
+
+class EndingTap:
+    """A recorder that passes everything on and notes when the drive has begun and ended."""
+
+    def __init__(self, writer: RecordWriter) -> None:
+        self.began = False
+        self.ending: str | None = None
+        self._writer = writer
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Write one entry."""
+        if topic == "event":
+            self.began |= payload.kind == "drive_began"
+            if payload.kind == "ending":
+                self.ending = payload.detail
+        self._writer.write(topic, payload, now)
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualLoop:
+    """Everything of a virtual run, before it is run: tests reach in here."""
+
+    runtime: VirtualRuntime
+    server: ServerNodes
+    client: ClientNodes
+    tap: EndingTap
+    writers: tuple[RecordWriter, RecordWriter]
+    digest: Any
+
+
+def read_costs() -> Costs:
+    """Read what the loop costs."""
+    return load_config(Costs, shipped("configs/costs.yaml"))
+
+
+def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
+    """Give the clocks of server and client: the client's is true, the server's has an offset and drifts."""
+    return (
+        HostClock(
+            SERVER_MONO_NS, WALL_NS, round(config.clocks.offset_ms * 1e6), round(config.clocks.drift_ppm * 1000)
+        ),
+        HostClock(CLIENT_MONO_NS, WALL_NS),
+    )
+
+
+def build_loop(
+    planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None
+) -> VirtualLoop:
+    """Make both sides of a run and the links between them, recording into `out`."""
+    config, seed, costs = planned.config, planned.seed, read_costs()
+    digest = hashlib.sha256()
+    writers = (RecordWriter(out / "server.mcap", "server", digest), RecordWriter(out / "client.mcap", "client", digest))
+    tap = EndingTap(writers[0])
+    server_clock, client_clock = clocks or host_clocks(config)
+    server = build_server(
+        server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
+        host="virtual-server", video_port=SERVER_VIDEO_PORT,
+    )  # fmt: skip
+    client = build_client(client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"))
+    costs_ns = {
+        (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()
+    }
+    error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
+    hosts = [
+        VirtualHost(
+            "server", server_clock, server.all, tap, costs_ns,
+            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
+        ),
+        VirtualHost(
+            "client", client_clock, client.all, writers[1], costs_ns,
+            modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s), CLIENT_ADDRESS,
+        ),
+    ]  # fmt: skip
+    injected = injected_network(
+        config.network.inherent, condition(config.network.condition), costs, seed, state_delay=config.network.state_delay
+    )
+    runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
+    return VirtualLoop(runtime, server, client, tap, writers, digest)
+
+
+def virtual_links(network: Network) -> dict[str, VirtualLink]:
+    """Make the links of all channels that cross the network."""
+
+    def counted(_payload: bytes, count: int) -> int:
+        return count
+
+    def link(law: DelayLaw, index: Callable[[bytes, int], int] = counted) -> VirtualLink:
+        return VirtualLink(DelayLine(law), index)
+
+    return {
+        "rtp": link(network.video, lambda payload, _count: video_index(payload)),
+        "control": link(network.control),
+        "state": link(network.state),
+        "feedback": link(network.unheld),
+        "session": link(network.unheld),
+        "session_reply": link(network.state),
+    }
+
+
+def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS) -> None:
+    """Run until the drive has ended and a little longer, until nobody has armed in time, or to the limit."""
+    runtime, tap = loop.runtime, loop.tap
+    try:
+        armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: tap.began)
+        if armed and runtime.run(limit_ns, lambda: tap.ending is not None):
+            runtime.run(runtime.true_ns + AFTERWARDS_NS, lambda: False)
+        runtime.close()
+    finally:
+        for writer in loop.writers:
+            writer.close()
