@@ -143,6 +143,19 @@ def test_truncated_access_unit(access_units: list[bytes]) -> None:
     assert decoded.corrupt
 
 
+def test_keyframe_after_damage(access_units: list[bytes]) -> None:
+    """Nothing of a damaged picture, wherever it was cut off, is left in the keyframe after it."""
+    clean = Decoder().decode(access_units[15])
+    assert clean is not None
+    for kept in range(100, len(access_units[14]), 97):
+        receiver = Decoder()
+        receiver.decode(access_units[0])
+        receiver.decode(access_units[14][:kept])
+        decoded = receiver.decode(access_units[15])
+        assert decoded is not None
+        assert np.array_equal(decoded.picture, clean.picture)
+
+
 def test_lost_access_units(access_units: list[bytes]) -> None:
     """After two lost pictures in a row the next ones come out all the same, each with no delay."""
     receiver = Decoder()

@@ -1,12 +1,17 @@
 from __future__ import annotations
 
 import itertools
+from fractions import Fraction
 
+import av
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.errors import BadPacket, UserError
+from lavt.streams import stream
+from lavt.transport.h264 import Encoder
 from lavt.transport.rtp import (
     MAX_ACCESS_UNIT_BYTES,
     AccessUnit,
@@ -303,3 +308,35 @@ def test_any_payloads(steps: list[tuple[bytes, int, bool, bool]]) -> None:
     depacketizer.push(packet(b"", 3, marker=True), False)
     (last,) = depacketizer.push(packet(SLICE + b"x", 4, marker=True), False)
     assert last == AccessUnit(byte_stream(SLICE + b"x"), 4, complete=True, keyframe=False)
+
+
+class DatagramList:
+    """A file to FFmpeg's RTP sender."""
+
+    def __init__(self) -> None:
+        self.datagrams: list[bytes] = []
+
+    def write(self, datagram: bytes) -> int:
+        """Take one packet."""
+        self.datagrams.append(bytes(datagram))
+        return len(datagram)
+
+
+def test_another_sender() -> None:
+    """What FFmpeg's own RTP sender makes of a stream comes out NAL unit by NAL unit as it was."""
+    noise = stream(1, "noise")
+    encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=4)
+    sent = [encoder.encode(noise.integers(0, 256, (128, 160, 3), dtype=np.uint8)) for _ in range(8)]
+    file = DatagramList()
+    options = {"packetsize": "1200", "rtpflags": "skip_rtcp", "payload_type": "96"}
+    with av.open(file, "w", format="rtp", options=options) as container:
+        video = container.add_stream("libx264", rate=30, width=160, height=128, pix_fmt="yuv420p")
+        for number, access_unit in enumerate(sent):
+            one = av.Packet(access_unit)
+            one.stream, one.time_base, one.pts, one.dts = video, Fraction(1, 90_000), number * 3000, number * 3000
+            container.mux(one)
+    units = push_all(Depacketizer(), [parse_packet(datagram) for datagram in file.datagrams])
+    assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit) for access_unit in sent]
+    assert all(unit.complete for unit in units)
+    assert [unit.keyframe for unit in units] == [number % 4 == 0 for number in range(8)]
+    assert {unit.timestamp - units[0].timestamp - 3000 * number for number, unit in enumerate(units)} <= {0, -(2**32)}
