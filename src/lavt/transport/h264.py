@@ -1,0 +1,182 @@
+"""Pictures to H.264 and back, one access unit for one picture, with no frame of delay on either side.
+
+The only module that knows PyAV (libx264 and FFmpeg's decoder). Encoding: constrained baseline, no look-ahead, constant
+bit rate with a small decoder buffer (VBV), so that no frame is much larger than its share. Decoding: one thread, since
+FFmpeg's frame threads buy speed with one frame of delay each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Final, cast
+
+import av
+import av.logging
+import cv2
+import numpy as np
+from av.codec.context import Flags, ThreadType
+from av.video.codeccontext import VideoCodecContext
+from av.video.frame import PictureType, VideoFrame
+from numpy.typing import NDArray
+
+from lavt.domain import Picture
+from lavt.errors import UserError
+from lavt.transport.rtp import split_nal_units
+
+_MIN_SIDE_PX: Final = 64
+_MAX_DECODED_PX: Final = 4096 * 2304
+"""A forged parameter set cannot make the decoder ask for more memory than pictures of this size need."""
+_RTP_TICK = Fraction(1, 90_000)
+_KEYFRAME_KINDS: Final = {5, 7, 8}
+"""An IDR slice, a sequence and a picture parameter set (H.264, table 7-1)."""
+_PRESETS: Final = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
+
+# What FFmpeg would print about a damaged stream is counted here anyway, and libx264 prints a summary at every end.
+av.logging.set_level(av.logging.PANIC)
+
+
+class Encoder:
+    """H.264 encoder of one stream of pictures (libx264); the same pictures give the same bytes.
+
+    `bit_rate_bps` is kept over any `buffer_s`; a keyframe comes every `gop_frames` and on request, each with its
+    parameter sets in band. Raises `UserError` for what no stream can be made of.
+    """
+
+    def __init__(
+        self,
+        width_px: int,
+        height_px: int,
+        *,
+        rate_hz: float,
+        bit_rate_bps: int,
+        gop_frames: int,
+        preset: str = "ultrafast",
+        buffer_s: float = 0.1,
+    ) -> None:
+        _check_size(width_px, height_px)
+        _check_rates(rate_hz, bit_rate_bps, gop_frames, buffer_s)
+        if preset not in _PRESETS:
+            raise UserError(f"preset {preset!r} is none of libx264's: choose one of {', '.join(_PRESETS)}")
+        self._shape = (height_px, width_px, 3)
+        self._planes = np.empty((height_px * 3 // 2, width_px), np.uint8)
+        self._next_pts = 0
+        context = av.CodecContext.create("libx264", "w")
+        context.width, context.height = width_px, height_px
+        context.pix_fmt = "yuv420p"
+        context.thread_count = 1
+        context.time_base = 1 / Fraction(rate_hz).limit_denominator(1001)
+        context.framerate = Fraction(rate_hz).limit_denominator(1001)
+        context.gop_size = gop_frames
+        context.max_b_frames = 0
+        context.bit_rate = bit_rate_bps
+        context.profile = "Constrained Baseline"
+        context.options = {
+            "preset": preset,
+            "tune": "zerolatency",
+            "maxrate": str(bit_rate_bps),
+            "bufsize": str(round(bit_rate_bps * buffer_s)),
+        }
+        context.open()
+        self._context = context
+
+    def encode(self, picture_bgr: Picture, keyframe: bool = False) -> bytes:
+        """Encode one picture (height, width, 3) and return its access unit, annex B.
+
+        `keyframe` makes it an IDR picture. Raises `UserError` for a picture of another size.
+        """
+        if picture_bgr.shape != self._shape:
+            raise UserError(f"the encoder was made for pictures of {self._shape}, not of {picture_bgr.shape}")
+        cv2.cvtColor(picture_bgr, cv2.COLOR_BGR2YUV_I420, dst=self._planes)
+        frame = VideoFrame.from_numpy_buffer(self._planes, format="yuv420p")
+        frame.pts = self._next_pts
+        frame.time_base = self._context.time_base
+        self._next_pts += 1
+        if keyframe:
+            frame.pict_type = PictureType.I
+        return b"".join(bytes(packet) for packet in self._context.encode(frame))
+
+
+def _check_size(width_px: int, height_px: int) -> None:
+    """Raise `UserError` for a size that libx264 refuses in its own words, or that our decoder would not take."""
+    if min(width_px, height_px) < _MIN_SIDE_PX or width_px % 2 or height_px % 2:
+        raise UserError(f"pictures of {width_px} x {height_px}: choose even sizes of at least {_MIN_SIDE_PX} pixels")
+    if width_px * height_px > _MAX_DECODED_PX:
+        raise UserError(f"pictures of {width_px} x {height_px}: choose at most 4096 x 2304")
+
+
+def _check_rates(rate_hz: float, bit_rate_bps: int, gop_frames: int, buffer_s: float) -> None:
+    """Raise `UserError` for rates that libx264 refuses in its own words or does not follow."""
+    if not 1 <= rate_hz <= 1000:
+        raise UserError(f"a frame rate of {rate_hz} Hz: choose 1 to 1000 Hz")
+    if not 10_000 <= bit_rate_bps <= 1_000_000_000:
+        raise UserError(f"a bit rate of {bit_rate_bps} bit/s: choose 10000 to 1000000000 bit/s")
+    if gop_frames < 1:
+        raise UserError(f"a keyframe every {gop_frames} frames: choose 1 or more")
+    if not 0.001 <= buffer_s <= 10:
+        raise UserError(f"a decoder buffer of {buffer_s} s: choose 0.001 to 10 s, and at least one frame")
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedPicture:
+    """A picture that came out of the decoder."""
+
+    luma: NDArray[np.uint8]
+    """(height, width), 16 black to 235 white."""
+    picture: Picture
+    """The same in colour."""
+    corrupt: bool
+    """The decoder had to make up parts of this very picture. Later ones copy from it and say nothing."""
+
+
+class Decoder:
+    """H.264 decoder of one stream: parameter sets in band, an access unit in, its picture out at once."""
+
+    def __init__(self) -> None:
+        self._context = _new_context()
+        self._damaged = False
+
+    def decode(self, access_unit: bytes) -> DecodedPicture | None:
+        """Decode one access unit (annex B); None when it gives no picture, whatever its bytes."""
+        if not access_unit:
+            return None  # to FFmpeg an empty packet means the end of the stream: nothing would come out ever after
+        # FFmpeg carries something of a damaged picture over into the next keyframe, which then is visibly wrong without
+        # being called corrupt; flushing does not help. Measured: a new context does, and takes less than 0.1 ms.
+        if self._damaged and _stands_alone(access_unit):
+            self._context = _new_context()
+            self._damaged = False
+        try:
+            frames = self._context.decode(av.Packet(access_unit))
+            decoded = _to_picture(frames[-1]) if frames else None
+        except (av.FFmpegError, ValueError):
+            decoded = None
+        self._damaged = self._damaged or decoded is None or decoded.corrupt
+        return decoded
+
+
+def _new_context() -> VideoCodecContext:
+    """Open a decoder that gives each picture as soon as its access unit is there."""
+    context = av.CodecContext.create("h264", "r")
+    context.thread_type = ThreadType.SLICE
+    context.thread_count = 1
+    # Without output_corrupt two lost pictures in a row leave the screen frozen until the next keyframe.
+    context.flags |= Flags.low_delay | Flags.output_corrupt
+    context.options = {"max_pixels": str(_MAX_DECODED_PX)}
+    return context
+
+
+def _stands_alone(access_unit: bytes) -> bool:
+    """Tell whether an access unit is a keyframe with its parameter sets."""
+    kinds = {unit[0] & 0x1F for unit in split_nal_units(access_unit)}
+    return kinds >= _KEYFRAME_KINDS
+
+
+def _to_picture(frame: VideoFrame) -> DecodedPicture:
+    """Copy a frame out of the decoder's memory. Raises `ValueError` for odd sizes, which 4:2:0 planes cannot hold."""
+    if frame.width % 2 or frame.height % 2:
+        raise ValueError("odd size")
+    if frame.format.name != "yuv420p":
+        frame = frame.reformat(format="yuv420p")  # a foreign sender's full range or other chroma
+    planes = cast("NDArray[np.uint8]", frame.to_ndarray())
+    picture = cast("Picture", cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420))
+    return DecodedPicture(planes[: frame.height], picture, frame.is_corrupt)

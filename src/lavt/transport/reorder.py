@@ -1,0 +1,147 @@
+"""Packets back into the order of their sequence numbers, without keeping those that are in order.
+
+A packet in order leaves at once. One after a gap waits for the missing ones, at most `hold_ns` from the first sign of
+the gap; then the gap is given up. The very first packets wait one hold, since the first to arrive need not be the
+first that was sent: without it a reordered keyframe at the start costs the whole first group of pictures.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lavt.domain import NS_PER_MS
+from lavt.transport.rtp import RtpPacket
+
+HOLD_NS: Final = 10 * NS_PER_MS
+MAX_JUMP: Final = 3000
+"""Sequence numbers further from the newest than this are another range. RFC 3550 (A.1) allows only 100 backwards; here
+a delay spike, which brings many old packets in a row, must not pass for a restart of the sender."""
+CAPACITY: Final = 1024
+"""Packets held at most; when there are more the gap is given up early."""
+
+Ordered = list[tuple[RtpPacket, bool]]
+"""Packets in order, each with whether any between it and the one before it is missing."""
+
+
+class ReorderBuffer:
+    """Puts the packets of one RTP stream in order; a new SSRC begins a new stream.
+
+    Repair packets have another SSRC and must not come in here. Public counters, in packets: `late` came after they had
+    been given up, `duplicate` came twice, `lost` were given up (late ones included), `reordered` came late but in
+    time, `stray` were far from all others and alone.
+    """
+
+    def __init__(self, hold_ns: int = HOLD_NS) -> None:
+        self.late = 0
+        self.duplicate = 0
+        self.lost = 0
+        self.reordered = 0
+        self.stray = 0
+        self._hold_ns = hold_ns
+        self._stray: RtpPacket | None = None
+        self._after_loss = False
+        self._ssrc: int | None = None
+        self._start(0)
+
+    @property
+    def highest_sequence(self) -> int:
+        """The highest sequence number received, extended by the number of wraps (RFC 3550, section 6.4.1)."""
+        return self._highest
+
+    def push(self, packet: RtpPacket, now_ns: int) -> Ordered:
+        """Take a packet that arrived at `now_ns`; return the packets that are in order now."""
+        released: Ordered = []
+        if packet.ssrc != self._ssrc:
+            released = self._restart(packet)
+        number = self._extend(packet.sequence)
+        if abs(number - self._highest) > MAX_JUMP:
+            stray, self._stray = self._stray, packet
+            if stray is None or packet.sequence != (stray.sequence + 1) % 2**16:
+                self.stray += 1
+                return released
+            # Two in a row: the sender has moved its sequence numbers (RFC 3550, A.1).
+            self.stray -= 1
+            released += self._restart(stray)
+            self._insert(stray, stray.sequence, now_ns)
+            number = self._extend(packet.sequence)
+        self._stray = None
+        self._insert(packet, number, now_ns)
+        return released + self._drain() + self.expire(now_ns)
+
+    def expire(self, now_ns: int) -> Ordered:
+        """Give up the gaps whose hold is over at `now_ns`; return the packets that are in order now."""
+        released: Ordered = []
+        while self._held and (now_ns >= self._deadline_ns() or len(self._held) > CAPACITY):
+            released += self._skip_gap()
+        return released
+
+    def next_wake_ns(self) -> int | None:
+        """Tell when `expire` has something to do; None: nothing is held."""
+        return self._deadline_ns() if self._held else None
+
+    def _start(self, first_number: int) -> None:
+        """Forget the stream."""
+        self._held: dict[int, tuple[RtpPacket, int]] = {}
+        self._next: int | None = None
+        self._first = first_number
+        self._highest = first_number
+        self._given_up: set[int] = set()
+
+    def _restart(self, first: RtpPacket) -> Ordered:
+        """Let go all that is held and begin anew with the stream of `first`."""
+        released: Ordered = []
+        while self._held:
+            released += self._skip_gap()
+        self._after_loss = self._ssrc is not None
+        self._ssrc = first.ssrc
+        self._stray = None
+        self._start(first.sequence)
+        return released
+
+    def _extend(self, sequence: int) -> int:
+        """Give the extended sequence number that is nearest to the highest one."""
+        return self._highest + (sequence - self._highest + 2**15) % 2**16 - 2**15
+
+    def _insert(self, packet: RtpPacket, number: int, now_ns: int) -> None:
+        """Hold a packet, or count why not."""
+        if number in self._held:
+            self.duplicate += 1
+        elif self._next is not None and number < self._next:
+            if number in self._given_up or number < self._first:
+                self._given_up.discard(number)
+                self.late += 1
+            else:
+                self.duplicate += 1
+        else:
+            self.reordered += number < self._highest
+            self._highest = max(self._highest, number)
+            self._held[number] = packet, now_ns
+
+    def _drain(self) -> Ordered:
+        """Let go the packets that are next, up to the first gap."""
+        released: Ordered = []
+        while self._next is not None and self._next in self._held:
+            packet, _ = self._held.pop(self._next)
+            released.append((packet, self._after_loss))
+            self._after_loss = False
+            self._next += 1
+        return released
+
+    def _skip_gap(self) -> Ordered:
+        """Give up what is missing before the first packet held, and let go from there to the next gap."""
+        first = min(self._held)
+        if self._next is None:
+            self._first = first
+        elif first > self._next:
+            missing = range(self._next, first)
+            self.lost += len(missing)
+            self._given_up.update(missing)
+            if len(self._given_up) > 2 * MAX_JUMP:
+                self._given_up = {number for number in self._given_up if number > first - MAX_JUMP}
+            self._after_loss = True
+        self._next = first
+        return self._drain()
+
+    def _deadline_ns(self) -> int:
+        """Tell when the hold of the first gap is over: the packet held longest was the first sign of it."""
+        return next(iter(self._held.values()))[1] + self._hold_ns

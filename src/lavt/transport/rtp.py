@@ -1,0 +1,301 @@
+"""RTP packets (RFC 3550) that carry H.264 (RFC 6184, packetization mode 1): access units to packets and back.
+
+An access unit is what one picture became: NAL units behind start codes (H.264, annex B). Sending uses single NAL unit
+packets, STAP-A for small neighbours such as the parameter sets, and FU-A in equal pieces; receiving takes any mix of
+these. An access unit leaves the depacketizer with its marker packet, so no frame waits for the next.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from lavt.errors import BadPacket, UserError
+
+VIDEO_PAYLOAD_TYPE: Final = 96
+MAX_PACKET_BYTES: Final = 1200
+MAX_ACCESS_UNIT_BYTES: Final = 2 * 1024 * 1024
+"""More than any picture needs: a peer that never ends its access unit fills no memory beyond this."""
+
+_HEADER = struct.Struct("!BBHII")
+_VERSION_2: Final = 0x80
+_START_CODE: Final = b"\x00\x00\x00\x01"
+_SHORT_START_CODE: Final = b"\x00\x00\x01"
+_MIN_PACKET_BYTES: Final = 64
+
+_NAL_TYPE: Final = 0x1F
+_NAL_IMPORTANCE: Final = 0x60
+_FORBIDDEN: Final = 0x80
+_NONE: Final = 0
+"""No NAL unit has this type."""
+_SLICE_OF_IDR: Final = 5
+_PARAMETER_SET: Final = 7
+_DELIMITER: Final = 9
+_LAST_SINGLE_NAL: Final = 23
+_STAP_A: Final = 24
+_FU_A: Final = 28
+_FU_START: Final = 0x80
+_FU_END: Final = 0x40
+
+
+@dataclass(frozen=True, slots=True)
+class RtpPacket:
+    """An RTP packet without contributing sources and extensions (RFC 3550, section 5.1)."""
+
+    payload_type: int
+    sequence: int
+    timestamp: int
+    ssrc: int
+    marker: bool
+    payload: bytes
+
+    def to_bytes(self) -> bytes:
+        """Write the packet as a datagram."""
+        second = self.marker << 7 | self.payload_type
+        return _HEADER.pack(_VERSION_2, second, self.sequence, self.timestamp, self.ssrc) + self.payload
+
+
+def parse_packet(datagram: bytes) -> RtpPacket:
+    """Read a datagram as an RTP packet, leaving out contributing sources, header extension and padding.
+
+    Raises `BadPacket` for anything that is not RTP version 2 or ends before its own header says.
+    """
+    if len(datagram) < _HEADER.size:
+        raise BadPacket("shorter than an RTP header")
+    first, second, sequence, timestamp, ssrc = _HEADER.unpack_from(datagram)
+    if first >> 6 != 2:
+        raise BadPacket("not RTP version 2")
+    begin = _HEADER.size + 4 * (first & 0x0F)
+    end = len(datagram)
+    if first & 0x10:
+        if begin + 4 > end:
+            raise BadPacket("header extension cut off")
+        begin += 4 + 4 * int.from_bytes(datagram[begin + 2 : begin + 4], "big")
+    if first & 0x20:
+        padding = datagram[-1]
+        if padding == 0:
+            raise BadPacket("padding of no length")
+        end -= padding
+    if begin > end:
+        raise BadPacket("header and padding longer than the packet")
+    return RtpPacket(second & 0x7F, sequence, timestamp, ssrc, second >= 0x80, datagram[begin:end])
+
+
+def split_nal_units(access_unit: bytes) -> list[bytes]:
+    """Take the NAL units out of an annex B byte stream; what comes before the first start code is left out."""
+    units = []
+    begin = access_unit.find(_SHORT_START_CODE)
+    while begin >= 0:
+        begin += len(_SHORT_START_CODE)
+        end = access_unit.find(_SHORT_START_CODE, begin)
+        # A NAL unit never ends with a zero byte: what is there belongs to the next start code or is filling.
+        unit = access_unit[begin : end if end >= 0 else None].rstrip(b"\x00")
+        if unit:
+            units.append(unit)
+        begin = end
+    return units
+
+
+class Packetizer:
+    """Makes RTP packets of access units: one stream, consecutive sequence numbers.
+
+    `max_packet_bytes` counts the RTP header in and UDP and IP out. Raises `UserError` for a size no stream can use.
+    """
+
+    def __init__(
+        self,
+        ssrc: int,
+        first_sequence: int,
+        payload_type: int = VIDEO_PAYLOAD_TYPE,
+        max_packet_bytes: int = MAX_PACKET_BYTES,
+    ) -> None:
+        if not _MIN_PACKET_BYTES <= max_packet_bytes <= 65_507:
+            raise UserError(f"RTP packets of {max_packet_bytes} bytes: choose {_MIN_PACKET_BYTES} to 65507")
+        self.ssrc = ssrc
+        self.next_sequence = first_sequence % 2**16
+        self._payload_type = payload_type
+        self._max_payload_bytes = max_packet_bytes - _HEADER.size
+
+    def packetize(self, access_unit: bytes, timestamp: int) -> list[bytes]:
+        """Make the datagrams of one access unit (annex B) with one 90 kHz `timestamp`; the last carries the marker."""
+        payloads = self._payloads(split_nal_units(access_unit))
+        last = len(payloads) - 1
+        datagrams = []
+        for index, payload in enumerate(payloads):
+            second = (index == last) << 7 | self._payload_type
+            datagrams.append(_HEADER.pack(_VERSION_2, second, self.next_sequence, timestamp, self.ssrc) + payload)
+            self.next_sequence = (self.next_sequence + 1) % 2**16
+        return datagrams
+
+    def _payloads(self, units: list[bytes]) -> list[bytes]:
+        """Pack NAL units in order: neighbours together while they fit one packet, large ones in pieces."""
+        payloads: list[bytes] = []
+        together: list[bytes] = []
+        room = self._max_payload_bytes - 1
+        for unit in units:
+            if len(unit) + 2 > room and together:
+                payloads.append(_aggregate(together))
+                together, room = [], self._max_payload_bytes - 1
+            if len(unit) > self._max_payload_bytes:
+                payloads += _fragment(unit, self._max_payload_bytes)
+            else:
+                together.append(unit)
+                room -= 2 + len(unit)
+        if together:
+            payloads.append(_aggregate(together))
+        return payloads
+
+
+def _aggregate(units: list[bytes]) -> bytes:
+    """Put NAL units into one STAP-A (RFC 6184, section 5.7.1); one alone needs none."""
+    if len(units) == 1:
+        return units[0]
+    importance = max(unit[0] & _NAL_IMPORTANCE for unit in units)
+    return bytes([importance | _STAP_A]) + b"".join(len(unit).to_bytes(2, "big") + unit for unit in units)
+
+
+def _fragment(unit: bytes, max_payload_bytes: int) -> list[bytes]:
+    """Cut one NAL unit into FU-A of nearly equal size (RFC 6184, section 5.8)."""
+    body_bytes = len(unit) - 1
+    count = -(-body_bytes // (max_payload_bytes - 2))
+    indicator = unit[0] & ~_NAL_TYPE | _FU_A
+    kind = unit[0] & _NAL_TYPE
+    cuts = [1 + body_bytes * index // count for index in range(count + 1)]
+    flags = [_FU_START, *[0] * (count - 2), _FU_END]
+    pieces = zip(flags, pairwise(cuts), strict=True)
+    return [bytes((indicator, flag | kind)) + unit[begin:end] for flag, (begin, end) in pieces]
+
+
+@dataclass(frozen=True, slots=True)
+class AccessUnit:
+    """What is there of one picture's H.264."""
+
+    data: bytes
+    """Annex B; b"" when nothing of it can be decoded."""
+    timestamp: int
+    complete: bool
+    """Nothing of it is missing, nor anything before it that it refers to. A picture that is not complete stays in what
+    is predicted from it, so pictures are in doubt from here to the next complete keyframe."""
+    keyframe: bool
+    """It holds slices of an IDR picture: decoding can begin here."""
+
+
+class Depacketizer:
+    """Puts access units together from RTP packets in the order of their sequence numbers.
+
+    It never raises: payloads that are not H.264 are counted in `malformed` and leave their access unit incomplete.
+    """
+
+    def __init__(self) -> None:
+        self.malformed = 0
+        self._damaged = False
+        self._begin(0, after_loss=False)
+
+    def push(self, packet: RtpPacket, lost_before: bool) -> list[AccessUnit]:
+        """Take the next packet; return the access units that are over, oldest first: at most two.
+
+        `lost_before` says that packets between this one and the one before are missing. An access unit whose marker
+        packet is missing leaves when the next one begins.
+        """
+        over = []
+        if self._packets and packet.timestamp != self._timestamp:
+            if lost_before:
+                self._damaged = True
+            over.append(self._finish())
+        if not self._packets:
+            self._begin(packet.timestamp, after_loss=lost_before)
+        elif lost_before:
+            self._damaged = True
+            self._open_fragment = _NONE
+        self._packets += 1
+        if not self._take(packet.payload):
+            self.malformed += 1
+            self._damaged = True
+        if packet.marker:
+            over.append(self._finish())
+        return over
+
+    def _begin(self, timestamp: int, *, after_loss: bool) -> None:
+        """Start an empty access unit."""
+        self._timestamp = timestamp
+        self._after_loss = after_loss
+        self._packets = 0
+        self._data = bytearray()
+        self._first_kind = _NONE
+        self._keyframe = False
+        self._damaged = False
+        self._open_fragment = _NONE
+
+    def _finish(self) -> AccessUnit:
+        """End the access unit and leave none begun."""
+        damaged = self._damaged or self._open_fragment != _NONE
+        # After a loss the first packets of this unit may be among the lost, and so may a picture it refers to. A
+        # keyframe that begins with its parameter sets shows that neither matters.
+        fresh = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
+        complete = not damaged and bool(self._data) and (fresh or not self._after_loss)
+        unit = AccessUnit(bytes(self._data), self._timestamp, complete, self._keyframe)
+        self._begin(self._timestamp, after_loss=False)
+        return unit
+
+    def _take(self, payload: bytes) -> bool:
+        """Add what a payload holds; False when it is not H.264 in packetization mode 1."""
+        if not payload or payload[0] & _FORBIDDEN or len(self._data) + len(payload) > MAX_ACCESS_UNIT_BYTES:
+            return False
+        kind = payload[0] & _NAL_TYPE
+        if kind == _FU_A:
+            return self._take_fragment(payload)
+        if self._open_fragment != _NONE:
+            self._damaged = True
+            self._open_fragment = _NONE
+        if kind == _STAP_A:
+            return self._take_aggregate(payload)
+        return self._begin_unit(payload[0]) and self._add(payload[1:])
+
+    def _take_aggregate(self, payload: bytes) -> bool:
+        """Add the NAL units of a STAP-A, as far as they are well formed."""
+        at = 1
+        while at < len(payload):
+            begin = at + 2
+            at = begin + int.from_bytes(payload[at:begin], "big")
+            if at > len(payload) or at == begin or not self._begin_unit(payload[begin]):
+                return False
+            self._add(payload[begin + 1 : at])
+        return len(payload) > 1
+
+    def _take_fragment(self, payload: bytes) -> bool:
+        """Add an FU-A. Pieces after a hole are left out: a decoder gets on better with a NAL unit that ends early."""
+        if len(payload) < 2:
+            return False
+        kind = payload[1] & _NAL_TYPE
+        starts, ends = bool(payload[1] & _FU_START), bool(payload[1] & _FU_END)
+        if starts and ends:
+            return False
+        if starts:
+            self._damaged = self._damaged or self._open_fragment != _NONE
+            if not self._begin_unit(payload[0] & ~_NAL_TYPE | kind):
+                return False
+        elif self._open_fragment != kind:
+            self._damaged = True
+            self._open_fragment = _NONE
+            return True
+        self._open_fragment = _NONE if ends else kind
+        return self._add(payload[2:])
+
+    def _begin_unit(self, header: int) -> bool:
+        """Start a NAL unit with its header byte; False when it is of no kind that may stand alone."""
+        kind = header & _NAL_TYPE
+        if not 1 <= kind <= _LAST_SINGLE_NAL or header & _FORBIDDEN:
+            return False
+        if self._first_kind == _NONE:
+            self._first_kind = kind
+        self._keyframe = self._keyframe or kind == _SLICE_OF_IDR
+        self._data += _START_CODE
+        self._data.append(header)
+        return True
+
+    def _add(self, part: bytes) -> bool:
+        """Append bytes to the NAL unit begun last."""
+        self._data += part
+        return True

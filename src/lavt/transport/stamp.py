@@ -1,0 +1,67 @@
+"""The send time of a frame, inside its pixels.
+
+64 bits, nanoseconds of the server's wall clock just before encoding, as 8 x 8 cells of 8 x 8 pixels in the top left
+corner, row by row, most significant bit first, white for 1. The cells lie on the grid of H.264's transform, so the
+stamp survives a low bit rate. A picture that the decoder had to make up carries a stamp that looks right and is not;
+the frame's RTP timestamp, which says the same time in 90 kHz ticks, tells them apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lavt.domain import Picture
+from lavt.errors import BadPacket, UserError
+
+STAMP_PX = 64
+"""Width and height of the stamp."""
+
+_CELLS = 8
+_CELL_PX = STAMP_PX // _CELLS
+_CENTRE = slice(_CELL_PX // 4, _CELL_PX - _CELL_PX // 4)
+_CENTRE_PIXELS = (_CELL_PX // 2) ** 2
+_THRESHOLD = 128
+
+_RTP_CLOCK_HZ_BY_10000 = 9
+_NS_PER_S_BY_10000 = 100_000
+
+
+def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
+    """Write `stamp_ns` into the top left corner of `picture_bgr`, in place.
+
+    The picture is (height, width, 3) and at least `STAMP_PX` each way, else `UserError`; `stamp_ns` is in [0, 2^64).
+    """
+    if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
+        raise UserError(f"a picture must be at least {STAMP_PX} x {STAMP_PX} pixels for the stamp; use a larger one")
+    stamp_bytes = np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)
+    cells = np.unpackbits(stamp_bytes).reshape(_CELLS, 1, _CELLS, 1) * np.uint8(255)
+    rows = cells.repeat(_CELL_PX, axis=2).reshape(_CELLS, 1, STAMP_PX, 1)
+    corner = picture_bgr[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, STAMP_PX, 3)
+    corner[...] = rows
+
+
+def read_stamp(luma: NDArray[np.uint8]) -> int:
+    """Read the stamp from the luma plane (height, width) of a decoded picture: mean of each cell's centre half.
+
+    What it returns is only a claim until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too
+    small to hold a stamp.
+    """
+    if luma.shape[0] < STAMP_PX or luma.shape[1] < STAMP_PX:
+        raise BadPacket(f"a picture of {luma.shape[1]} x {luma.shape[0]} pixels holds no stamp")
+    cells = luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
+    sums = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
+    return int.from_bytes(np.packbits(sums > _THRESHOLD * _CENTRE_PIXELS).tobytes(), "big")
+
+
+def rtp_timestamp(stamp_ns: int) -> int:
+    """Give the RTP timestamp of a frame stamped `stamp_ns`: 90 kHz ticks, modulo 2^32 (RFC 6184, section 5.1)."""
+    return stamp_ns * _RTP_CLOCK_HZ_BY_10000 // _NS_PER_S_BY_10000 % 2**32
+
+
+def stamp_agrees(stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:
+    """Tell whether a stamp read from a picture and the RTP timestamp of its packets say the same time.
+
+    Two stamps that differ agree with the same timestamp only when less than 12 us, or a multiple of 13.3 h, apart.
+    """
+    return rtp_timestamp(stamp_ns) == rtp_timestamp_of_frame

@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import NS_PER_MS
+from lavt.transport.reorder import CAPACITY, HOLD_NS, MAX_JUMP, Ordered, ReorderBuffer
+from lavt.transport.rtp import RtpPacket
+
+STARTED_NS = HOLD_NS
+
+
+def packet(sequence: int, ssrc: int = 7) -> RtpPacket:
+    return RtpPacket(96, sequence % 2**16, 0, ssrc, False, b"")
+
+
+def numbers(ordered: Ordered) -> list[int]:
+    return [one.sequence for one, _ in ordered]
+
+
+def gaps(ordered: Ordered) -> list[int]:
+    return [one.sequence for one, lost_before in ordered if lost_before]
+
+
+def started(first: int = 0) -> ReorderBuffer:
+    """Give a buffer past its start: packet `first` has left it, at `STARTED_NS`."""
+    buffer = ReorderBuffer()
+    buffer.push(packet(first), 0)
+    assert numbers(buffer.expire(STARTED_NS)) == [first % 2**16]
+    return buffer
+
+
+def test_start() -> None:
+    """The first packets wait one hold, so that the stream begins with the first sent and not the first to arrive."""
+    buffer = ReorderBuffer()
+    assert buffer.next_wake_ns() is None
+    assert buffer.push(packet(11), 100) == []
+    assert buffer.push(packet(12), 100 + NS_PER_MS) == []
+    assert buffer.push(packet(10), 100 + 2 * NS_PER_MS) == []
+    assert buffer.next_wake_ns() == 100 + HOLD_NS
+    assert buffer.expire(100 + HOLD_NS - 1) == []
+    ordered = buffer.expire(100 + HOLD_NS)
+    assert numbers(ordered) == [10, 11, 12]
+    assert gaps(ordered) == []
+    assert buffer.next_wake_ns() is None
+
+
+def test_in_order() -> None:
+    """A packet in order leaves at once, also over the wrap of the sequence numbers."""
+    buffer = started(65_534)
+    assert [numbers(buffer.push(packet(number), STARTED_NS)) for number in (65_535, 0, 1)] == [[65_535], [0], [1]]
+    assert buffer.highest_sequence == 2**16 + 1
+
+
+def test_gap_that_closes() -> None:
+    """Packets after a gap leave with the packet that closes it, in order and without a loss."""
+    buffer = started()
+    assert buffer.push(packet(3), STARTED_NS) == []
+    assert buffer.push(packet(2), STARTED_NS) == []
+    ordered = buffer.push(packet(1), STARTED_NS + HOLD_NS - 1)
+    assert numbers(ordered) == [1, 2, 3]
+    assert gaps(ordered) == []
+    assert (buffer.reordered, buffer.lost) == (2, 0)
+
+
+def test_gap_that_stays() -> None:
+    """After one hold a gap is given up, and the packet behind it says so."""
+    buffer = started()
+    assert buffer.push(packet(3), STARTED_NS) == []
+    assert numbers(buffer.push(packet(4), STARTED_NS + 1)) == []
+    assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert numbers(ordered) == [3, 4]
+    assert gaps(ordered) == [3]
+    assert buffer.lost == 2
+
+
+def test_each_gap_has_its_own_hold() -> None:
+    """The hold of a gap begins with the first packet behind that gap."""
+    buffer = started()
+    buffer.push(packet(2), STARTED_NS)
+    buffer.push(packet(4), STARTED_NS + 3)
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
+    assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS + 3
+    assert gaps(buffer.expire(STARTED_NS + HOLD_NS + 3)) == [4]
+
+
+def test_late_wake() -> None:
+    """A packet that closes a gap is used even if the hold is over, as long as nobody has given the gap up."""
+    buffer = started()
+    buffer.push(packet(2), STARTED_NS)
+    assert numbers(buffer.push(packet(1), STARTED_NS + 2 * HOLD_NS)) == [1, 2]
+    buffer.push(packet(4), STARTED_NS + 2 * HOLD_NS)
+    assert numbers(buffer.push(packet(5), STARTED_NS + 4 * HOLD_NS)) == [4, 5]
+
+
+def test_late_and_duplicate() -> None:
+    """A packet that comes after its gap was given up, or twice, is dropped and counted as what it is."""
+    buffer = started(10)
+    buffer.push(packet(12), STARTED_NS)
+    assert buffer.push(packet(12), STARTED_NS) == []
+    assert (buffer.late, buffer.duplicate) == (0, 1)
+    buffer.expire(STARTED_NS + HOLD_NS)
+    assert buffer.push(packet(11), STARTED_NS + HOLD_NS) == []
+    assert (buffer.late, buffer.duplicate, buffer.lost) == (1, 1, 1)
+    assert buffer.push(packet(11), STARTED_NS + HOLD_NS) == []
+    assert buffer.push(packet(12), STARTED_NS + HOLD_NS) == []
+    assert (buffer.late, buffer.duplicate) == (1, 3)
+    assert buffer.push(packet(9), STARTED_NS + HOLD_NS) == []
+    assert buffer.late == 2
+
+
+def test_new_sender() -> None:
+    """A new SSRC lets go all that is held and begins a new stream, which the old one's packets are missing before."""
+    buffer = started()
+    buffer.push(packet(2), STARTED_NS)
+    assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [2]
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert [(one.ssrc, one.sequence, lost) for one, lost in ordered] == [(8, 40_000, True)]
+    assert buffer.highest_sequence == 40_000
+
+
+def test_one_stray_packet() -> None:
+    """A single packet far from all others is dropped and counted, and the stream goes on."""
+    buffer = started()
+    assert buffer.push(packet(MAX_JUMP + 1), STARTED_NS) == []
+    assert buffer.push(packet(-MAX_JUMP - 1), STARTED_NS) == []
+    assert numbers(buffer.push(packet(1), STARTED_NS)) == [1]
+    assert buffer.stray == 2
+    assert buffer.next_wake_ns() is None
+
+
+def test_jump() -> None:
+    """Two packets in a row in another range move the stream there, and neither of them is dropped."""
+    buffer = started()
+    assert buffer.push(packet(20_000), STARTED_NS) == []
+    assert buffer.push(packet(20_001), STARTED_NS) == []
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert numbers(ordered) == [20_000, 20_001]
+    assert gaps(ordered) == [20_000]
+    assert (buffer.stray, buffer.lost) == (0, 0)
+
+
+def test_delay_spike() -> None:
+    """Many old packets in a row are late packets and not a restart of the sender."""
+    buffer = started()
+    buffer.push(packet(1500), STARTED_NS)
+    buffer.expire(STARTED_NS + HOLD_NS)
+    for number in range(1, 1500):
+        assert buffer.push(packet(number), STARTED_NS + HOLD_NS) == []
+    assert (buffer.lost, buffer.late) == (1499, 1499)
+    assert numbers(buffer.push(packet(1501), STARTED_NS + HOLD_NS)) == [1501]
+
+
+def test_bounded_memory() -> None:
+    """However long the hold, no more than a fixed number of packets is held."""
+    buffer = ReorderBuffer(hold_ns=10**15)
+    released = [buffer.push(packet(2 * number), number) for number in range(CAPACITY + 50)]
+    assert sum(len(ordered) for ordered in released) == 50
+
+
+@given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
+def test_any_order(first: int, order: list[int], start_ns: int) -> None:
+    """Packets that arrive within one hold leave in the order they were sent, none missing."""
+    buffer = ReorderBuffer()
+    ordered = [
+        one for at, number in enumerate(order) for one in buffer.push(packet(first + number), start_ns + at * 1000)
+    ]
+    ordered += buffer.expire(start_ns + HOLD_NS)
+    assert numbers(ordered) == [(first + number) % 2**16 for number in range(30)]
+    assert gaps(ordered) == []
+    assert (buffer.lost, buffer.late, buffer.duplicate) == (0, 0, 0)
+
+
+ARRIVALS = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 8 * NS_PER_MS)), min_size=1, max_size=80)
+
+
+@given(st.integers(0, 2**16 - 1), ARRIVALS)
+def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
+    """Whatever arrives when: order is kept, gaps are told, each packet is accounted for and held one hold at most."""
+    buffer = ReorderBuffer()
+    ordered: Ordered = []
+    now_ns = 0
+    for number, pause_ns in arrivals:
+        now_ns += pause_ns
+        ordered += buffer.push(packet(first + number), now_ns)
+        wake_ns = buffer.next_wake_ns()
+        assert wake_ns is None or now_ns < wake_ns <= now_ns + HOLD_NS
+    ordered += buffer.expire(now_ns + HOLD_NS)
+    assert buffer.next_wake_ns() is None
+    sent = [(number - first) % 2**16 for number in numbers(ordered)]
+    assert sent == sorted(set(sent))
+    assert gaps(ordered) == [(first + after) % 2**16 for before, after in pairwise(sent) if after != before + 1]
+    assert buffer.lost == sent[-1] - sent[0] + 1 - len(sent)
+    assert len(ordered) + buffer.late + buffer.duplicate == len(arrivals)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2**16 - 1), st.integers(0, 1), st.integers(0, HOLD_NS)), max_size=60))
+def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
+    """No sequence numbers and sources break the buffer, and after them an orderly stream goes through."""
+    buffer = ReorderBuffer()
+    now_ns = 0
+    for sequence, ssrc, pause_ns in arrivals:
+        now_ns += pause_ns
+        buffer.push(packet(sequence, ssrc), now_ns)
+    buffer.push(packet(0, ssrc=9), now_ns)
+    buffer.expire(now_ns + HOLD_NS)
+    assert numbers(buffer.push(packet(1, ssrc=9), now_ns + HOLD_NS)) == [1]

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.errors import BadPacket, UserError
+from lavt.streams import stream
+from lavt.transport.stamp import STAMP_PX, read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+
+STAMPS = st.integers(min_value=0, max_value=2**64 - 1)
+
+
+@given(STAMPS)
+def test_round_trip(stamp_ns: int) -> None:
+    """Every 64-bit time that is written into a picture is read back from it."""
+    picture = np.full((STAMP_PX, STAMP_PX + 16, 3), 90, np.uint8)
+    write_stamp(picture, stamp_ns)
+    assert read_stamp(picture[..., 0]) == stamp_ns
+
+
+@given(STAMPS, st.integers(min_value=0, max_value=100))
+def test_noise(stamp_ns: int, seed: int) -> None:
+    """The stamp is read through noise of 40 grey levels on video range luma."""
+    picture = np.zeros((STAMP_PX, STAMP_PX, 3), np.uint8)
+    write_stamp(picture, stamp_ns)
+    luma = 16 + picture[..., 0].astype(np.float64) * 219 / 255
+    noisy = luma + stream(seed, "noise").normal(0, 40, luma.shape)
+    assert read_stamp(noisy.clip(0, 255).astype(np.uint8)) == stamp_ns
+
+
+def test_layout() -> None:
+    """The stamp is 8 x 8 cells of 8 x 8 pixels, row by row, most significant bit first, white for 1."""
+    picture = np.full((80, 80, 3), 90, np.uint8)
+    write_stamp(picture, 1 << 63 | 1 << 54 | 1)
+    white = np.argwhere(picture[:64, :64, 1] == 255)
+    assert {(row // 8, column // 8) for row, column in white.tolist()} == {(0, 0), (1, 1), (7, 7)}
+    assert len(white) == 3 * 64
+    assert set(np.unique(picture[:64, :64])) == {0, 255}
+
+
+def test_rest_of_the_picture() -> None:
+    """Nothing outside the corner of 64 x 64 pixels changes."""
+    picture = np.full((96, 112, 3), 90, np.uint8)
+    write_stamp(picture, 2**64 - 1)
+    picture[:STAMP_PX, :STAMP_PX] = 90
+    assert (picture == 90).all()
+
+
+def test_part_of_a_larger_array() -> None:
+    """A stamp goes in place into a picture that is a view of another array."""
+    array = np.zeros((200, 300, 3), np.uint8)
+    write_stamp(array[50:, 100:], 0xFFFF_0000_FFFF_0000)
+    assert read_stamp(array[50:, 100:, 2]) == 0xFFFF_0000_FFFF_0000
+
+
+def test_centre_of_the_cells() -> None:
+    """Only the centre half of each cell counts, so what a filter does to the edges does not matter."""
+    picture = np.zeros((64, 64, 3), np.uint8)
+    write_stamp(picture, 0x0123_4567_89AB_CDEF)
+    luma = picture[..., 0].copy()
+    edges = np.ones((8, 8), bool)
+    edges[2:6, 2:6] = False
+    luma[np.tile(edges, (8, 8))] = 128
+    assert read_stamp(luma) == 0x0123_4567_89AB_CDEF
+
+
+def test_too_small() -> None:
+    """A picture without room for the stamp is the user's error when written and the peer's when read."""
+    with pytest.raises(UserError, match="64 x 64"):
+        write_stamp(np.zeros((64, 63, 3), np.uint8), 1)
+    with pytest.raises(BadPacket):
+        read_stamp(np.zeros((63, 64), np.uint8))
+
+
+def test_rtp_timestamp() -> None:
+    """The RTP timestamp counts 90 kHz ticks of the stamp and wraps at 32 bits."""
+    assert rtp_timestamp(1_000_000_000) == 90_000
+    assert rtp_timestamp(11_111) == 0
+    assert rtp_timestamp(11_112) == 1
+    assert rtp_timestamp(2**32 * 100_000 // 9 + 1) == 0
+
+
+@given(STAMPS, st.integers(min_value=0, max_value=63))
+def test_agreement(stamp_ns: int, bit: int) -> None:
+    """A stamp agrees with its own timestamp, and one with a wrong bit above the lowest 13 does not."""
+    assert stamp_agrees(stamp_ns, rtp_timestamp(stamp_ns))
+    if bit > 13:
+        assert not stamp_agrees(stamp_ns ^ 1 << bit, rtp_timestamp(stamp_ns))
