@@ -1,0 +1,97 @@
+"""Roads to look at: flat grey ground with painted lines, seen through the pinhole of `CameraModel`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from lavt.domain import CameraModel, FloatArray, Picture
+from lavt.perception.bird_eye import ground_to_picture
+
+ROAD_GREY, SKY_GREY = 85, 190
+MARK_WIDTH_M = 0.125
+FINE = 3  # rays along and across one pixel
+
+
+@dataclass(frozen=True)
+class Line:
+    """A painted line at an offset from the lane's centre."""
+
+    offset_m: float
+    colour_bgr: tuple[int, int, int] = (225, 225, 225)
+    dash_m: float = 9.0
+    """Painted length of each 9 m."""
+    phase_m: float = 0.0
+
+
+LANE = (Line(1.75), Line(-1.75))
+BROKEN_LANE = (Line(1.75, dash_m=3.0), Line(-1.75, dash_m=3.0, phase_m=4.0))
+FOUR_LANES = (Line(8.75), Line(5.25, dash_m=3.0), *BROKEN_LANE, Line(-5.25))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Draws pictures of a straight or circular road from a place beside its centre."""
+
+    model: CameraModel
+
+    def picture(
+        self,
+        lines: Sequence[Line] = LANE,
+        curvature_per_m: float = 0.0,
+        offset_m: float = 0.0,
+        heading_rad: float = 0.0,
+    ) -> Picture:
+        """Show the road from a car whose rear axle is `offset_m` left of the centre, turned left by `heading_rad`."""
+        x_m, y_m = self._ground()
+        seen = np.isfinite(x_m) & (x_m < 120)
+        along, across = on_road(
+            np.where(seen, x_m, 0.0), np.where(seen, y_m, 0.0), curvature_per_m, offset_m, heading_rad
+        )
+        fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
+        fine[np.isfinite(x_m)] = ROAD_GREY
+        for line in lines:
+            paint = np.abs(across - line.offset_m) < MARK_WIDTH_M / 2
+            fine[seen & paint & (np.mod(along - line.phase_m, 9.0) < line.dash_m)] = line.colour_bgr
+        shrunk = cv2.resize(fine, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
+        return np.asarray(shrunk.round(), dtype=np.uint8)
+
+    def _ground(self) -> tuple[FloatArray, FloatArray]:
+        """Give the ground seen along each fine ray, infinite above the horizon."""
+        u = (np.arange(self.model.width_px * FINE) + 0.5) / FINE - 0.5
+        v = (np.arange(self.model.height_px * FINE) + 0.5) / FINE - 0.5
+        inverse = np.linalg.inv(ground_to_picture(self.model))
+        rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
+        below = rays[..., 2] > 1e-9  # the inverse's third row is the depth turned round: positive below the horizon
+        scale = np.where(below, rays[..., 2], 1.0)
+        return np.where(below, rays[..., 0] / scale, np.inf), np.where(below, rays[..., 1] / scale, np.inf)
+
+
+def on_road(
+    x_m: FloatArray, y_m: FloatArray, curvature_per_m: float, offset_m: float, heading_rad: float
+) -> tuple[FloatArray, FloatArray]:
+    """Take points of the vehicle's frame to (along, across) a road that starts straight ahead of the centre."""
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    x, y = x_m * cosine - y_m * sine, offset_m + x_m * sine + y_m * cosine
+    if curvature_per_m == 0:
+        return x, y
+    radius = 1 / curvature_per_m
+    ahead, sideways = x * np.sign(radius), (radius - y) * np.sign(radius)
+    return np.arctan2(ahead, sideways) * radius, radius - np.sign(radius) * np.hypot(x, radius - y)
+
+
+def centre_y_m(x_m: float, curvature_per_m: float) -> float:
+    """Give y of the centre of a road that starts along x at the rear axle."""
+    if curvature_per_m == 0:
+        return 0.0
+    radius = 1 / curvature_per_m
+    return float(radius - np.sign(radius) * np.sqrt(radius**2 - x_m**2))
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene(CameraModel())

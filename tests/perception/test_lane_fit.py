@@ -1,0 +1,131 @@
+import numpy as np
+import pytest
+
+from lavt.perception.bird_eye import GroundGrid
+from lavt.perception.lane_fit import (
+    LaneFit,
+    Points,
+    Sides,
+    fit_lane,
+    mark_points,
+    sides_by_windows,
+    sides_near,
+    start_line,
+)
+from lavt.streams import stream
+
+GRID = GroundGrid()
+CURVE = (0.2, -0.03, 0.012)
+
+
+def lines(centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m: np.ndarray | None = None) -> Points:
+    """Paint parallels of a centre, exactly along its normal."""
+    x = np.arange(3.65, 20.0, 0.1) if x_m is None else x_m
+    slope = centre[1] + 2 * centre[2] * x
+    y = centre[0] + centre[1] * x + centre[2] * x * x
+    across = np.repeat(offsets_m, 3) + np.tile([-0.04, 0.0, 0.04], len(offsets_m))
+    turned = np.sqrt(1 + slope**2)
+    return Points(
+        np.concatenate([x - slope / turned * offset for offset in across]),
+        np.concatenate([y + offset / turned for offset in across]),
+    )
+
+
+def follow(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
+    start = start_line(points, GRID, width_m)
+    assert start is not None
+    sides = sides_by_windows(points, GRID, start, width_m)
+    return sides, fit_lane(points, sides, GRID, width_m)
+
+
+def error_m(fit: LaneFit | None, centre: tuple[float, float, float]) -> float:
+    assert fit is not None
+    x = np.linspace(4, 19, 16)
+    return float(np.max(np.abs(np.polyval(fit.centre[::-1], x) - np.polyval(centre[::-1], x))))
+
+
+def test_mask_cells_become_points_on_the_ground() -> None:
+    """The first row is the farthest, the first column the leftmost."""
+    mask = np.zeros((GRID.rows, GRID.columns), dtype=np.uint8)
+    mask[0, 0] = 255
+    points = mark_points(mask, GRID)
+    assert points.x_m.tolist() == pytest.approx([19.95])
+    assert points.y_m.tolist() == pytest.approx([6.975])
+
+
+def test_a_curved_lane_is_found_and_fitted() -> None:
+    """From nothing, the windows follow a curve of 42 m radius and the fit lies within 3 cm of its centre."""
+    _, fit = follow(lines(CURVE, (1.75, -1.75)))
+    assert error_m(fit, CURVE) < 0.03
+    assert fit is not None
+    assert fit.width_m == pytest.approx(3.5, abs=0.03)
+    assert fit.confidence > 0.95
+
+
+def test_marks_of_the_lanes_beside_are_nobodys() -> None:
+    """Of six lines the windows take the two beside the car, also when it stands 0.6 m off the centre."""
+    points = lines((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
+    sides, fit = follow(points)
+    assert error_m(fit, (0.6, 0.0, 0.0)) < 0.02
+    assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}
+
+
+def test_points_near_a_known_lane_are_its_own() -> None:
+    """Half a metre off the line expected belongs to it, a metre off does not."""
+    points = Points(np.full(4, 10.0), np.array([2.25, 2.75, -1.3, -0.75]))
+    assert sides_near(points, (0.0, 0.0, 0.0), 3.5).tolist() == [1, 0, -1, 0]
+
+
+def test_one_line_is_enough() -> None:
+    """With one line only, the centre is half the expected width beside it, and the confidence about half."""
+    points = lines(CURVE, (-1.75,))
+    fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
+    assert error_m(fit, CURVE) < 0.03
+    assert fit is not None
+    assert fit.left_seen == 0
+    assert fit.confidence == pytest.approx(0.5, abs=0.05)
+
+
+def test_lines_that_are_not_a_lane_apart_are_not_averaged() -> None:
+    """When the width measured is no lane's, only the line of which more is seen counts."""
+    long, short = lines((0.0, 0.0, 0.0), (1.75,)), lines((0.0, 0.0, 0.0), (-0.5,), np.arange(4, 9, 0.1))
+    points = Points(np.concatenate([long.x_m, short.x_m]), np.concatenate([long.y_m, short.y_m]))
+    sides = np.concatenate([np.full(len(long.x_m), 1), np.full(len(short.x_m), -1)]).astype(np.int8)
+    fit = fit_lane(points, sides, GRID, 3.5)
+    assert error_m(fit, (0.0, 0.0, 0.0)) < 0.02
+
+
+def test_a_short_stretch_is_fitted_straight() -> None:
+    """Less than 6 m of road give a line: their curvature would be noise."""
+    points = lines(CURVE, (1.75, -1.75), np.arange(5.0, 10.0, 0.1))
+    fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
+    assert fit is not None
+    assert fit.centre[2] == 0.0
+
+
+def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
+    """Spots half a metre off a line are left out by the second pass, and lower the confidence."""
+    clean = lines(CURVE, (1.75, -1.75))
+    spots = lines(CURVE, (1.2,), np.arange(12.0, 14.0, 0.1))
+    points = Points(np.concatenate([clean.x_m, spots.x_m]), np.concatenate([clean.y_m, spots.y_m]))
+    fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
+    assert error_m(fit, CURVE) < 0.04
+    assert fit is not None
+    assert fit.fitting < 0.97
+
+
+def test_too_few_points_are_no_lane() -> None:
+    """Nothing, or a handful of points, gives no fit and no error."""
+    nothing = Points(np.empty(0), np.empty(0))
+    assert start_line(nothing, GRID, 3.5) is None
+    assert fit_lane(nothing, np.empty(0, dtype=np.int8), GRID, 3.5) is None
+    few = lines((0.0, 0.0, 0.0), (1.75, -1.75), np.arange(5.0, 5.5, 0.1))
+    assert fit_lane(few, sides_near(few, (0.0, 0.0, 0.0), 3.5), GRID, 3.5) is None
+
+
+def test_speckle_is_hardly_believed() -> None:
+    """Points all over the place give a low confidence, because most of those near the lines are not on them."""
+    generator = stream(1, "speckle")
+    points = Points(generator.uniform(3.6, 20, 3000), generator.uniform(-7, 7, 3000))
+    fit = fit_lane(points, sides_near(points, (0.0, 0.0, 0.0), 3.5), GRID, 3.5)
+    assert fit is None or fit.confidence < 0.5

@@ -1,0 +1,49 @@
+import numpy as np
+
+from lavt.perception.lane_pixels import Mask, edge_pixels, lane_pixels, white_pixels, yellow_pixels
+
+ROAD = 85
+
+
+def road() -> Mask:
+    return np.full((40, 640, 3), ROAD, dtype=np.uint8)
+
+
+def test_a_white_mark_is_found_and_nothing_else() -> None:
+    """A white stripe across the rows gives its own pixels, not those of the road beside it."""
+    picture = road()
+    picture[:, 300:308] = 220
+    mask = lane_pixels(picture)
+    assert mask[:, 301:307].all()
+    assert not mask[:, :298].any()
+    assert not mask[:, 310:].any()
+
+
+def test_a_yellow_mark_is_found() -> None:
+    """Yellow counts as paint though it is hardly brighter than the road."""
+    picture = road()
+    picture[:, 300:308] = (40, 130, 150)
+    assert lane_pixels(picture)[:, 301:307].all()
+    assert not white_pixels(picture[..., 1]).any() or yellow_pixels(picture)[:, 301:307].all()
+
+
+def test_brighter_light_is_not_paint() -> None:
+    """A road that becomes bright gradually has no edges, so none of it is paint."""
+    picture = road()
+    picture[:] = np.linspace(60, 250, 640).astype(np.uint8)[None, :, None]
+    assert not lane_pixels(picture).any()
+
+
+def test_a_bright_field_is_not_paint_inside() -> None:
+    """What is bright over more than a mark's width is paint at its rim at most."""
+    picture = road()
+    picture[:, 200:440] = 220
+    assert not lane_pixels(picture)[:, 260:380].any()
+
+
+def test_a_stripe_along_the_rows_is_not_paint() -> None:
+    """A bar across the road, as at a stop line, has no upright edges."""
+    picture = road()
+    picture[20:23] = 220
+    assert not lane_pixels(picture).any()
+    assert not edge_pixels(picture[..., 1]).any()
