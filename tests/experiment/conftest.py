@@ -61,11 +61,19 @@ class Drive:
         return round((self.tau_v_ms + self.spread_ms * (number % 5 - 2) / 2) * NS_PER_MS)
 
 
+RADIUS_M = 120.0
+
+
+def on_route(progress_m: float, left_m: float) -> tuple[float, float]:
+    angle_rad = progress_m / RADIUS_M
+    return (RADIUS_M - left_m) * math.sin(angle_rad), RADIUS_M - (RADIUS_M - left_m) * math.cos(angle_rad)
+
+
 def write_server(drive: Drive, path: Path) -> None:
     writer = RecordWriter(path, "server")
     writer.annotate("versions", {"lavt": "0.1.0"})
     writer.annotate("machine", {"cores": "2"})
-    points = [[x / 2, 0.0] for x in range(int(drive.seconds * 8) * 2 + 20)]
+    points = [on_route(index / 2, 0.0) for index in range(201)]
     writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
     end_ns = round(drive.seconds * NS_PER_S)
     for second in range(-1, math.ceil(drive.seconds) + 2):
@@ -92,7 +100,8 @@ def write_server(drive: Drive, path: Path) -> None:
         slope_rad = math.atan(drive.wobble_m / 5 * math.cos(progress_m / 5))
         mono_ns = drive.server(at_ns).mono_ns
         steering_rad = -0.05 * math.sin(progress_m / 5)
-        truth = GroundTruth(mono_ns, progress_m, error_m, slope_rad, 8.0, steering_rad, error_m, slope_rad, progress_m)
+        x_m, y_m = on_route(progress_m, error_m)
+        truth = GroundTruth(mono_ns, x_m, y_m, slope_rad, 8.0, steering_rad, error_m, slope_rad, progress_m)
         writer.write("truth", truth, drive.server(at_ns))
     if drive.server_counts:
         writer.write("counts", dict(drive.server_counts), drive.server(end_ns))
@@ -114,9 +123,14 @@ def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
         "keyframe": number % 30 == 0,
     }
     writer.write("frame", frame, now)
-    ends = (("capture", 1), ("stamp", 2), ("encode", 6), ("packetize", 7))
+    ends = (("capture", -1), ("stamp", 0), ("encode", 4), ("packetize", 5))
     hops = [[name, now.mono_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
-    timeline = {"node": "camera", "stamp_ns": now.wall_ns, "channel": "wake", "arrived_mono_ns": now.mono_ns}
+    timeline = {
+        "node": "camera",
+        "stamp_ns": now.wall_ns,
+        "channel": "wake",
+        "arrived_mono_ns": now.mono_ns - 3 * NS_PER_MS,
+    }
     writer.write("timeline", {**timeline, "hops": hops}, now)
 
 
@@ -176,7 +190,7 @@ def write_client(drive: Drive, path: Path) -> None:
     writer.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_run() -> Callable[..., Path]:
     """Give a function that writes both records of a made-up drive into a directory; keywords are those of `Drive`."""
 
