@@ -1,0 +1,67 @@
+"""Where the time of a loop goes: medians of every hop, from the timelines of both records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lavt.domain import NS_PER_MS
+from lavt.experiment.latency import frames_within, look_up
+from lavt.experiment.metrics import driving_interval
+from lavt.experiment.record import Record
+from lavt.experiment.table import MISSING, Table
+
+BEFORE_VIDEO, AFTER_VIDEO, AFTER_CONTROL = ("camera",), ("receiver", "driver"), ("actuator",)
+"""The nodes on the way of a frame, and between which of them it is on the network."""
+
+Share = tuple[str, str, float]
+"""Node or "network", what it did, and how long that took (median, ms)."""
+
+
+def breakdown(server: Record, client: Record, result: Mapping[str, Any]) -> list[Share]:
+    """Split the median loop latency of a run into hops and links, in the order of a frame's life.
+
+    A hop's time is the median over the frames of the drive. The control link is the median tau_c. What is left of the
+    median loop is the video link and every wait for a next tick; medians do not add up exactly, so this is a picture of
+    the loop, not a measurement. Empty where there is no loop latency.
+    """
+    loop_ms, tau_c_ms = result["loop_ms"]["p50"], result["tau_c_ms"]["p50"]
+    if loop_ms is None:
+        return []
+    began_ns, ended_ns, _ = driving_interval(server)
+    frames = frames_within(server.table("frame"), began_ns, ended_ns)
+    camera = _hops(server.table("timeline"), BEFORE_VIDEO, frames, from_stamp=True)
+    client_hops = _hops(client.table("timeline"), AFTER_VIDEO, frames)
+    actuator = _hops(server.table("timeline"), AFTER_CONTROL, frames)
+    control_link: list[Share] = [] if tau_c_ms is None else [("network", "control link", max(tau_c_ms, 0.0))]
+    known_ms = sum(share[2] for share in [*camera, *client_hops, *control_link, *actuator])
+    rest: list[Share] = [("network", "video link and waiting", max(loop_ms - known_ms, 0.0))]
+    return [*camera, *rest, *client_hops, *control_link, *actuator]
+
+
+def _hops(timelines: Table, nodes: Sequence[str], frames: Table, *, from_stamp: bool = False) -> list[Share]:
+    """Median duration of each hop of `nodes`, over the first timeline that each node wrote for each frame.
+
+    With `from_stamp` only what happened after the frame was stamped counts: the loop begins there.
+    """
+    stamps = timelines.ints("stamp_ns")
+    stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
+    names, arrivals_ns = timelines.texts("node"), timelines.ints("arrived_mono_ns")
+    every_hops = timelines.objects("hops")
+    durations_ns: dict[tuple[str, str], list[int]] = {}
+    seen: set[tuple[str, int]] = set()
+    for node, stamp_ns, start_ns, arrived_ns, hops in zip(
+        names, stamps.tolist(), stamped_ns.tolist(), arrivals_ns.tolist(), every_hops, strict=True
+    ):
+        if node not in nodes or start_ns == MISSING or (node, stamp_ns) in seen:
+            continue
+        seen.add((node, stamp_ns))
+        before_ns = max(arrived_ns, start_ns) if from_stamp else arrived_ns
+        for name, end_ns in hops or []:
+            if end_ns > before_ns or not from_stamp:
+                durations_ns.setdefault((node, name), []).append(end_ns - before_ns)
+                before_ns = end_ns
+    ordered = sorted(durations_ns, key=lambda hop: nodes.index(hop[0]))
+    return [(node, name, float(np.median(durations_ns[node, name])) / NS_PER_MS) for node, name in ordered]

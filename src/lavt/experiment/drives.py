@@ -1,0 +1,56 @@
+"""What the figures of a report need of each run: its result, and what its server recorded of the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.experiment.metrics import driving_interval
+from lavt.experiment.record import read_record
+from lavt.experiment.table import Table
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One run: where it is, its `result.json`, the truth of the driving interval, and the route's centre line.
+
+    `reference_m` is (points, 2); `truth` has no rows where there was no simulator.
+    """
+
+    directory: Path
+    result: Mapping[str, Any]
+    truth: Table
+    reference_m: FloatArray
+    began_ns: int
+    annotations: Mapping[str, Mapping[str, str]]
+    """Versions and machine, as recorded."""
+
+    @property
+    def condition(self) -> str:
+        """Name of the run's condition."""
+        return str(self.result["condition"])
+
+
+def read_drive(directory: Path, result: Mapping[str, Any]) -> Drive:
+    """Read what the figures need of the run in `directory`."""
+    record = read_record(directory / "server.mcap", channels=("truth", "event", "route"))
+    began_ns, ended_ns, _ = driving_interval(record)
+    truth = record.table("truth")
+    truth_ns = truth.ints("mono_ns")
+    routes = record.table("route").objects("points")
+    reference_m = np.array(routes[0] if routes and routes[0] else np.zeros((0, 2)), np.float64)
+    driven = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    return Drive(directory, result, driven, reference_m, began_ns, record.annotations)
+
+
+def one_of_each_condition(drives: Sequence[Drive]) -> list[Drive]:
+    """Choose a drive of each condition, in their order: a valid one if there is one, the first of those."""
+    chosen: dict[str, Drive] = {}
+    for drive in sorted(drives, key=lambda drive: not drive.result["valid"]):
+        chosen.setdefault(drive.condition, drive)
+    return [chosen[name] for name in sorted(chosen)]

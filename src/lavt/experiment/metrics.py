@@ -1,0 +1,136 @@
+"""Everything `result.json` says of how a run went, computed from its two records and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.clocks import clocks
+from lavt.experiment.latency import (
+    closure_ns,
+    control_latency_ns,
+    frames_within,
+    loops,
+    percentiles_ms,
+    picture_age,
+    pictures_of,
+    video_latency_ns,
+)
+from lavt.experiment.record import Record
+from lavt.experiment.table import MISSING, Table
+from lavt.experiment.tracking import cross_track, distance_m, reversals_per_s, root_mean_square, sampled_by_distance
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was measured in a run.
+
+    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of how far the
+    parts of the loop are from the whole; `clock_bound_ms` the bound of Delta; both None where they are not known.
+    """
+
+    entry: Mapping[str, Any]
+    closure_p95_ms: float | None
+    clock_bound_ms: float | None
+
+
+def driving_interval(server: Record) -> tuple[int, int, str | None]:
+    """When the drive began and ended, on the server's monotonic clock, and how.
+
+    Without an event `drive_began` nothing was driven: the interval is empty. Without an event `ending` (a crash) it
+    reaches to the last message of the record, and the ending is None.
+    """
+    last_ns = max((int(table.mono_ns.max()) for table in server.tables.values() if len(table)), default=0)
+    began_ns: int | None = None
+    ended_ns, ending = last_ns, None
+    for kind, mono_ns, detail in _events(server.table("event")):
+        if kind == "drive_began" and began_ns is None:
+            began_ns = mono_ns
+        if kind == "ending" and began_ns is not None and ending is None:
+            ended_ns, ending = mono_ns, detail
+    return (ended_ns + 1 if began_ns is None else began_ns), ended_ns, ending
+
+
+def _events(events: Table) -> list[tuple[str, int, str]]:
+    return list(zip(events.texts("kind"), events.ints("mono_ns").tolist(), events.texts("detail"), strict=True))
+
+
+def measure(server: Record, client: Record) -> Measured:
+    """Compute every metric of a run. What cannot be known (no truth, no clock samples, no picture) is None."""
+    began_ns, ended_ns, ending = driving_interval(server)
+    drove = began_ns <= ended_ns
+    latencies, closure_p95_ms, clock_bound_ms = _latencies(server, client, began_ns, ended_ns)
+    entry = {
+        "ending": ending,
+        **_tracking(server, began_ns, ended_ns),
+        "duration_s": (ended_ns - began_ns) / NS_PER_S if drove else None,
+        **latencies,
+    }
+    return Measured(entry, closure_p95_ms, clock_bound_ms)
+
+
+def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
+    truth = server.table("truth")
+    truth_ns = truth.ints("mono_ns")
+    truth = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    kinds = [kind for kind, mono_ns, _ in _events(server.table("event")) if began_ns <= mono_ns <= ended_ns]
+    return {
+        "distance_m": distance_m(truth),
+        **cross_track(truth),
+        "heading_rms_rad": root_mean_square(sampled_by_distance(truth, "heading_error_rad")),
+        "steering_rms_rad": root_mean_square(sampled_by_distance(truth, "steering_rad")),
+        "steering_reversals_per_s": reversals_per_s(truth),
+        "collisions": kinds.count("collision"),
+        "lane_invasions": kinds.count("lane_invasion"),
+    }
+
+
+def _latencies(
+    server: Record, client: Record, began_ns: int, ended_ns: int
+) -> tuple[dict[str, Any], float | None, float | None]:
+    all_frames, admissions = server.table("frame"), server.table("admission")
+    frames = frames_within(all_frames, began_ns, ended_ns)
+    pictures = pictures_of(client.table("picture"), frames)
+    paired = loops(frames, admissions, ended_ns)
+    age = picture_age(all_frames, admissions, began_ns, ended_ns)
+    on_one_scale = clocks(server.table("clock"), client.table("clock"))
+    nothing = np.zeros(0, np.int64)
+    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = nothing, nothing, None, None
+    if on_one_scale is not None:
+        tau_v_ns = video_latency_ns(pictures, on_one_scale)
+        tau_c_ns = control_latency_ns(admissions, on_one_scale, began_ns, ended_ns)
+        bound_ms = None if on_one_scale.bound_s is None else on_one_scale.bound_s * 1e3
+        closures_ns = closure_ns(pictures, paired, on_one_scale)
+        if len(closures_ns):
+            closure_p95_ms = float(np.percentile(np.abs(closures_ns), 95)) / NS_PER_MS
+    entry = {
+        "loop_ms": percentiles_ms(paired.loop_ns),
+        "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
+        "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
+        "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
+        "frames_sent": len(frames),
+        "frames_decoded": len(pictures),
+        "frames_unreadable": int(np.sum(~pictures.flags("readable"))),
+    }
+    return entry, closure_p95_ms, bound_ms
+
+
+def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, Any]:
+    return {
+        "p5": summary["p5"],
+        "p50": summary["p50"],
+        "p95": summary["p95"],
+        "bound": bound_ms if summary["n"] else None,
+        "n": summary["n"],
+    }
+
+
+def count(record: Record, name: str) -> int | None:
+    """Last value of a counter on the channel `counts`; None where it was never recorded."""
+    values = record.table("counts").ints(name)
+    known = values[values != MISSING]
+    return int(known[-1]) if len(known) else None

@@ -1,0 +1,94 @@
+"""Payloads of a record as JSON, and the JSON Schema of their types.
+
+Bytes become base64 text, None and NaN become null, times stay whole numbers, floats keep every digit.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+from pydantic.errors import PydanticUserError
+
+Json = Any
+"""What `json` reads and writes: dict, list, str, int, float, bool, None."""
+
+
+@functools.cache
+def _field_names(payload_type: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(payload_type))
+
+
+def _plain(value: Any) -> Json:
+    """Say in simpler types what `json` cannot write; what is inside of it is asked for again."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {name: getattr(value, name) for name in _field_names(type(value))}
+    if isinstance(value, bytes | bytearray | memoryview):
+        return base64.b64encode(value).decode("ascii")
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Enum):
+        return value.value
+    raise TypeError(f"a record cannot hold a {type(value).__name__}")
+
+
+_ENCODER = json.JSONEncoder(default=_plain, separators=(",", ":"), allow_nan=False)
+
+
+def without_nan(value: Any) -> Json:
+    """Say the same value in plain JSON types, with null for every number that is not finite."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(entry) for entry in value]
+    return without_nan(_plain(value))
+
+
+def to_json(payload: Any) -> bytes:
+    """One line of JSON for a dataclass or a dict.
+
+    Raises `TypeError` for values that JSON has no words for.
+    """
+    try:
+        return _ENCODER.encode(payload).encode()
+    except ValueError:  # a float that is not finite: rare, and worth a second walk only then
+        return _ENCODER.encode(without_nan(payload)).encode()
+
+
+def _with_base64(schema: Json) -> Json:
+    """Say of bytes what `to_json` does with them; pydantic calls them only binary."""
+    if isinstance(schema, dict):
+        if schema.get("format") == "binary":
+            return {"type": "string", "contentEncoding": "base64"}
+        return {key: _with_base64(entry) for key, entry in schema.items()}
+    if isinstance(schema, list):
+        return [_with_base64(entry) for entry in schema]
+    return schema
+
+
+@functools.cache
+def json_schema(payload_type: type) -> bytes:
+    """JSON Schema of a payload's type; of a dict, or of a type pydantic cannot describe, only that it is an object."""
+    schema: Json = {"type": "object"}
+    if is_dataclass(payload_type):
+        try:
+            schema = _with_base64(TypeAdapter(payload_type).json_schema(mode="serialization"))
+        except PydanticUserError:
+            schema = {"type": "object", "title": payload_type.__name__}
+    return json.dumps(schema).encode()

@@ -1,0 +1,217 @@
+"""Records of a run: one MCAP file a side, everything that went in and out, in the order it happened.
+
+A message's log time is the host's wall clock, its publish time the host's monotonic clock. A step of the wall clock
+must not put messages in another order, so readers go by their order in the file. Formats: MCAP (mcap.dev/spec), JSON
+with JSON Schema; the video is `foxglove.CompressedVideo`, which Foxglove and others play.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from lavt.domain import NS_PER_S, Now
+from lavt.errors import WorkError
+from lavt.experiment.payload_json import json_schema, to_json
+from lavt.experiment.table import EMPTY, Table, table_of
+
+CHUNK_BYTES = 64 * 1024
+"""What a crash can cost at most: only whole chunks can be read again."""
+
+VIDEO = "video"
+"""The channel of access units; its payload has `stamp_ns` and `data`."""
+
+_VIDEO_SCHEMA_NAME = "foxglove.CompressedVideo"
+_VIDEO_SCHEMA = {
+    "type": "object",
+    "title": _VIDEO_SCHEMA_NAME,
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {
+                "sec": {"type": "integer", "minimum": 0},
+                "nsec": {"type": "integer", "minimum": 0, "maximum": NS_PER_S - 1},
+            },
+        },
+        "frame_id": {"type": "string"},
+        "data": {"type": "string", "contentEncoding": "base64"},
+        "format": {"type": "string"},
+    },
+}
+
+Side = Literal["server", "client"]
+
+
+class Digest(Protocol):
+    """What the writers need of a digest, as in `hashlib`."""
+
+    def update(self, data: bytes, /) -> None:
+        """Add bytes."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class VideoUnit:
+    """One access unit of the video (H.264, Annex B) and the stamp of its frame: the payload of the channel `VIDEO`."""
+
+    stamp_ns: int
+    data: bytes
+
+
+class RecordWriter:
+    """Writes the record of one side.
+
+    `digest`, where there is one, gets every message: side, channel, monotonic time, length and JSON. Both sides of a
+    run in virtual time share one, so it also holds the order between them. What `annotate` writes stays out of it.
+    """
+
+    def __init__(self, path: Path, side: Side, digest: Digest | None = None) -> None:
+        self._side = side
+        self._digest = digest
+        self._file = path.open("wb")
+        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES)
+        self._mcap.start(library=f"lavt {side}")
+        self._channels: dict[tuple[str, type], int] = {}
+        self._schemas: dict[type, int] = {}
+        self._sequence = 0
+
+    def write(self, channel: str, payload: Any, now: Now) -> None:
+        """Write one message: a dataclass or a dict, on the topic "/" + `channel`.
+
+        Raises `TypeError` for values that JSON has no words for.
+        """
+        data = _video_json(payload) if channel == VIDEO else to_json(payload)
+        channel_id = self._channels.get((channel, type(payload))) or self._register(channel, type(payload))
+        self._sequence += 1
+        self._mcap.add_message(channel_id, now.wall_ns, data, now.mono_ns, self._sequence & 0xFFFFFFFF)
+        if self._digest is not None:
+            self._digest.update(f"{self._side} {channel} {now.mono_ns} {len(data)}\n".encode())
+            self._digest.update(data)
+
+    def annotate(self, name: str, entries: Mapping[str, str]) -> None:
+        """Write what belongs to this machine and not to the run's result: versions, the machine itself."""
+        self._mcap.add_metadata(name, dict(entries))
+
+    def close(self) -> None:
+        """Finish the file; a file without this can still be read, but says that it is not complete."""
+        if not self._file.closed:
+            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+
+    def _register(self, channel: str, payload_type: type) -> int:
+        """Channel number for a payload type; the second type of a channel becomes a second channel of its topic."""
+        if channel == VIDEO:
+            schema_id = self._mcap.register_schema(_VIDEO_SCHEMA_NAME, "jsonschema", json.dumps(_VIDEO_SCHEMA).encode())
+        else:
+            if payload_type not in self._schemas:
+                name = "object" if payload_type is dict else f"lavt.{payload_type.__name__}"
+                schema = json_schema(payload_type)
+                self._schemas[payload_type] = self._mcap.register_schema(name, "jsonschema", schema)
+            schema_id = self._schemas[payload_type]
+        channel_id = self._mcap.register_channel("/" + channel, "json", schema_id)
+        self._channels[channel, payload_type] = channel_id
+        return channel_id
+
+
+def _video_json(payload: Any) -> bytes:
+    stamp_ns, unit = (
+        (payload["stamp_ns"], payload["data"]) if isinstance(payload, dict) else (payload.stamp_ns, payload.data)
+    )
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    text = base64.b64encode(unit).decode("ascii")
+    # Written by hand: base64 needs no escaping, and this is by far the largest message.
+    return (
+        f'{{"timestamp":{{"sec":{seconds},"nsec":{nanoseconds}}},"frame_id":"camera","data":"{text}","format":"h264"}}'
+    ).encode()
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One side's record, read back.
+
+    `complete` is False for a file that was never finished, or is damaged: then it holds what came before.
+    """
+
+    path: Path
+    complete: bool
+    tables: Mapping[str, Table]
+    annotations: Mapping[str, Mapping[str, str]]
+
+    def table(self, channel: str) -> Table:
+        """Give the messages of a channel; no rows where nothing was recorded."""
+        return self.tables.get(channel, EMPTY)
+
+    def video(self) -> list[tuple[int, bytes]]:
+        """Read the access units and the stamp (ns) of each from the file; they are too large to be kept."""
+        units = []
+        for item in _readable_records(self.path, _Outcome(), topics={"/" + VIDEO}):
+            if isinstance(item, tuple):
+                fields = json.loads(item[1].data)
+                stamp_ns = fields["timestamp"]["sec"] * NS_PER_S + fields["timestamp"]["nsec"]
+                units.append((stamp_ns, base64.b64decode(fields["data"])))
+        return units
+
+
+class _Outcome:
+    """Whether reading came to the proper end of the file."""
+
+    complete = False
+
+
+def _readable_records(
+    path: Path, outcome: _Outcome, topics: Container[str] | None
+) -> Iterator[tuple[str, Message] | Metadata]:
+    """Messages of `topics` (None: all) and metadata in file order, up to the end or to the first damage."""
+    topic_of: dict[int, str] = {}
+    with path.open("rb") as stream:
+        try:
+            for item in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(item, Channel):
+                    topic_of[item.id] = item.topic
+                elif isinstance(item, Message):
+                    topic = topic_of[item.channel_id]
+                    if topics is None or topic in topics:
+                        yield topic, item
+                elif isinstance(item, Metadata):
+                    yield item
+        except (McapError, struct.error, ValueError, KeyError, RuntimeError):
+            return  # a cut or damaged end: what came before is whole, each chunk has its own checksum
+        outcome.complete = True
+
+
+def read_record(path: Path, channels: Container[str] | None = None) -> Record:
+    """Read the record at `path` into tables, without the video; `channels` names the only ones wanted.
+
+    An unfinished file (a crash, a full disk) gives all its whole chunks. Raises `WorkError` where there is no file.
+    """
+    if not path.is_file():
+        raise WorkError(f"there is no record at {path}")
+    outcome = _Outcome()
+    rows: dict[str, list[dict[str, Any]]] = {}
+    times: dict[str, tuple[list[int], list[int]]] = {}
+    annotations: dict[str, dict[str, str]] = {}
+    for item in _readable_records(path, outcome, topics=None):
+        if isinstance(item, Metadata):
+            annotations[item.name] = dict(item.metadata)
+            continue
+        topic, message = item
+        channel = topic.removeprefix("/")
+        if channel == VIDEO or (channels is not None and channel not in channels):
+            continue
+        rows.setdefault(channel, []).append(json.loads(message.data))
+        mono_ns, wall_ns = times.setdefault(channel, ([], []))
+        mono_ns.append(message.publish_time)
+        wall_ns.append(message.log_time)
+    tables = {channel: table_of(rows[channel], *times[channel]) for channel in rows}
+    return Record(path=path, complete=outcome.complete, tables=tables, annotations=annotations)

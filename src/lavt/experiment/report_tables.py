@@ -1,0 +1,90 @@
+"""The tables of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lavt.experiment.breakdown import Share
+from lavt.experiment.page import NOTHING, interval, latency, number, percent, table
+
+
+def how_it_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Say in words whether time was real, and who injected the delay."""
+    ways = {(run["time"], run["injection"]) for run in runs}
+    return "; ".join(
+        "virtual time: network and clocks are modelled, pictures, codec and packets are real"
+        if time == "virtual"
+        else f"real time, {'nothing injected' if injection == 'none' else f'injected by {injection}'}"
+        for time, injection in sorted(ways, key=str)
+    )
+
+
+def condition_table(conditions: Mapping[str, Mapping[str, Any]]) -> str:
+    """One row a condition, as in the paper, with what was injected beside what was measured."""
+    headers = [
+        "condition",
+        "injected ms (video / control)",
+        "loop ms",
+        "τ video ms",
+        "τ control ms",
+        "runs",
+        "completed",
+        "95 % interval",
+        "collisions / run",
+        "lane invasions / run",
+        "p95 error m",
+        "95 % interval",
+    ]
+    rows = [
+        [
+            name,
+            f"{number(entry['injected_ms']['video'], 0)} / {number(entry['injected_ms']['control'], 0)}",
+            latency(entry["loop_ms"]),
+            latency(entry["tau_v_ms"]),
+            latency(entry["tau_c_ms"]),
+            str(entry["runs"]),
+            percent(entry["completion_rate"]),
+            interval(entry["completion_interval"], unit=100.0),
+            number(entry["collisions_per_run"], 2),
+            number(entry["lane_invasions_per_run"], 2),
+            number(entry["p95_m"], 2),
+            interval(entry["p95_interval"], digits=2),
+        ]
+        for name, entry in conditions.items()
+    ]
+    return table(headers, rows)
+
+
+def run_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """One row a run: what it was, how it ended, and whether it may count."""
+    headers = ["run", "time", "route", "condition", "ending", "distance m", "loop ms", "p95 error m", "validity"]
+    rows = [
+        [
+            str(run["run"]),
+            f"{run['time']}, {run['injection']}",
+            str(run["route"]),
+            str(run["condition"]),
+            str(run["ending"] or NOTHING),
+            number(run["distance_m"], 0),
+            number(run["loop_ms"]["p50"]),
+            number(run["p95_m"], 2),
+            "valid" if run["valid"] else "not valid: " + "; ".join(run["invalid_because"]),
+        ]
+        for run in runs
+    ]
+    return table(headers, rows, text_columns=[8])
+
+
+def hop_table(shares: Mapping[str, Sequence[Share]]) -> str:
+    """One row a hop in the order of a frame's life, one column a condition: medians in ms."""
+    hops = list(dict.fromkeys((node, hop) for every in shares.values() for node, hop, _ in every))
+    durations = {name: {(node, hop): ms for node, hop, ms in every} for name, every in shares.items()}
+    rows = [[f"{node}: {hop}", *(number(of.get((node, hop)), 2) for of in durations.values())] for node, hop in hops]
+    return table(["hop, median ms", *durations], rows)
+
+
+def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> str:
+    """Show what a run's record says of versions and machine."""
+    rows = [[name, key, value] for name in sorted(annotations) for key, value in annotations[name].items()]
+    return table(["", "", ""], rows or [["not recorded", "", ""]], text_columns=[1, 2])

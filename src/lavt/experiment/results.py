@@ -1,0 +1,96 @@
+"""`result.json`: what one run was, how it ended, and what was measured."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lavt.errors import WorkError
+from lavt.experiment.metrics import measure
+from lavt.experiment.payload_json import without_nan
+from lavt.experiment.record import Record
+from lavt.experiment.validity import invalid_because
+
+IDENTITY = (
+    "run",
+    "time",
+    "injection",
+    "inherent",
+    "route",
+    "condition",
+    "controller",
+    "preset",
+    "driver",
+    "participant",
+    "block",
+    "order",
+    "repetition",
+    "seed",
+)
+"""What says which run it was: known before it is driven. What does not apply is null."""
+
+MEASURES = (
+    "distance_m",
+    "duration_s",
+    "mae_m",
+    "rms_m",
+    "p95_m",
+    "max_m",
+    "heading_rms_rad",
+    "steering_rms_rad",
+    "steering_reversals_per_s",
+    "collisions",
+    "lane_invasions",
+    "loop_ms",
+    "picture_age_ms",
+    "tau_v_ms",
+    "tau_c_ms",
+    "frames_sent",
+    "frames_decoded",
+    "frames_unreadable",
+)
+
+
+def run_result(
+    identity: Mapping[str, Any],
+    server: Record,
+    client: Record,
+    *,
+    digest: str | None = None,
+    reasons: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Compute the run's entry of `summary.json` from its records.
+
+    `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes) and `injected_ms` (what
+    was asked of the network); these two are kept. `reasons` are those against the run that records do not show.
+    """
+    measured = measure(server, client)
+    against = [*invalid_because(server, client, measured), *reasons]
+    further = {key: identity[key] for key in ("axes", "injected_ms") if key in identity}
+    return {
+        **{key: identity.get(key) for key in IDENTITY},
+        **further,
+        "digest": digest,
+        "ending": measured.entry["ending"],
+        "valid": not against,
+        "invalid_because": against,
+        **{key: measured.entry[key] for key in MEASURES},
+    }
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` as JSON that people can read, all at once: nobody ever sees half a file. NaN becomes null."""
+    text = json.dumps(without_nan(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    unfinished = path.with_name(path.name + ".part")
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file. Raises `WorkError` where it is missing or is no JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise WorkError(f"cannot read {path}: {error}") from error

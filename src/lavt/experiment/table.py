@@ -1,0 +1,119 @@
+"""One channel of a record as columns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lavt.domain import FloatArray
+
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+MISSING = int(np.iinfo(np.int64).min)
+"""Null in a column of whole numbers. A float could not hold wall times: beyond 2^60 it counts in steps of 256 ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Messages of one channel, in the order they were recorded.
+
+    `columns` has an array per field of the payload: int64 (null is `MISSING`), float64 (null is NaN), bool, or objects.
+    `mono_ns` and `wall_ns` say when each message was recorded, on the host that recorded it; a payload's own field of
+    that name is in `columns`.
+    """
+
+    mono_ns: IntArray
+    wall_ns: IntArray
+    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.mono_ns)
+
+    def ints(self, name: str) -> IntArray:
+        """Column of whole numbers; `MISSING` where there is none, or no such column."""
+        column = self.columns.get(name)
+        if column is None or column.dtype != np.int64:
+            return _ints_of(column, len(self))
+        return column
+
+    def floats(self, name: str) -> FloatArray:
+        """Column of numbers; NaN where there is none, or no such column."""
+        column = self.columns.get(name)
+        if column is None:
+            return np.full(len(self), np.nan)
+        if column.dtype == np.int64:
+            return np.where(column == MISSING, np.nan, column.astype(np.float64))
+        if column.dtype == object:
+            return np.array([value if isinstance(value, int | float) else np.nan for value in column], np.float64)
+        return column.astype(np.float64)
+
+    def flags(self, name: str) -> BoolArray:
+        """Column of truth values; False where there is none, or no such column."""
+        column = self.columns.get(name)
+        if column is None:
+            return np.zeros(len(self), np.bool_)
+        return np.array([value is True or value is np.True_ for value in column], np.bool_)
+
+    def texts(self, name: str) -> list[str]:
+        """Column of texts; empty where there is none, or no such column."""
+        column = self.columns.get(name)
+        if column is None:
+            return [""] * len(self)
+        return [value if isinstance(value, str) else "" for value in column]
+
+    def objects(self, name: str) -> list[Any]:
+        """Column as plain Python values; None where there is none, or no such column."""
+        column = self.columns.get(name)
+        if column is None:
+            return [None] * len(self)
+        return [None if _is_null(value) else value for value in column.tolist()]
+
+    def where(self, chosen: BoolArray) -> Table:
+        """Choose the rows for which `chosen` is true."""
+        columns = {name: column[chosen] for name, column in self.columns.items()}
+        return Table(self.mono_ns[chosen], self.wall_ns[chosen], columns)
+
+
+def _is_null(value: Any) -> bool:
+    return value is None or value == MISSING or (isinstance(value, float) and math.isnan(value))
+
+
+def _ints_of(column: NDArray[Any] | None, length: int) -> IntArray:
+    ints = np.full(length, MISSING, np.int64)
+    if column is not None and column.dtype == object:
+        for index, value in enumerate(column):
+            if isinstance(value, int) and not isinstance(value, bool):
+                ints[index] = value
+    elif column is not None:
+        known = np.isfinite(column.astype(np.float64))
+        ints[known] = column[known].astype(np.int64)
+    return ints
+
+
+EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
+    """Make columns of `rows`; a field that a row lacks is null there."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    columns = {name: _column([row.get(name) for row in rows]) for name in names}
+    return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    kinds = {type(value) for value in values} - {type(None)}
+    if kinds == {bool} and None not in values:
+        return np.array(values, np.bool_)
+    if kinds == {int} and all(value is None or abs(value) <= -(MISSING + 1) for value in values):
+        return np.array([MISSING if value is None else value for value in values], np.int64)
+    if kinds <= {int, float}:
+        return np.array([np.nan if value is None else value for value in values], np.float64)
+    column = np.empty(len(values), object)
+    column[:] = values
+    return column

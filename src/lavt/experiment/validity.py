@@ -1,0 +1,93 @@
+"""Whether a run may count. Only the infrastructure is looked at, never how the driving went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lavt.domain import NS_PER_MS
+from lavt.experiment.metrics import Measured, count
+from lavt.experiment.record import Record
+from lavt.experiment.table import MISSING, Table
+
+STEP_LIMIT_MS = 5.0
+"""A wall clock that moves this much against the monotonic clock between two samples was set."""
+CLOCK_BOUND_LIMIT_MS = 2.0
+"""Beyond this the split of the loop into tau_v and tau_c says too little."""
+CLOSURE_LIMIT_MS = 1.0
+SKIPPED_LIMIT = 0.01
+"""Share of camera ticks that may be missed."""
+INJECTION_LIMIT_MS = 1.0
+"""How far the injected delay may be from what was asked."""
+
+
+def invalid_because(server: Record, client: Record, measured: Measured) -> list[str]:
+    """Say why a run must not count, one sentence a reason; an empty list is a valid run."""
+    return [
+        *_record_reasons("server", server),
+        *_record_reasons("client", client),
+        *_clock_reasons(measured),
+        *_step_reasons("server", server.table("clock")),
+        *_step_reasons("client", client.table("clock")),
+        *_closure_reasons(measured),
+        *_tick_reasons(server, measured),
+    ]
+
+
+def _record_reasons(side: str, record: Record) -> list[str]:
+    reasons = [] if record.complete else [f"the record of the {side} is not complete"]
+    lost = count(record, "record_overflow") or 0
+    if lost > 0:
+        reasons.append(f"the record of the {side} lost {lost} messages because its queue was full")
+    return reasons
+
+
+def _clock_reasons(measured: Measured) -> list[str]:
+    bound_ms = measured.clock_bound_ms
+    if bound_ms is None:
+        return ["the offset between the clocks has no bound"]
+    if bound_ms > CLOCK_BOUND_LIMIT_MS:
+        return [f"the offset between the clocks is only known to {bound_ms:.2f} ms (limit {CLOCK_BOUND_LIMIT_MS} ms)"]
+    return []
+
+
+def _step_reasons(side: str, samples: Table) -> list[str]:
+    mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
+    known = (mono_ns != MISSING) & (wall_ns != MISSING)
+    jumps_ms = np.diff(wall_ns[known] - mono_ns[known]) / NS_PER_MS
+    if len(jumps_ms) == 0 or np.max(np.abs(jumps_ms)) <= STEP_LIMIT_MS:
+        return []
+    largest_ms = jumps_ms[np.argmax(np.abs(jumps_ms))]
+    return [f"the wall clock of the {side} stepped by {largest_ms:+.1f} ms"]
+
+
+def _closure_reasons(measured: Measured) -> list[str]:
+    closure_ms = measured.closure_p95_ms
+    if closure_ms is None or closure_ms <= CLOSURE_LIMIT_MS:
+        return []
+    return [f"the parts of the loop miss the whole by {closure_ms:.2f} ms (p95, limit {CLOSURE_LIMIT_MS} ms)"]
+
+
+def _tick_reasons(server: Record, measured: Measured) -> list[str]:
+    reasons = [] if measured.entry["ending"] is not None else ["the record has no ending"]
+    late = count(server, "physics_late") or 0
+    if late > 0:
+        reasons.append(f"the physics was late {late} times")
+    skipped = count(server, "frames_skipped") or 0
+    ticks = skipped + len(server.table("frame"))
+    if skipped > SKIPPED_LIMIT * ticks:
+        reasons.append(f"the camera missed {skipped} of {ticks} ticks (limit {SKIPPED_LIMIT:.0%})")
+    return reasons
+
+
+def injection_reasons(asked_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]) -> list[str]:
+    """Compare the delay asked for with the median that the relay or netem measured, per direction, in milliseconds."""
+    reasons = []
+    for direction, delay_ms in asked_ms.items():
+        found_ms = measured_ms.get(direction)
+        if found_ms is None:
+            reasons.append(f"nobody measured the injected delay of {direction}")
+        elif abs(found_ms - delay_ms) > INJECTION_LIMIT_MS:
+            reasons.append(f"{direction} was delayed by {found_ms:.1f} ms where {delay_ms:g} ms was asked")
+    return reasons

@@ -1,0 +1,204 @@
+"""A made-up run whose every latency is known: two records, as the nodes would have written them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, Now
+from lavt.experiment.record import RecordWriter, VideoUnit
+
+WALL_NS = 1_700_000_000_000_000_000
+SERVER_MONO_NS = 1_000 * NS_PER_S
+CLIENT_MONO_NS = 77 * NS_PER_S
+FRAME_NS = 33_333_333
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """What to make up. Times of the truth count from the drive's beginning."""
+
+    seconds: float = 12.0
+    tau_v_ms: float = 62.0
+    spread_ms: float = 2.0
+    client_ms: float = 3.0
+    tau_c_ms: float = 9.0
+    actuator_ms: float = 2.0
+    offset_s: float = 0.25
+    """Delta at the beginning: server's wall clock less the client's."""
+    drift: float = 20e-6
+    bound_s: float | None = 0.0002
+    corrected: bool = True
+    server_host: str = "vehicle"
+    client_host: str = "desk"
+    ending: str | None = "completed"
+    wobble_m: float = 0.5
+    step_s: float = 0.0
+    """Step of the client's wall clock halfway."""
+    server_counts: tuple[tuple[str, int], ...] = ()
+
+    def server(self, at_ns: int) -> Now:
+        """Read the server's clocks; its wall clock is the reference."""
+        return Now(SERVER_MONO_NS + at_ns, WALL_NS + at_ns)
+
+    def client(self, at_ns: int) -> Now:
+        """Read the client's clocks: behind by the offset, and losing `drift` a second."""
+        ticked = at_ns - round(at_ns * self.drift)
+        step_ns = round(self.step_s * NS_PER_S) if at_ns > self.seconds * NS_PER_S / 2 else 0
+        return Now(CLIENT_MONO_NS + ticked, WALL_NS + ticked - round(self.offset_s * NS_PER_S) + step_ns)
+
+    def client_correction_s(self, at_ns: int) -> float:
+        """Tell what a perfect time service on the client would."""
+        return self.offset_s + self.drift * at_ns / NS_PER_S if self.corrected else 0.0
+
+    def tau_v_of_frame_ns(self, number: int) -> int:
+        """Give the video latency of a frame: five values in turn, even about the median."""
+        return round((self.tau_v_ms + self.spread_ms * (number % 5 - 2) / 2) * NS_PER_MS)
+
+
+RADIUS_M = 120.0
+
+
+def on_route(progress_m: float, left_m: float) -> tuple[float, float]:
+    angle_rad = progress_m / RADIUS_M
+    return (RADIUS_M - left_m) * math.sin(angle_rad), RADIUS_M - (RADIUS_M - left_m) * math.cos(angle_rad)
+
+
+def write_server(drive: Drive, path: Path) -> None:
+    writer = RecordWriter(path, "server")
+    writer.annotate("versions", {"lavt": "0.1.0"})
+    writer.annotate("machine", {"cores": "2"})
+    points = [on_route(index / 2, 0.0) for index in range(201)]
+    writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
+    end_ns = round(drive.seconds * NS_PER_S)
+    for second in range(-1, math.ceil(drive.seconds) + 2):
+        now = drive.server(second * NS_PER_S)
+        clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
+        writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
+    writer.write("event", {"mono_ns": drive.server(0).mono_ns, "kind": "drive_began", "detail": ""}, drive.server(0))
+    writer.write(
+        "event", {"mono_ns": drive.server(5).mono_ns, "kind": "lane_invasion", "detail": "left"}, drive.server(5)
+    )
+    sequence = 0
+    for number in range(-3, end_ns // FRAME_NS + 1):
+        at_ns = number * FRAME_NS
+        write_frame(writer, drive, number)
+        for repeat in range(2):
+            sequence += 1
+            write_admission(writer, drive, sequence, number, repeat * 15 * NS_PER_MS)
+        if number % 30 == 0:
+            writer.write("video", VideoUnit(drive.server(at_ns).wall_ns, b"\0\0\0\1\x65"), drive.server(at_ns))
+    for index in range(round(drive.seconds * 60) + 1):
+        at_ns = index * NS_PER_S // 60
+        progress_m = 8.0 * at_ns / NS_PER_S
+        error_m = drive.wobble_m * math.sin(progress_m / 5)
+        slope_rad = math.atan(drive.wobble_m / 5 * math.cos(progress_m / 5))
+        mono_ns = drive.server(at_ns).mono_ns
+        steering_rad = -0.05 * math.sin(progress_m / 5)
+        x_m, y_m = on_route(progress_m, error_m)
+        truth = GroundTruth(mono_ns, x_m, y_m, slope_rad, 8.0, steering_rad, error_m, slope_rad, progress_m)
+        writer.write("truth", truth, drive.server(at_ns))
+    if drive.server_counts:
+        writer.write("counts", dict(drive.server_counts), drive.server(end_ns))
+    if drive.ending is not None:
+        ending = {"mono_ns": drive.server(end_ns).mono_ns, "kind": "ending", "detail": drive.ending}
+        writer.write("event", ending, drive.server(end_ns))
+    writer.close()
+
+
+def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
+    now = drive.server(number * FRAME_NS)
+    frame = {
+        "number": number,
+        "stamp_ns": now.wall_ns,
+        "stamped_mono_ns": now.mono_ns,
+        "capture_ns": None,
+        "pixel_crc": number,
+        "size_bytes": 4000,
+        "keyframe": number % 30 == 0,
+    }
+    writer.write("frame", frame, now)
+    ends = (("capture", -1), ("stamp", 0), ("encode", 4), ("packetize", 5))
+    hops = [[name, now.mono_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+    timeline = {
+        "node": "camera",
+        "stamp_ns": now.wall_ns,
+        "channel": "wake",
+        "arrived_mono_ns": now.mono_ns - 3 * NS_PER_MS,
+    }
+    writer.write("timeline", {**timeline, "hops": hops}, now)
+
+
+def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: int, later_ns: int) -> None:
+    read_ns = number * FRAME_NS + drive.tau_v_of_frame_ns(number)
+    sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + later_ns
+    received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
+    applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
+    refused = sequence % 100 == 98  # an even one: a repetition, so that no loop changes
+    admission: dict[str, Any] = {
+        "epoch": 1,
+        "sequence": sequence,
+        "stamp_ns": drive.server(number * FRAME_NS).wall_ns,
+        "sent_wall_ns": drive.client(sent_ns).wall_ns,
+        "stamp_received_wall_ns": drive.client(read_ns).wall_ns,
+        "received_mono_ns": drive.server(received_ns).mono_ns,
+        "received_wall_ns": drive.server(received_ns).wall_ns,
+        "applied_mono_ns": None if refused else drive.server(applied_ns).mono_ns,
+        "verdict": "refused" if refused else "obeyed",
+        "reason": "sequence" if refused else "",
+        "limited": "",
+        "steering_rad": 0.05 * math.sin(sequence / 20),
+        "throttle": 0.2,
+        "brake": 0.0,
+    }
+    writer.write("admission", admission, drive.server(applied_ns))
+
+
+def write_client(drive: Drive, path: Path) -> None:
+    writer = RecordWriter(path, "client")
+    for second in range(-1, math.ceil(drive.seconds) + 2):
+        at_ns = second * NS_PER_S
+        now = drive.client(at_ns)
+        correction_s = drive.client_correction_s(at_ns)
+        clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
+        writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
+    for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
+        stamp_ns = drive.server(number * FRAME_NS).wall_ns
+        read = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
+        readable = number % 50 != 49
+        picture = {
+            "stamp_ns": stamp_ns if readable else None,
+            "readable": readable,
+            "reason": "" if readable else "checksum",
+            "rtp_timestamp": stamp_ns * 9 // 100_000 % 2**32,
+            "packet_mono_ns": read.mono_ns - 4 * NS_PER_MS,
+            "decoded_mono_ns": read.mono_ns - 1 * NS_PER_MS,
+            "read_mono_ns": read.mono_ns,
+            "read_wall_ns": read.wall_ns,
+        }
+        writer.write("picture", picture, read)
+        arrived_ns = read.mono_ns - 4 * NS_PER_MS
+        ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
+        hops = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+        timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "video", "arrived_mono_ns": arrived_ns}
+        writer.write("timeline", {**timeline, "hops": hops}, read)
+    writer.close()
+
+
+@pytest.fixture(scope="session")
+def make_run() -> Callable[..., Path]:
+    """Give a function that writes both records of a made-up drive into a directory; keywords are those of `Drive`."""
+
+    def make(directory: Path, **settings: Any) -> Path:
+        directory.mkdir(parents=True, exist_ok=True)
+        drive = Drive(**settings)
+        write_server(drive, directory / "server.mcap")
+        write_client(drive, directory / "client.mcap")
+        return directory
+
+    return make

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lavt.experiment.latency import picture_age, rtp_timestamp
+from lavt.experiment.metrics import Measured, measure
+from lavt.experiment.record import read_record
+from lavt.experiment.table import Table, table_of
+from lavt.experiment.tracking import cross_track, sampled_by_distance, steering_reversals
+
+MakeRun = Callable[..., Path]
+MICROSECOND_MS = 1e-3
+
+
+def measured(make_run: MakeRun, directory: Path, **settings: Any) -> Measured:
+    make_run(directory, **settings)
+    return measure(read_record(directory / "server.mcap"), read_record(directory / "client.mcap"))
+
+
+def table(rows: list[dict[str, Any]]) -> Table:
+    return table_of(rows, [0] * len(rows), [0] * len(rows))
+
+
+def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Path) -> None:
+    """With clocks 250 ms apart and drifting by 20 ppm, tau_v, tau_c and the loop come out as they were made."""
+    entry = measured(make_run, tmp_path).entry
+    for name, p50_ms, spread_ms in (("tau_v_ms", 62.0, 2.0), ("loop_ms", 76.0, 2.0), ("tau_c_ms", 9.0, 0.0)):
+        assert entry[name]["p50"] == pytest.approx(p50_ms, abs=MICROSECOND_MS)
+        assert entry[name]["p5"] == pytest.approx(p50_ms - spread_ms, abs=MICROSECOND_MS)
+        assert entry[name]["p95"] == pytest.approx(p50_ms + spread_ms, abs=MICROSECOND_MS)
+
+
+def test_the_offset_between_the_clocks_matters(make_run: MakeRun, tmp_path: Path) -> None:
+    """Without the correction tau_v would be short by the 250 ms between the clocks, and the loop the same as ever."""
+    entry = measured(make_run, tmp_path, corrected=False).entry
+    assert entry["tau_v_ms"]["p50"] == pytest.approx(62.0 - 250.0, abs=0.2)
+    assert entry["tau_c_ms"]["p50"] == pytest.approx(9.0 + 250.0, abs=0.2)
+    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=MICROSECOND_MS)
+
+
+def test_every_split_latency_has_the_bound_of_both_hosts(make_run: MakeRun, tmp_path: Path) -> None:
+    """The bound printed with tau_v and tau_c is the sum of the bounds of both hosts."""
+    entry = measured(make_run, tmp_path, bound_s=0.0003).entry
+    assert entry["tau_v_ms"]["bound"] == pytest.approx(0.6)
+    assert entry["tau_c_ms"]["bound"] == pytest.approx(0.6)
+
+
+def test_hosts_that_share_a_kernel_share_a_clock(make_run: MakeRun, tmp_path: Path) -> None:
+    """Where both sides report the same host, Delta is 0 with bound 0, whatever a time service says."""
+    settings = {"server_host": "one", "client_host": "one", "offset_s": 0.0, "drift": 0.0}
+    good = measured(make_run, tmp_path / "a", **settings)
+    assert good.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=1e-9)
+    assert good.clock_bound_ms == 0.0
+
+
+def test_hosts_without_a_name_are_not_taken_for_one(make_run: MakeRun, tmp_path: Path) -> None:
+    """Two sides that do not say on which host they ran do not get a bound of 0."""
+    run = measured(make_run, tmp_path, server_host="", client_host="", bound_s=None)
+    assert run.clock_bound_ms is None
+    assert run.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=MICROSECOND_MS)
+    assert run.entry["tau_v_ms"]["bound"] is None
+
+
+def test_the_parts_of_the_loop_make_the_whole(make_run: MakeRun, tmp_path: Path) -> None:
+    """tau_v, client time, tau_c and actuator time add up to the loop to the microsecond though the clocks drift."""
+    closure_ms = measured(make_run, tmp_path).closure_p95_ms
+    assert closure_ms is not None
+    assert closure_ms < MICROSECOND_MS
+
+
+def test_a_step_of_the_clock_does_not_touch_the_loop(make_run: MakeRun, tmp_path: Path) -> None:
+    """When the client's wall clock steps by 100 ms, loop latency and picture age stay what they were."""
+    still, stepped = measured(make_run, tmp_path / "a"), measured(make_run, tmp_path / "b", step_s=0.1)
+    assert stepped.entry["loop_ms"] == still.entry["loop_ms"]
+    assert stepped.entry["picture_age_ms"] == still.entry["picture_age_ms"]
+    assert stepped.entry["tau_v_ms"]["p95"] > still.entry["tau_v_ms"]["p95"] + 50
+
+
+def test_only_the_drive_counts(make_run: MakeRun, tmp_path: Path) -> None:
+    """Frames before the drive began are no part of it, and unreadable pictures are counted and give no latency."""
+    entry = measured(make_run, tmp_path).entry
+    assert entry["frames_sent"] == 361
+    assert entry["frames_decoded"] == 361
+    assert entry["frames_unreadable"] == 7
+    assert entry["tau_v_ms"]["n"] == 354
+    assert entry["duration_s"] == 12.0
+
+
+def test_picture_age_is_the_loop_and_half_the_hold(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a constant loop of 76 ms and a new picture every 33.3 ms the mean picture age is 92.7 ms."""
+    age = measured(make_run, tmp_path, spread_ms=0.0).entry["picture_age_ms"]
+    assert age["mean"] == pytest.approx(76 + 33.333 / 2, abs=0.05)
+    assert age["p95"] == pytest.approx(76 + 33.333 * 0.95, abs=0.1)
+
+
+def test_picture_age_by_hand() -> None:
+    """The age runs from 10 to 20, from 10 to 30 and from 5 to 15 ms: mean 16.25, p95 28 ms."""
+    millisecond = 1_000_000
+    frames = table(
+        [{"stamp_ns": n, "stamped_mono_ns": stamped * millisecond} for n, stamped in ((1, 0), (2, 10), (3, 35))]
+    )
+    admissions = table(
+        [
+            {"stamp_ns": n, "verdict": "obeyed", "applied_mono_ns": applied * millisecond}
+            for n, applied in ((1, 10), (2, 20), (3, 40))
+        ]
+    )
+    age = picture_age(frames, admissions, 10 * millisecond, 50 * millisecond)
+    assert age.mean_ms == pytest.approx((10 * 15 + 20 * 20 + 10 * 10) / 40)
+    assert age.p95_ms == pytest.approx(28.0)
+
+
+def test_nothing_recorded_is_null_not_zero(make_run: MakeRun, tmp_path: Path) -> None:
+    """A client that recorded nothing leaves tau_v and the bound undefined, and the loop as it was."""
+    make_run(tmp_path / "a")
+    make_run(tmp_path / "b", seconds=0.01)
+    server = read_record(tmp_path / "a" / "server.mcap")
+    nothing = read_record(tmp_path / "b" / "client.mcap", channels=())
+    entry = measure(server, nothing).entry
+    assert entry["tau_v_ms"] == {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
+    assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=MICROSECOND_MS)
+    assert measure(nothing, nothing).entry["mae_m"] is None
+    assert measure(nothing, nothing).entry["duration_s"] is None
+
+
+def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
+    """A car that swings 0.5 m about the lane's centre has mean 2/pi, rms 1/sqrt(2) and maximum 1 of that amplitude."""
+    entry = measured(make_run, tmp_path, seconds=12 * np.pi).entry
+    assert entry["mae_m"] == pytest.approx(0.5 * 2 / np.pi, abs=0.005)
+    assert entry["rms_m"] == pytest.approx(0.5 / np.sqrt(2), abs=0.005)
+    assert entry["max_m"] == pytest.approx(0.5, abs=0.001)
+    assert entry["distance_m"] == pytest.approx(96 * np.pi, abs=0.2)
+    assert entry["steering_reversals_per_s"] == pytest.approx(2 * 8 / (2 * np.pi * 5), abs=0.03)
+    assert entry["lane_invasions"] == 1
+    assert entry["collisions"] == 0
+
+
+def test_standing_still_weighs_nothing() -> None:
+    """Errors are sampled by distance: a car that waits 1 m off the centre for 1000 rows has the error of its way."""
+    way = [{"progress_m": index * 0.1, "cross_track_m": 0.0} for index in range(101)]
+    waiting = [{"progress_m": 10.0, "cross_track_m": 1.0}] * 1000
+    assert cross_track(table(way + waiting))["mae_m"] == 0.0
+
+
+def test_going_back_counts_the_first_passage() -> None:
+    """Where the progress shrinks and grows again, the error of the first passage is taken."""
+    rows = [(0.0, 0.0), (1.0, 0.0), (0.5, 9.0), (0.9, 9.0), (2.0, 0.0)]
+    samples = sampled_by_distance(table([{"progress_m": p, "cross_track_m": c} for p, c in rows]), "cross_track_m")
+    assert samples.tolist() == [0.0] * 9
+
+
+@pytest.mark.parametrize(
+    ("angles", "reversals"),
+    [([], 0), ([0.0], 0), ([0.0, 0.2, 0.1], 1), ([0.0, 0.2, 0.195, 0.3], 0), ([0.0, -0.1, 0.1, -0.1, 0.1], 3)],
+)
+def test_reversals_ignore_what_is_smaller_than_the_deadband(angles: list[float], reversals: int) -> None:
+    """A turn back counts from 0.01 rad on; smaller ones are noise."""
+    assert steering_reversals(np.array(angles)) == reversals
+
+
+def test_rtp_timestamps_do_not_overflow() -> None:
+    """The RTP timestamp of a stamp of our time equals that of exact arithmetic."""
+    stamps = [1_700_000_000_123_456_789, 1_999_999_999_999_999_999]
+    expected = [stamp * 9 // 100_000 % 2**32 for stamp in stamps]
+    assert rtp_timestamp(np.array(stamps)).tolist() == expected
