@@ -71,7 +71,7 @@ def _finest() -> Textures:
     grain = stream(_WORLD_SEED, "grain").standard_normal((size, size))
     stones = seamless_noise("stones", size, size // 3)
     patches = seamless_noise("patches", size, 40) + 0.8 * seamless_noise("patches", size, 12)
-    asphalt = 92 + 5.5 * grain + 5.0 * stones + 2.4 * patches
+    asphalt = 100 + 9.0 * grain + 4.0 * stones + 1.2 * patches
     blades = seamless_noise("blades", size, size // 2)
     tufts = seamless_noise("tufts", size, 200) + seamless_noise("tufts", size, 64)
     meadow = seamless_noise("meadow", size, 9)
