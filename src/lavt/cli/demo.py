@@ -1,0 +1,79 @@
+"""`lavt demo`: the main job, small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from lavt.cli import console
+from lavt.cli.live_view import LiveView
+from lavt.config import RunConfig, SweepConfig, load_config, parse_config, shipped
+from lavt.experiment.plan import plan_run, plan_sweep
+from lavt.experiment.report import write_report
+from lavt.experiment.results import read_json
+from lavt.experiment.run import prepare_directory, run_once
+from lavt.experiment.sweep import run_all
+
+REAL_CONDITIONS = ("L0", "L5")
+VIRTUAL_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("demo")(demo)
+
+
+def demo(out: console.Out = None, as_json: console.Json = False) -> None:
+    """Drive by video on this machine: in real time at L0 and L5, in virtual time from L0 to L5; then report.
+
+    Example: lavt demo --out out/demo
+    """
+    out = out or Path("out") / "demo"
+    config = shipped("configs/demo.yaml")
+    prepare_directory(out)
+    for name in REAL_CONDITIONS:
+        run = load_config(RunConfig, config, ["time=real", f"network.condition={name}"])
+        planned = plan_run(run, name=f"real_{run.vehicle.route}_{name}_00")
+        with LiveView(f"real time, {name}") as view:
+            result = run_once(planned, out / "runs" / planned.name, progress=view.update)
+        console.say(f"real time, {name}: {result['ending']}")
+    base = load_config(RunConfig, config, ["time=virtual"])
+    sweep = parse_config(
+        SweepConfig, {**base.model_dump(mode="json"), "routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)},
+        str(config),
+    )  # fmt: skip
+    console.say("virtual time, L0 to L5")
+    driven, speed = run_all(plan_sweep(sweep), out / "runs", jobs=None, tell=console.say)
+    page = write_report(out, speed=speed)
+    summary = read_json(out / "summary.json")
+    if as_json:
+        console.show_json(summary)
+    else:
+        _show(summary)
+        console.show(f"the report is {page}")
+    if driven.failed:
+        raise typer.Exit(1)
+
+
+def _show(summary: dict[str, Any]) -> None:
+    """Print the table of conditions."""
+    table = Table("time", "condition", "ending", "injected video + control", "tau_v", "tau_c", "loop", "cross-track P95")
+    for run in summary["runs"]:
+        asked = run["injected_ms"]
+        table.add_row(
+            run["time"], run["condition"], run["ending"] + ("" if run["valid"] else " (not valid)"),
+            f"{asked['video']:g} + {asked['control']:g} ms", _ms(run["tau_v_ms"]), _ms(run["tau_c_ms"]),
+            _ms(run["loop_ms"]), "" if run["p95_m"] is None else f"{run['p95_m']:.2f} m",
+        )  # fmt: skip
+    Console(width=120).print(table)
+
+
+def _ms(summary: dict[str, Any]) -> str:
+    if summary["p50"] is None:
+        return "unknown"
+    bound = summary.get("bound")
+    return f"{summary['p50']:.1f} ms" + ("" if bound is None else f" ± {bound:.2f}")

@@ -1,0 +1,59 @@
+"""What a person sees while a drive goes on: one line that changes on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+LINE_EVERY = 25
+"""Off a terminal: one line for so many updates (5 s)."""
+
+
+class LiveView:
+    """Shows speed, latencies and cross-track error of a drive on one machine, where both sides share a clock."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._console = Console(stderr=True)
+        self._live = Live(Text(title), console=self._console, refresh_per_second=5) if sys.stderr.isatty() else None
+        self._updates = 0
+
+    def __enter__(self) -> LiveView:
+        if self._live is not None:
+            self._live.start()
+        else:
+            self._console.print(self._title, highlight=False)
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, server: dict[str, Any], client: dict[str, Any]) -> None:
+        """Show the newest figures of both sides."""
+        text = f"{self._title}: {_line(server, client)}"
+        if self._live is not None:
+            self._live.update(Text(text))
+        elif self._updates % LINE_EVERY == 0:
+            self._console.print(text, highlight=False)
+        self._updates += 1
+
+
+def _line(server: dict[str, Any], client: dict[str, Any]) -> str:
+    if "speed_mps" not in server:
+        return "starting"
+    figures = (
+        ("", server["speed_mps"] * 3.6, "5.1f", "km/h"),
+        ("tau_v", client.get("raw_tau_v_ms"), "6.1f", "ms"),
+        ("tau_c", server.get("raw_tau_c_ms"), "6.1f", "ms"),
+        ("cross-track", server.get("cross_track_m"), "+6.2f", "m"),
+    )
+    shown = (f"{name} {value:{form}} {unit}".strip() for name, value, form, unit in figures if value is not None)
+    return f"{server.get('safety', ''):<10} " + "  ".join(shown)

@@ -1,0 +1,46 @@
+"""`lavt report`: the report of runs that were driven, made again from their records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lavt.cli import console
+from lavt.errors import UserError
+from lavt.experiment.report import write_report
+from lavt.experiment.results import read_json
+from lavt.experiment.run import RESULT, compute_result
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("report")(report)
+
+
+def report(
+    directories: Annotated[list[Path], typer.Argument(help="Run directories, or sweep directories of runs.")],
+    out: console.Out = None,
+) -> None:
+    """Compute the results of runs again from their records, and write summary.json and report/index.html.
+
+    Example: lavt report out/sweep --out out/sweep
+    """
+    runs = [run for directory in directories for run in _runs(directory)]
+    for run in runs:
+        result = read_json(run / RESULT)
+        compute_result(run, result, result.get("digest"))
+    out = out or directories[0]
+    out.mkdir(parents=True, exist_ok=True)
+    console.show(f"the report is {write_report(out, run_dirs=runs)}")
+
+
+def _runs(directory: Path) -> list[Path]:
+    """Give the run directories in `directory`, which may be one itself."""
+    if (directory / RESULT).is_file():
+        return [directory]
+    runs = sorted(result.parent for result in directory.glob(f"runs/*/{RESULT}"))
+    if not runs:
+        raise UserError(f"{directory} holds no finished run: name a run directory or that of a sweep")
+    return runs

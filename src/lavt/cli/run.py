@@ -1,0 +1,66 @@
+"""`lavt run`: one run on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lavt.cli import console
+from lavt.cli.live_view import LiveView
+from lavt.config import RunConfig, load_config
+from lavt.experiment.plan import plan_run
+from lavt.experiment.run import run_once
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("run")(run)
+
+
+def run(
+    config: Annotated[Path, typer.Argument(help="A run config in YAML, such as configs/demo.yaml.")],
+    changes: console.Set = None,
+    out: console.Out = None,
+    as_json: console.Json = False,
+) -> None:
+    """Drive one route once under one condition, in virtual or real time.
+
+    Example: lavt run configs/demo.yaml --set network.condition=L2 --out out/l2
+    """
+    planned = plan_run(load_config(RunConfig, config, changes or []))
+    out = out or Path("out") / "run"
+    with LiveView(f"driving {planned.config.vehicle.route} under {planned.config.network.condition}") as view:
+        result = run_once(planned, out, progress=view.update)
+    if as_json:
+        console.show_json(result)
+    else:
+        console.show(sentence(result))
+        console.show(f"records and result.json are in {out}")
+
+
+def sentence(result: dict[str, Any]) -> str:
+    """Say in a few lines how a run went."""
+    loop, age, p95_m = result["loop_ms"], result["picture_age_ms"], result["p95_m"]
+    lines = [
+        f"{result['route']} under {result['condition']}, seed {result['seed']}: {result['ending']} after "
+        f"{_number(result['distance_m'], 'm')}, cross-track P95 {_number(p95_m, 'm', 2)}",
+        f"loop latency {_number(loop['p50'], 'ms')} (p95 {_number(loop['p95'], 'ms')}), "
+        f"picture age {_number(age['mean'], 'ms')} in the mean",
+        f"tau_v {_latency(result['tau_v_ms'])}, tau_c {_latency(result['tau_c_ms'])}",
+    ]
+    if not result["valid"]:
+        lines.append("this run is not valid: " + "; ".join(result["invalid_because"]))
+    return "\n".join(lines)
+
+
+def _latency(summary: dict[str, Any]) -> str:
+    if summary["p50"] is None:
+        return "unknown"
+    bound = "no known bound" if summary["bound"] is None else f"± {summary['bound']:.2f} ms"
+    return f"{summary['p50']:.1f} ms ({bound})"
+
+
+def _number(value: float | None, unit: str, digits: int = 1) -> str:
+    return "unknown" if value is None else f"{value:.{digits}f} {unit}"

@@ -1,0 +1,45 @@
+"""`lavt sweep`: many runs, their summary and their report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lavt.cli import console
+from lavt.config import SweepConfig, load_config
+from lavt.experiment.plan import plan_sweep
+from lavt.experiment.results import read_json
+from lavt.experiment.sweep import sweep as drive_sweep
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("sweep")(sweep)
+
+
+def sweep(
+    config: Annotated[Path, typer.Argument(help="A sweep config in YAML, such as configs/sweep.yaml.")],
+    changes: console.Set = None,
+    out: console.Out = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at a time; default: one for each core.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where a sweep into --out was stopped.")] = False,
+    as_json: console.Json = False,
+) -> None:
+    """Drive routes under conditions, repeated, and report.
+
+    Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
+    """
+    planned = plan_sweep(load_config(SweepConfig, config, changes or []))
+    out = out or Path("out") / "sweep"
+    console.say(f"{len(planned)} runs into {out}")
+    page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=console.say)
+    for name, why in driven.failed:
+        console.say(f"failed: {name}: {why}")
+    if as_json:
+        console.show_json(read_json(out / "summary.json"))
+    else:
+        console.show(f"the report is {page}")
+    if driven.failed:
+        raise typer.Exit(1)

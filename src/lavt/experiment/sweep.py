@@ -1,0 +1,104 @@
+"""Many runs on all cores, and their summary and report. A run that fails is told and does not stop the others."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lavt.clock import MachineClock
+from lavt.domain import NS_PER_S
+from lavt.errors import LavtError, UserError, WorkError
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.report import write_report
+from lavt.experiment.results import read_json
+from lavt.experiment.run import RESULT, prepare_directory, run_once
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Driven:
+    """Results of a sweep's runs, and the names of those that failed with the reason."""
+
+    results: Sequence[dict[str, Any]]
+    failed: Sequence[tuple[str, str]]
+
+
+def run_all(
+    planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell
+) -> tuple[Driven, dict[str, Any]]:
+    """Drive the runs that have no result yet, `jobs` at a time (None: one for each core), those in real time one by one.
+
+    Returns what was driven, and the entry `speed` of the summary.
+    """
+    jobs = jobs or os.cpu_count() or 1
+    clock = MachineClock()
+    start_ns = clock.now().mono_ns
+    results, failed = [], []
+    todo = []
+    for each in planned:
+        result = runs_dir / each.name / RESULT
+        if result.is_file():
+            results.append(read_json(result))
+        else:
+            todo.append(each)
+    jobs = 1 if any(each.config.time == "real" for each in todo) else jobs
+    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
+    with ProcessPoolExecutor(jobs, mp_context=context) as executor:
+        futures = {executor.submit(run_once, each, runs_dir / each.name): each for each in todo}
+        try:
+            for number, future in enumerate(as_completed(futures), 1):
+                name = futures[future].name
+                try:
+                    result = future.result()
+                    results.append(result)
+                    tell(f"{number}/{len(todo)} {name}: {result['ending']}")
+                except LavtError as error:
+                    failed.append((name, str(error)))
+                    tell(f"{number}/{len(todo)} {name} failed: {error}")
+        except KeyboardInterrupt:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+    speed = {
+        "simulated_s": sum(result["duration_s"] or 0.0 for result in results),
+        "wall_s": (clock.now().mono_ns - start_ns) / NS_PER_S,
+        "jobs": jobs,
+    }
+    return Driven(results, failed), speed
+
+
+def sweep(
+    planned: Sequence[PlannedRun], out: Path, *, jobs: int | None, resume: bool, tell: Tell
+) -> tuple[Path, Driven]:
+    """Drive a sweep into `out`, and write its summary and report; returns the report's page."""
+    if resume and not out.is_dir():
+        raise UserError(f"there is nothing to resume in {out}: leave --resume away to begin")
+    if not resume:
+        prepare_directory(out)
+    runs_dir = out / "runs"
+    runs_dir.mkdir(exist_ok=True)
+    _remove_unfinished(planned, runs_dir)
+    driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell)
+    if not driven.results:
+        raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
+    return write_report(out, speed=speed, base=base_of(planned)), driven
+
+
+def base_of(planned: Sequence[PlannedRun]) -> dict[str, Any]:
+    """Tell what the runs of the base config have in common: the first value of each further axis."""
+    return dict(planned[0].identity.get("axes", {}))
+
+
+def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
+    """A run that was killed left a directory without a result: it is driven again, from an empty one."""
+    for each in planned:
+        directory = runs_dir / each.name
+        if directory.is_dir() and not (directory / RESULT).is_file():
+            for file in directory.iterdir():
+                file.unlink()
+            directory.rmdir()
