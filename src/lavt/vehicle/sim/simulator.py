@@ -1,0 +1,118 @@
+"""A simulated car on a road, on a fixed grid of the monotonic clock."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
+from lavt.streams import stream
+from lavt.vehicle.sim.dynamics import Car, CarMotion, CarParameters
+from lavt.vehicle.sim.judge import Judge
+from lavt.vehicle.sim.road import Road
+from lavt.vehicle.vehicle import Capabilities
+
+STEPS_PER_S = 240
+
+START_LATERAL_M = 0.25
+START_HEADING_RAD = math.radians(1.5)
+START_AHEAD_M = 2.0
+"""How far the start may lie from the route's: to both sides, in heading, and ahead; drawn by the run's seed."""
+
+AT_REST = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
+
+
+def grid_ns(index: int) -> int:
+    """Time of a point of the grid; from the index each time, so that nothing drifts."""
+    return index * NS_PER_S // STEPS_PER_S
+
+
+class Simulator:
+    """A `lavt.vehicle.vehicle.Vehicle`: it stands at the start, brake on, until it is told otherwise.
+
+    Its time is a grid of 1/240 s on the monotonic clock. It begins at the first point at or after `start_mono_ns`;
+    `advance` takes every step up to the time given, however late it is called. After a collision the car stays where
+    it is.
+    """
+
+    def __init__(self, *, road: Road, seed: int, start_mono_ns: int, parameters: CarParameters | None = None) -> None:
+        self._parameters = parameters or CarParameters()
+        self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
+        ahead_m = float(stream(seed, "start position").uniform(0.0, START_AHEAD_M))
+        lateral_m = float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M))
+        turned_rad = float(stream(seed, "start heading").uniform(-START_HEADING_RAD, START_HEADING_RAD))
+        x_m, y_m = road.across(ahead_m, lateral_m).tolist()
+        motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
+        self._car = Car(self._parameters, motion, 1.0 / STEPS_PER_S)
+        self._judge = Judge(road, self._parameters, near_s_m=ahead_m)
+        self._judge.judge(motion, grid_ns(self._index))
+        self._actuation = AT_REST
+        self._pending: deque[tuple[int, Actuation]] = deque()
+        self._wrecked = False
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What this vehicle is and can do."""
+        parameters = self._parameters
+        return Capabilities(
+            simulated=True,
+            virtual_time=True,
+            ground_truth=True,
+            reset=False,
+            wheelbase_m=parameters.wheelbase_m,
+            max_steering_rad=parameters.max_steering_rad,
+            max_steering_rate_radps=parameters.max_steering_rate_radps,
+            max_acceleration_mps2=parameters.max_acceleration_mps2,
+            max_braking_mps2=parameters.max_braking_mps2,
+        )
+
+    def advance(self, to_ns: int) -> list[VehicleEvent]:
+        """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
+        events: list[VehicleEvent] = []
+        while self.next_wake_ns() <= to_ns:
+            begin_ns = grid_ns(self._index)
+            while self._pending and self._pending[0][0] <= begin_ns:
+                self._actuation = self._pending.popleft()[1]
+            self._index += 1
+            if self._wrecked:
+                continue
+            self._car.step(self._actuation)
+            happened = self._judge.judge(self._car.motion, grid_ns(self._index))
+            if any(event.kind == "collision" for event in happened):
+                self._wrecked = True
+                self._car.stop_dead()
+            events += happened
+        return events
+
+    def apply(self, actuation: Actuation, now_ns: int) -> None:
+        """Obey `actuation` from the first point of the grid at or after `now_ns`; call with growing times."""
+        self._pending.append((now_ns, actuation))
+
+    def state(self) -> VehicleState:
+        """Tell speed and road wheel angle at the newest point of the grid."""
+        motion = self._car.motion
+        return VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+
+    def ground_truth(self) -> GroundTruth:
+        """Tell the truth at the newest point of the grid."""
+        motion, track = self._car.motion, self._judge.track(self._car.motion)
+        return GroundTruth(
+            mono_ns=grid_ns(self._index),
+            x_m=motion.x_m,
+            y_m=motion.y_m,
+            heading_rad=motion.heading_rad,
+            speed_mps=motion.speed_mps,
+            steering_rad=motion.steering_rad,
+            cross_track_m=track.cross_track_m,
+            heading_error_rad=track.heading_error_rad,
+            progress_m=track.progress_m,
+        )
+
+    def pose(self) -> Pose:
+        """Tell where the car is at the newest point of the grid."""
+        motion = self._car.motion
+        return Pose(grid_ns(self._index), motion.x_m, motion.y_m, motion.heading_rad)
+
+    def next_wake_ns(self) -> int:
+        """Tell the next point of the grid."""
+        return grid_ns(self._index + 1)

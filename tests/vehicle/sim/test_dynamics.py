@@ -1,0 +1,140 @@
+import dataclasses
+import math
+
+import pytest
+
+from lavt.domain import Actuation
+from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, Car, CarMotion, CarParameters
+
+STEP_S = 1 / 240
+CAR = CarParameters()
+
+
+def car_at(speed_mps: float = 0.0, parameters: CarParameters = CAR) -> Car:
+    return Car(parameters, CarMotion(0.0, 0.0, 0.0, speed_mps=speed_mps), STEP_S)
+
+
+def drive(car: Car, actuation: Actuation, duration_s: float) -> None:
+    for _ in range(round(duration_s / STEP_S)):
+        car.step(actuation)
+
+
+def cruise(car: Car, speed_mps: float, steering_rad: float, duration_s: float) -> None:
+    for _ in range(round(duration_s / STEP_S)):
+        car.step(Actuation(steering_rad, 0.0, 0.0))
+        car.motion.speed_mps = speed_mps
+
+
+def test_a_car_at_rest_stays_at_rest() -> None:
+    """Whatever the wheel does, without throttle a standing car does not move, with and without brake."""
+    for brake in (0.0, 1.0):
+        car = car_at()
+        drive(car, Actuation(0.3, 0.0, brake), 2.0)
+        motion = car.motion
+        assert (motion.x_m, motion.y_m, motion.heading_rad, motion.speed_mps) == (0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("steering_rad", [0.02, -0.04])
+def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float) -> None:
+    """At 30 km/h the yaw rate is the linear bicycle's, v d / (L + K v^2) with K = m (l_r - l_f) / (C L), within 1 %."""
+    speed_mps = 30 / 3.6
+    car = car_at(speed_mps)
+    cruise(car, speed_mps, steering_rad, 4.0)
+    front_m = CAR.front_axle_to_gravity_m
+    rear_m = CAR.wheelbase_m - front_m
+    understeer = CAR.mass_kg * (rear_m - front_m) / (CAR.axle_stiffness_nprad * CAR.wheelbase_m)
+    theory = speed_mps * steering_rad / (CAR.wheelbase_m + understeer * speed_mps**2)
+    assert car.motion.yaw_rate_radps == pytest.approx(theory, rel=0.01)
+
+
+def test_a_steady_circle_closes() -> None:
+    """After the time of one turn at its yaw rate the rear axle is back where it was."""
+    car = car_at(8.0)
+    cruise(car, 8.0, 0.1, 5.0)
+    motion = dataclasses.replace(car.motion)
+    cruise(car, 8.0, 0.1, 2 * math.pi / motion.yaw_rate_radps)
+    assert math.hypot(car.motion.x_m - motion.x_m, car.motion.y_m - motion.y_m) < 0.1
+
+
+def test_a_slow_car_rolls_without_slip() -> None:
+    """At 1 m/s the yaw rate is v tan(d) / L and the rear axle moves along the heading."""
+    car = car_at(1.0)
+    cruise(car, 1.0, 0.3, 2.0)
+    motion = car.motion
+    assert motion.yaw_rate_radps == pytest.approx(math.tan(0.3) / CAR.wheelbase_m, rel=1e-3)
+    rear_m = CAR.wheelbase_m - CAR.front_axle_to_gravity_m
+    assert motion.side_speed_mps == pytest.approx(rear_m * motion.yaw_rate_radps, rel=1e-3)
+
+
+def test_nothing_jumps_where_the_models_meet() -> None:
+    """Accelerating and braking through 3 m/s in a turn, the yaw rate changes by less than 0.01 rad/s a step."""
+    car = car_at(2.5)
+    drive(car, Actuation(0.3, 0.0, 0.0), 0.5)
+    for actuation in (Actuation(0.3, 1.0, 0.0), Actuation(0.3, 0.0, 0.5)):
+        for _ in range(240):
+            before = car.motion.yaw_rate_radps
+            car.step(actuation)
+            assert abs(car.motion.yaw_rate_radps - before) < 0.01
+
+
+def test_tyres_cannot_hold_more_than_their_friction() -> None:
+    """At 25 m/s with the wheel fully turned the lateral acceleration stays below friction times gravity."""
+    car = car_at(25.0)
+    highest = 0.0
+    for _ in range(480):
+        car.step(Actuation(0.5, 0.0, 0.0))
+        sideways, _, _ = car._tyre_accelerations()
+        highest = max(highest, abs(sideways))
+    assert 0.8 * CAR.friction * GRAVITY_MPS2 < highest <= CAR.friction * GRAVITY_MPS2
+
+
+def test_steering_follows_with_its_lag() -> None:
+    """One lag after a small step the wheel has made 63 % of it."""
+    car = car_at()
+    drive(car, Actuation(0.05, 0.0, 1.0), CAR.steering_lag_s)
+    assert car.motion.steering_rad == pytest.approx(0.05 * (1 - math.exp(-1)), rel=0.02)
+
+
+def test_steering_keeps_its_rate_and_its_limit() -> None:
+    """A large step is followed at 0.534 rad/s at most, and never beyond 0.513 rad."""
+    car = car_at()
+    fastest = 0.0
+    for _ in range(960):
+        before = car.motion.steering_rad
+        car.step(Actuation(9.0, 0.0, 1.0))
+        fastest = max(fastest, (car.motion.steering_rad - before) / STEP_S)
+    assert fastest == pytest.approx(CAR.max_steering_rate_radps)
+    assert car.motion.steering_rad == pytest.approx(CAR.max_steering_rad, rel=1e-3)
+    assert car.motion.steering_rad <= CAR.max_steering_rad
+
+
+def test_pedals_follow_with_their_lag() -> None:
+    """One lag after full throttle the pedal has made 63 % of it."""
+    car = car_at()
+    drive(car, Actuation(0.0, 1.0, 0.0), CAR.pedal_lag_s)
+    assert car.motion.throttle == pytest.approx(1 - math.exp(-1), rel=0.02)
+
+
+def test_full_brake_stops_within_the_distance_of_theory() -> None:
+    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2 (a constant braking behind a lag T), and stays."""
+    speed_mps = 30 / 3.6
+    car = car_at(speed_mps)
+    drive(car, Actuation(0.0, 0.0, 1.0), 3.0)
+    braking = CAR.max_braking_mps2 + CAR.rolling_resistance_mps2
+    lag_s = CAR.pedal_lag_s
+    theory_m = speed_mps**2 / (2 * braking) + speed_mps * lag_s - braking * lag_s**2 / 2
+    assert car.motion.speed_mps == 0.0
+    assert car.motion.x_m == pytest.approx(theory_m, abs=0.1)
+    drive(car, Actuation(0.0, 0.0, 1.0), 1.0)
+    assert car.motion.speed_mps == 0.0
+
+
+def test_full_throttle_accelerates_as_stated() -> None:
+    """At full throttle, once the pedal has followed, the car gains 2 m/s2 less its resistance."""
+    car = car_at()
+    drive(car, Actuation(0.0, 1.0, 0.0), 2.0)
+    before = car.motion.speed_mps
+    drive(car, Actuation(0.0, 1.0, 0.0), 1.0)
+    assert car.motion.speed_mps - before == pytest.approx(1.9, abs=0.02)
+    assert car.motion.x_m > 0.0
+    assert car.motion.y_m == 0.0
