@@ -1,0 +1,101 @@
+"""Steering by pure pursuit, and the path that follows from it.
+
+The car aims at the point of the lane's centre that is a lookahead away from its rear axle, and takes the circle that
+leads there: curvature = 2 sin(angle to that point) / lookahead (R. C. Coulter, Implementation of the Pure Pursuit Path
+Tracking Algorithm, CMU-RI-TR-92-01).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
+
+LOOKAHEAD_WITHIN_M = (4.0, 20.0)
+"""Nearer than 4 m the camera sees no road, and the wheel would twitch at low speed; beyond 20 m it sees no marks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the rear axle is and where the car points to, in the frame the lane is given in."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    heading_rad: float = 0.0
+
+    def moved(self, distance_m: float, curvature_per_m: float) -> Place:
+        """Go `distance_m` along a circle."""
+        turned_rad = distance_m * curvature_per_m
+        # The chord of the arc: its length, and its direction half-way between the two headings.
+        chord_m = distance_m if abs(turned_rad) < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
+        direction_rad = self.heading_rad + turned_rad / 2
+        return Place(
+            self.x_m + chord_m * math.cos(direction_rad),
+            self.y_m + chord_m * math.sin(direction_rad),
+            self.heading_rad + turned_rad,
+        )
+
+
+SEEN_FROM = Place()
+"""Where the picture was taken."""
+
+
+def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
+    """Give the distance to aim at: `lookahead_s` of driving, within `LOOKAHEAD_WITHIN_M`."""
+    nearest_m, farthest_m = LOOKAHEAD_WITHIN_M
+    return min(max(lookahead_s * speed_mps, nearest_m), farthest_m)
+
+
+def goal_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> tuple[float, float]:
+    """Find the point of the lane's centre, ahead of `place`, that is `distance_m` away from it.
+
+    From a place farther off the lane than that, it is the point abreast.
+    """
+    c0, c1, c2 = lane.centre
+    low_m, high_m = place.x_m, place.x_m + distance_m
+    # At `low_m` the centre is nearer than the lookahead and at `high_m` not nearer: the crossing lies between.
+    for _ in range(24):
+        x_m = (low_m + high_m) / 2
+        if math.hypot(x_m - place.x_m, c0 + (c1 + c2 * x_m) * x_m - place.y_m) < distance_m:
+            low_m = x_m
+        else:
+            high_m = x_m
+    return low_m, c0 + (c1 + c2 * low_m) * low_m
+
+
+def pursuit_curvature_per_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> float:
+    """Give the curvature, left positive, of the circle from `place` to the goal on the lane's centre."""
+    x_m, y_m = goal_m(lane, distance_m, place)
+    angle_rad = math.atan2(y_m - place.y_m, x_m - place.x_m) - place.heading_rad
+    return 2 * math.sin(angle_rad) / distance_m
+
+
+def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place = SEEN_FROM) -> tuple[float, ...]:
+    """Give the curvatures, within +-`limit_per_m`, of the path from `place` onto the lane's centre and along it.
+
+    It is where pure pursuit would go: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead. The lane's
+    own curvature would not do: a car that is beside its lane, or turned, would stay so along a path of that curvature.
+    """
+    curvatures = []
+    curvature_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
+    for _ in range(PATH_POINTS):
+        place = place.moved(PATH_STEP_M, curvature_per_m)
+        curvature_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
+        curvatures.append(curvature_per_m)
+    return tuple(curvatures)
+
+
+def limited(value: float, limit: float) -> float:
+    """Keep `value` within +-`limit`."""
+    return min(max(value, -limit), limit)
+
+
+def steering_rad(curvature_per_m: float, wheelbase_m: float) -> float:
+    """Give the road wheel angle of the kinematic bicycle for a curvature of its rear axle's path."""
+    return math.atan(wheelbase_m * curvature_per_m)
+
+
+def curvature_per_m(angle_rad: float, wheelbase_m: float) -> float:
+    """Give the curvature of the rear axle's path for a road wheel angle, the inverse of `steering_rad`."""
+    return math.tan(angle_rad) / wheelbase_m
