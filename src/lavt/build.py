@@ -196,9 +196,13 @@ def build_server(
     plant = build_plant(config)
     video, camera = config.video, config.camera
     encoder = Encoder(
-        camera.width_px, camera.height_px, camera.rate_hz, video.bit_rate_bps, video.gop_frames,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        rate_hz=camera.rate_hz,
+        bit_rate_bps=video.bit_rate_bps,
+        gop_frames=video.gop_frames,
         buffer_s=video.buffer_ms / 1000,
-    )  # fmt: skip
+    )
     start = now()
     vehicle = plant.start(start)
     able = vehicle.capabilities

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lavt.control.drive_controller import DriveController, LaneWatch
+from lavt.control.drive_controller import DriveController
+from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, State
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
@@ -74,7 +75,7 @@ class DriverNode:
         self._view: View | None = None
         self._view_ns = 0
         self._decision: Decision | None = None
-        self._lane_says = "ok"
+        self._lane_says: LaneState = "ok"
         self._speed_mps = 0.0
         self._command_ns: int | None = None
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -126,7 +127,7 @@ class DriverNode:
         return Seen(view, view.stamp_ns, self._detector.detect(view.picture))
 
     def _decide(self, seen: Seen, now: Now) -> Seen:
-        self._lane_says = self._watch.judge(seen.lane.confidence, now.mono_ns)
+        self._lane_says = self._watch.check(seen.lane.confidence, now.mono_ns)
         self._decision = self._controller.decide(seen.lane, self._speed_mps, now.mono_ns)
         self._view, self._view_ns = seen.view, now.mono_ns
         return seen

@@ -31,8 +31,8 @@ class ReceiverNode:
         self._reorder = reorder
         self._depacketizer = depacketizer
         self._path: PathClient | None = None
+        self._token = b""
         self._port = 0
-        self._hello_ns = 0
         self._report_ns = 0
         self._picture_loss_ns = 0
         self._media_ssrc: int | None = None
@@ -51,15 +51,15 @@ class ReceiverNode:
         """When the reorder buffer gives up waiting, a hello or a report is due."""
         times = [self._reorder.next_wake_ns()]
         if self._path is not None:
-            times += [self._hello_ns, self._report_ns if self._media_ssrc is not None else None]
+            times += [self._path.next_hello_ns(), self._report_ns if self._media_ssrc is not None else None]
         return min((time for time in times if time is not None), default=None)
 
-    def _note_token(self, message: Message, now: Now) -> None:
+    def _note_token(self, message: Message, _now: Now) -> None:
         token: PathToken = message.payload
-        if self._path is None or token.token != self._path.token:
+        if self._path is None or token.token != self._token:
+            self._token = token.token
             self._path = PathClient(token.token)
             self._port = token.port
-            self._hello_ns = now.mono_ns
 
     def _receive(self, message: Message, now: Now) -> tuple[list[tuple[RtpPacket, bool]], Now, list[Send]] | None:
         if is_path_datagram(message.payload):
@@ -75,14 +75,14 @@ class ReceiverNode:
         self._packets_since_report += 1
         self._note_transit(message.arrived.mono_ns, packet.timestamp)
         self._media_ssrc, self._highest_sequence = packet.ssrc, packet.sequence
-        self._hello_ns = now.mono_ns + 2 * REPORT_PERIOD_NS  # video comes: no hello needed
+        if self._path is not None:
+            self._path.video_arrived(now.mono_ns)
         return self._reorder.push(packet, now.mono_ns), message.arrived, []
 
     def _wake(self, message: Message, now: Now) -> tuple[list[tuple[RtpPacket, bool]], Now, list[Send]]:
         sends = []
-        if self._path is not None and now.mono_ns >= self._hello_ns:
+        if self._path is not None and now.mono_ns >= self._path.next_hello_ns():
             sends.append(self._feedback(self._path.hello(now.mono_ns)))
-            self._hello_ns = now.mono_ns + REPORT_PERIOD_NS
         if self._media_ssrc is not None and now.mono_ns >= self._report_ns:
             sends.append(self._report(self._media_ssrc))
             self._report_ns = now.mono_ns + REPORT_PERIOD_NS
