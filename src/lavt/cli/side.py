@@ -12,6 +12,7 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel
 
+import lavt
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -29,7 +30,7 @@ from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 STATUS_PERIOD_S = 0.2
-VERSIONED = ("lavt", "numpy", "opencv-python-headless", "av", "eclipse-zenoh")
+LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
 class NoRecorder:
@@ -67,7 +68,7 @@ class Side:
             out.mkdir(parents=True, exist_ok=True)
             (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
             self._writer = RecordWriter(out / f"{name}.mcap", name)
-            self._writer.annotate("versions", {each: version(each) for each in VERSIONED})
+            self._writer.annotate("versions", {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}})
             self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
             recorder = self._queue = QueuedRecorder(self._writer)
         self.tap = LiveTap(recorder)
