@@ -26,8 +26,7 @@ class MachineClock:
 
 def cpu_ns() -> int:
     """CPU time of this process and the children it has waited for, in nanoseconds."""
-    spent = time.process_time_ns()
-    return spent
+    return time.process_time_ns()
 
 
 def pause(duration_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""What a user can configure: one schema with units in its names; unknown keys are refused with the nearest known one."""
+"""What a user can configure: one schema, units in its names; unknown keys are refused with the nearest known one."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """The errors of LAVT, one tree.
 
-    LavtError
-    ├── UserError            what the user did wrong: one sentence that says what to do; exit code 2
-    ├── WorkError            the work failed though the input was right: exit code 1
-    ├── PeerError            what the peer or the network did wrong: counted and dropped, never fatal
-    │   ├── BadMessage       bytes that are not a message of ours, or hold a value out of range
-    │   └── BadPacket        a datagram that is not RTP, or whose payload cannot be H.264
-    └── VehicleError         what the vehicle did wrong: leads to a stop
+LavtError
+├── UserError            what the user did wrong: one sentence that says what to do; exit code 2
+├── WorkError            the work failed though the input was right: exit code 1
+├── PeerError            what the peer or the network did wrong: counted and dropped, never fatal
+│   ├── BadMessage       bytes that are not a message of ours, or hold a value out of range
+│   └── BadPacket        a datagram that is not RTP, or whose payload cannot be H.264
+└── VehicleError         what the vehicle did wrong: leads to a stop
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def show_json(value: Any) -> None:
 
 
 def keep_stdout_for_results() -> None:
-    """Send what libraries write to standard output (Zenoh's log) to standard error; `show` still writes to the old one."""
+    """Send what libraries print (Zenoh's log) to standard error; `show` still writes to standard output."""
     results = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     sys.stdout = results

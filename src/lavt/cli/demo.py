@@ -42,10 +42,8 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
             result = run_once(planned, out / "runs" / planned.name, progress=view.update)
         console.say(f"real time, {name}: {result['ending']}")
     base = load_config(RunConfig, config, ["time=virtual"])
-    sweep = parse_config(
-        SweepConfig, {**base.model_dump(mode="json"), "routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)},
-        str(config),
-    )  # fmt: skip
+    axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
+    sweep = parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config))
     console.say("virtual time, L0 to L5")
     driven, speed = run_all(plan_sweep(sweep), out / "runs", jobs=None, tell=console.say)
     page = write_report(out, speed=speed)
@@ -61,7 +59,9 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
 
 def _show(summary: dict[str, Any]) -> None:
     """Print the table of conditions."""
-    table = Table("time", "condition", "ending", "injected video + control", "tau_v", "tau_c", "loop", "cross-track P95")
+    table = Table(
+        "time", "condition", "ending", "injected video + control", "tau_v", "tau_c", "loop", "cross-track P95"
+    )
     for run in summary["runs"]:
         asked = run["injected_ms"]
         table.add_row(

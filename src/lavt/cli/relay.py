@@ -38,7 +38,9 @@ def relay(
         if as_json:
             console.show_json({"ports": ports})
         else:
-            console.show(f"relaying video at port {ports['video']} and control at port {ports['control']}; Ctrl-C ends it")
+            console.show(
+                f"relaying video at port {ports['video']} and control at port {ports['control']}; Ctrl-C ends it"
+            )
         while not told.is_set():
             opened.step()
     opened.close()
@@ -70,7 +72,9 @@ def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
 def _resolved(key: str, text: str) -> tuple[str, int]:
     """Read an address and look its host up, once: datagrams are compared with the numeric address."""
     if text.startswith(("tcp/", "tls/", "quic/")):
-        raise UserError(f"{key}: the relay carries UDP only, not {text!r}: let the routers talk by udp/...?rel=1;mixed_rel=1")
+        raise UserError(
+            f"{key}: the relay carries UDP only, not {text!r}: let the routers talk by udp/...?rel=1;mixed_rel=1"
+        )
     host, port = parse_address(key, text)
     try:
         return socket.gethostbyname(host), port

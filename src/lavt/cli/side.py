@@ -61,7 +61,13 @@ class Side:
         self._udp: UdpLink | None = None
         quiet_logs()
         self._zenoh = ZenohLink(
-            clock, self._deliver, side=name, path=find(Path(zenoh.session)), router=zenoh.router, vehicle=vehicle, who=who
+            clock,
+            self._deliver,
+            side=name,
+            path=find(Path(zenoh.session)),
+            router=zenoh.router,
+            vehicle=vehicle,
+            who=who,
         )
         recorder: Recorder = NoRecorder()
         if out is not None:
@@ -135,5 +141,3 @@ def run_side(
                 break
     if runtime.failed is not None:
         raise WorkError(f"stopped because a part failed: {runtime.failed}")
-
-

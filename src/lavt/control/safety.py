@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from lavt.control.limiter import Limiter
 from lavt.control.limits import Limits
 from lavt.control.written import WrittenStamps
-from lavt.domain import Actuation, Command, SafetyState, SessionReply, SessionRequest, VehicleState
+from lavt.domain import Actuation, Command, Operation, SafetyState, SessionReply, SessionRequest, VehicleState
 
 Trigger = Literal[
     "arming begins", "arming broken", "arming held", "silence", "fresh command", "long silence", "stop asked",
@@ -147,7 +147,7 @@ class SafetyGate:
         self._trigger("cleared")
         return ""
 
-    _OPERATIONS = {
+    _OPERATIONS: ClassVar[dict[Operation, Callable[..., str]]] = {
         "hold": _hold,
         "release": _release,
         "emergency_stop": _emergency_stop,

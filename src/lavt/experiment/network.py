@@ -38,7 +38,7 @@ INHERENT = {
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """How long things take: video and state (server to client), control (client to server), and all that never waits."""
+    """How long things take: video, state (server to client), control (client to server), and what is never held."""
 
     video: DelayLaw
     control: DelayLaw

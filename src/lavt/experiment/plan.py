@@ -22,7 +22,9 @@ class PlannedRun:
     seed: int
 
 
-def plan_run(config: RunConfig, *, name: str = "run", repetition: int = 0, axes: Mapping[str, Any] | None = None) -> PlannedRun:
+def plan_run(
+    config: RunConfig, *, name: str = "run", repetition: int = 0, axes: Mapping[str, Any] | None = None
+) -> PlannedRun:
     """Plan one run; raises `UserError` for a condition that does not exist."""
     asked = condition(config.network.condition)
     seed = run_seed(config.seed, config.vehicle.route, repetition)
@@ -79,6 +81,8 @@ def _change(section: dict[str, Any], path: Sequence[str], value: Any, key: str) 
         return
     inner = section.get(path[0])
     if not isinstance(inner, Mapping):
-        raise UserError(f"the axis {key!r} names no config value: write it as in the config, such as video.bit_rate_bps")
+        raise UserError(
+            f"the axis {key!r} names no config value: write it as in the config, such as video.bit_rate_bps"
+        )
     section[path[0]] = dict(inner)
     _change(section[path[0]], path[1:], value, key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +57,9 @@ def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path,
     relay = None
     control_port = int(remote.partition("?")[0].rpartition(":")[2])
     if run.network.injection == "relay":
-        relay = processes.start("relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port)))
+        relay = processes.start(
+            "relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port))
+        )
         ports = relay.ready()["ports"]
         video_port, control_port = ports["video"], ports["control"]
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
@@ -68,9 +71,7 @@ def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path,
     return Loop(server_router, server, relay, client_router, client)
 
 
-def drive_real(
-    planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None
-) -> None:
+def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
     """Drive once, leaving the two records in `out`; raises `WorkError` where a part ends or nobody gets to drive."""
     clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
@@ -104,10 +105,9 @@ def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: 
 def _start_router(processes: Processes, name: str, file: str, dialled: list[str]) -> tuple[Process, str, str]:
     """Start a router on free ports and tell its local and, for the server's, its remote endpoint."""
     listen = [LOCAL_TCP] if dialled else [LOCAL_TCP, LOCAL_UDP]
-    router = processes.start(
-        name, "router", f"zenoh-configs/{file}", "--set", f"listen.endpoints={yaml.safe_dump(listen, default_flow_style=True).strip()}",
-        "--set", f"connect.endpoints={yaml.safe_dump(dialled, default_flow_style=True).strip()}",
-    )  # fmt: skip
+    endpoints = {"listen": listen, "connect": dialled}
+    changes = [part for key, each in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(each)}")]
+    router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
     locators = router.ready()["locators"]
     local = next(each for each in locators if each.startswith("tcp/"))
     return router, local, next((each for each in locators if each.startswith("udp/")), "")

@@ -32,7 +32,7 @@ class Driven:
 def run_all(
     planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell
 ) -> tuple[Driven, dict[str, Any]]:
-    """Drive the runs that have no result yet, `jobs` at a time (None: one for each core), those in real time one by one.
+    """Drive the runs that have no result yet, `jobs` at a time (None: one a core), those in real time one by one.
 
     Returns what was driven, and the entry `speed` of the summary.
     """
@@ -42,9 +42,9 @@ def run_all(
     results, failed = [], []
     todo = []
     for each in planned:
-        result = runs_dir / each.name / RESULT
-        if result.is_file():
-            results.append(read_json(result))
+        finished = runs_dir / each.name / RESULT
+        if finished.is_file():
+            results.append(read_json(finished))
         else:
             todo.append(each)
     jobs = 1 if any(each.config.time == "real" for each in todo) else jobs

@@ -70,16 +70,12 @@ def read_costs() -> Costs:
 def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
     """Give the clocks of server and client: the client's is true, the server's has an offset and drifts."""
     return (
-        HostClock(
-            SERVER_MONO_NS, WALL_NS, round(config.clocks.offset_ms * 1e6), round(config.clocks.drift_ppm * 1000)
-        ),
+        HostClock(SERVER_MONO_NS, WALL_NS, round(config.clocks.offset_ms * 1e6), round(config.clocks.drift_ppm * 1000)),
         HostClock(CLIENT_MONO_NS, WALL_NS),
     )
 
 
-def build_loop(
-    planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None
-) -> VirtualLoop:
+def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
     """Make both sides of a run and the links between them, recording into `out`."""
     config, seed, costs = planned.config, planned.seed, read_costs()
     digest = hashlib.sha256()
@@ -106,7 +102,11 @@ def build_loop(
         ),
     ]  # fmt: skip
     injected = injected_network(
-        config.network.inherent, condition(config.network.condition), costs, seed, state_delay=config.network.state_delay
+        config.network.inherent,
+        condition(config.network.condition),
+        costs,
+        seed,
+        state_delay=config.network.state_delay,
     )
     runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
     return VirtualLoop(runtime, server, client, tap, writers, digest)

@@ -7,8 +7,8 @@ from typing import Literal
 from lavt.domain import NS_PER_S, SessionReply, SessionRequest, State
 
 Phase = Literal["seeking", "arming", "driving", "stopped"]
-"""seeking: no epoch yet. arming: commands ask for arming. driving: the vehicle obeys. stopped: it has stopped for safety,
-and only a person (or `rearm`) begins anew."""
+"""seeking: no epoch yet. arming: commands ask for arming. driving: the vehicle obeys. stopped: it has stopped for
+safety, and only a person (or `rearm`) begins anew."""
 
 ASK_PERIOD_NS = NS_PER_S
 

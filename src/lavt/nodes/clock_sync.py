@@ -36,7 +36,5 @@ class ClockSyncNode:
 
     def _sample(self, message: Message, now: Now) -> list[Send]:
         report: ClockReport = message.payload
-        sample = ClockSample(
-            now.mono_ns, now.wall_ns, report.host, report.source, report.correction_s, report.bound_s
-        )
+        sample = ClockSample(now.mono_ns, now.wall_ns, report.host, report.source, report.correction_s, report.bound_s)
         return [Send("clock", sample)]

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 from lavt.control.drive_controller import DriveController
 from lavt.control.lane_watch import LaneState, LaneWatch
+from lavt.control.limits import ClientLimits
 from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, State
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, View, VideoUnit
+from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, VideoUnit, View
 from lavt.perception.lane_detector import LaneDetector
 from lavt.transport.h264 import DecodedPicture, Decoder
 from lavt.transport.messages import decode, encode
 from lavt.transport.stamp import read_stamp, stamp_agrees
-from lavt.control.limits import ClientLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ class Seen:
 class DriverNode:
     """Drives by the received pictures and the speed that the vehicle reports, and by nothing else.
 
-    Every picture is decoded; when pictures wait, only the newest is looked at. A command leaves as soon as a picture has
-    been looked at, and never later than `limits.command_period_ns` after the one before.
+    Every picture is decoded; when pictures wait, only the newest is looked at. A command leaves as soon as a picture
+    has been looked at, and never later than `limits.command_period_ns` after the one before.
     """
 
     name = "driver"
@@ -199,5 +199,3 @@ class DriverNode:
             return []
         self.session.note_reply(reply, now.mono_ns)
         return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted else []
-
-

@@ -36,7 +36,6 @@ class ReceiverNode:
         self._report_ns = 0
         self._picture_loss_ns = 0
         self._media_ssrc: int | None = None
-        self._highest_sequence = 0
         self._packets_since_report = 0
         self._lost_at_report = 0
         self._transit: int | None = None
@@ -74,7 +73,7 @@ class ReceiverNode:
         self.counts["packets"] += 1
         self._packets_since_report += 1
         self._note_transit(message.arrived.mono_ns, packet.timestamp)
-        self._media_ssrc, self._highest_sequence = packet.ssrc, packet.sequence
+        self._media_ssrc = packet.ssrc
         if self._path is not None:
             self._path.video_arrived(now.mono_ns)
         return self._reorder.push(packet, now.mono_ns), message.arrived, []
@@ -109,9 +108,13 @@ class ReceiverNode:
         self._packets_since_report, self._lost_at_report = 0, self._reorder.lost
         return self._feedback(
             receiver_report(
-                SSRC, media_ssrc, highest_sequence=self._highest_sequence, lost_fraction=fraction,
-                cumulative_lost=self._reorder.lost, jitter=round(self._jitter),
-            )  # fmt: skip
+                SSRC,
+                media_ssrc,
+                highest_sequence=self._reorder.highest_sequence,
+                lost_fraction=fraction,
+                cumulative_lost=self._reorder.lost,
+                jitter=round(self._jitter),
+            )
         )
 
     def _note_transit(self, arrived_ns: int, timestamp: int) -> None:

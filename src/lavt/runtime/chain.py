@@ -32,9 +32,7 @@ class Walked:
     timeline: Timeline | None
 
 
-def walk(
-    node: str, hops: Sequence[Hop], message: Message, start: Now, after: Callable[[str, Now], Now]
-) -> Walked:
+def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, after: Callable[[str, Now], Now]) -> Walked:
     """Call hop after hop; `after(name, before)` tells the time when hop `name`, begun at `before`, is done."""
     value: object = message
     now = start

@@ -207,9 +207,7 @@ class VirtualRuntime:
             self.deliver(side, channel, payload, peer)
 
 
-def modelled_clock_source(
-    clock: HostClock, host: str, error_s: float, bound_s: float
-) -> Callable[[int], ClockReport]:
+def modelled_clock_source(clock: HostClock, host: str, error_s: float, bound_s: float) -> Callable[[int], ClockReport]:
     """Model chrony on a virtual host: it reports the truth plus `error_s`, which lies inside its stated `bound_s`."""
 
     def report(true_ns: int) -> ClockReport:

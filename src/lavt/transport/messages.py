@@ -1,6 +1,6 @@
 """Messages between the two sides: msgpack arrays with a version first, checked before anything else sees them.
 
-A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` refuses whatever is
+A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` refuses what is
 too long, not msgpack, of another version or shape, not finite, or out of range, with `BadMessage`.
 """
 
@@ -118,4 +118,5 @@ def decode(kind: type[Kind], data: bytes) -> Kind:
     for (name, check), value in zip(checks.items(), values[1:], strict=True):
         if not check(value):
             raise BadMessage(f"{kind.__name__}.{name} is out of range")
-    return kind(*(tuple(value) if isinstance(value, list) else value for value in values[1:]))
+    checked: list[Any] = [tuple(value) if isinstance(value, list) else value for value in values[1:]]
+    return kind(*checked)

@@ -19,7 +19,7 @@ Deliver = Callable[[str, Any, Now, Any], None]
 """(channel, payload, arrived, peer): what a link does with what comes in."""
 
 SO_TIMESTAMPNS = 35
-"""Linux: time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; `socket` does not name it."""
+"""Linux: time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; not named in `socket`."""
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_DATAGRAM = 65_535
 QUEUED_LONGEST_NS = 10 * NS_PER_S

@@ -1,7 +1,7 @@
 """Commands, state and session over Zenoh; the only module that knows it.
 
-Each side has a session to a router on its own machine; the routers talk to each other. Zenoh is not trusted with safety:
-after an outage it may deliver seconds of old commands, and its liveliness is as slow as its lease (see the safety gate).
+Each side has a session to a router on its own machine; the routers talk to each other. Zenoh is not trusted with
+safety: after an outage it may deliver seconds of old commands, and its liveliness is as slow as its lease.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 ROUTER_READY_S = 5.0
-CONTROL = {
+CONTROL: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
     "express": True,
     "reliability": zenoh.Reliability.BEST_EFFORT,
 }
 """A command that is late is worthless: never re-sent, never blocked, never batched, before everything else."""
-STATE = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
+STATE: dict[str, Any] = {**CONTROL, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 
 
 def quiet_logs() -> None:
@@ -45,7 +45,7 @@ def check_name(what: str, name: str) -> str:
     """Return `name` if it may be part of a key; raises `UserError` otherwise, and says what `what` may be called."""
     if not NAME.match(name):
         raise UserError(
-            f"{what} {name!r} cannot be part of a Zenoh key: use 1 to 32 letters, digits, _ or -, a letter or digit first"
+            f"{what} {name!r} cannot be part of a Zenoh key: use 1 to 32 letters, digits, _ or -, not _ or - first"
         )
     return name
 
@@ -124,14 +124,15 @@ class ZenohLink:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
             raise UserError(
-                f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or name another ({_plain(error)})"
+                f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or name another "
+                f"({_plain(error)})"
             ) from error
         self._declared: list[Any] = []
 
     def start(self) -> None:
         """Begin to send and to hear; from here on messages are delivered."""
         heard, said, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
-        listener = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
+        listener: Any = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
         self._publisher = self._session.declare_publisher(f"{self._base}/{said}", **qos)
         self._declared.append(self._session.declare_subscriber(f"{self._base}/{heard}", listener))
         if self._side == "server":
