@@ -71,6 +71,15 @@ def test_a_channel_without_messages_is_empty(tmp_path: Path) -> None:
     assert table.ints("stamp_ns").tolist() == []
 
 
+def test_whole_numbers_are_never_rounded(tmp_path: Path) -> None:
+    """A column of whole numbers that do not fit into 64 bits keeps every digit, as objects."""
+    writer = RecordWriter(tmp_path / "a.mcap", "server")
+    for index, number in enumerate((WALL_NS, 2**64)):
+        writer.write("counts", {"number": number}, now(index))
+    writer.close()
+    assert read_record(tmp_path / "a.mcap").table("counts").objects("number") == [WALL_NS, 2**64]
+
+
 def test_not_a_number_becomes_null(tmp_path: Path) -> None:
     """NaN and infinity are written as null, because JSON has no word for them, and read as NaN."""
     assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}

@@ -13,6 +13,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment import page
 from lavt.experiment.breakdown import breakdown
+from lavt.experiment.figures import condition_colours
 from lavt.experiment.record import RecordWriter, VideoUnit, read_record
 from lavt.experiment.report import received_pictures, write_report
 from lavt.experiment.results import run_result, write_json
@@ -134,9 +135,31 @@ def test_received_pictures_are_decoded(tmp_path: Path) -> None:
     assert [round(float(picture.mean()) / 20) for _, picture in pictures] == [3, 5, 7, 9]
 
 
+def test_every_condition_has_a_colour_of_its_own() -> None:
+    """However many conditions there are, no two share a colour, and the order they come in does not matter."""
+    names = [f"L{index}" for index in range(20)]
+    colours = condition_colours(names)
+    assert len({str(colour) for colour in colours.values()}) == 20
+    assert condition_colours(["L5", "L0"]) == condition_colours(["L0", "L5"])
+
+
 def test_what_is_undefined_is_a_dash() -> None:
     """A number, a share, an interval or a latency that is not known is shown as a dash, and a bound as unknown."""
     nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
     dashes = [page.number(None), page.percent(None), page.interval(None), page.latency(nothing)]
     assert dashes == [page.NOTHING] * 4
     assert page.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1}) == "2.0 (1.0 to 3.0) ± unknown"
+
+
+def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
+    """Records without any message give a report all the same: nothing measured, and the reasons why it is not valid."""
+    directory = tmp_path / "runs" / "0"
+    directory.mkdir(parents=True)
+    RecordWriter(directory / "server.mcap", "server").close()
+    RecordWriter(directory / "client.mcap", "client").close()
+    server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
+    identity = {"run": "0", "time": "real", "injection": "none", "route": "A", "condition": "L0"}
+    write_json(directory / "result.json", run_result(identity, server, client))
+    html = write_report(tmp_path).read_text()
+    assert "real time, nothing injected" in html
+    assert "the record has no ending" in html

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,9 @@ from lavt.experiment.drives import Drive
 Conditions = Mapping[str, Mapping[str, Any]]
 """A summary's `conditions` or `real`."""
 
+Colours = Mapping[str, Any]
+"""The colour of each condition."""
+
 KINDS = {"virtual": ("o", "virtual time"), "real": ("s", "real time")}
 """Marker and name of the two ways a run can be driven; real runs are hollow, so that nobody takes one for the other."""
 
@@ -30,8 +33,8 @@ NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "d
 RESOLUTION_DPI = 130
 
 
-def condition_colours(names: Sequence[str]) -> dict[str, Any]:
-    """Give each condition a colour of its own."""
+def condition_colours(names: Iterable[str]) -> dict[str, Any]:
+    """Give each condition a colour of its own, to be used in every figure of a report."""
     ordered = sorted(set(names))
     if len(ordered) <= len(COLOURS):
         return dict(zip(ordered, COLOURS, strict=False))
@@ -63,11 +66,10 @@ def _beside(kind: str) -> dict[str, Any]:
     return {"xytext": offset, "ha": side, "textcoords": "offset points", "fontsize": 8}
 
 
-def loop_figure(kinds: Mapping[str, Conditions]) -> Figure:
+def loop_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
     """Completion and cross-track error over the median loop latency, with 95 % intervals: one point a condition."""
     figure = _figure(8, 3.6)
     completion, error = figure.subplots(1, 2)
-    colours = condition_colours([name for conditions in kinds.values() for name in conditions])
     for kind, conditions in kinds.items():
         for name, condition in conditions.items():
             loop_ms = condition["loop_ms"]["p50"]
@@ -104,7 +106,7 @@ def _legend_of_kinds(figure: Figure, kinds: Mapping[str, Conditions]) -> None:
     figure.legend(handles=handles, fontsize=8, ncols=2, loc="outside lower center", frameon=False)
 
 
-def injected_figure(kinds: Mapping[str, Conditions]) -> Figure:
+def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
     """Injected against measured delay of video and of control.
 
     Above: medians, bars from p5 to p95, and lines for the injected delay on top of the latency without any. Below: how
@@ -112,7 +114,6 @@ def injected_figure(kinds: Mapping[str, Conditions]) -> Figure:
     """
     figure = _figure(8, 5.6)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
-    colours = condition_colours([name for conditions in kinds.values() for name in conditions])
     for column, (direction, key) in enumerate((("video", "tau_v_ms"), ("control", "tau_c_ms"))):
         above, below = panels[:, column]
         for kind, conditions in kinds.items():
@@ -144,7 +145,7 @@ def _draw_injected(
     below: Axes,
     points: Sequence[tuple[str, float, Mapping[str, Any]]],
     kind: str,
-    colours: Mapping[str, Any],
+    colours: Colours,
 ) -> None:
     if not points:
         return
@@ -164,14 +165,13 @@ def _draw_injected(
     above.margins(x=0.15)
 
 
-def route_figure(drives: Sequence[Drive]) -> Figure:
+def route_figure(drives: Sequence[Drive], colours: Colours) -> Figure:
     """All drives of one route: from above, and the distance from the lane's centre over the way.
 
     The reference is thick and black, a red cross is where a drive ended early.
     """
     figure = _figure(8, 6.4)
     above, along = figure.subplots(2, 1, height_ratios=[3, 2])
-    colours = condition_colours([drive.condition for drive in drives])
     reference_m = max((drive.reference_m for drive in drives), key=len)
     above.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=4, label="lane centre")
     along.axhline(0, color="black", linewidth=2)
@@ -193,11 +193,10 @@ def route_figure(drives: Sequence[Drive]) -> Figure:
     return figure
 
 
-def time_figure(drives: Sequence[Drive]) -> Figure:
+def time_figure(drives: Sequence[Drive], colours: Colours) -> Figure:
     """Steering and cross-track error over time, one row a drive."""
     figure = _figure(8, 1.6 * len(drives) + 0.8)
     rows = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
-    colours = condition_colours([drive.condition for drive in drives])
     for row, drive in zip(rows, drives, strict=True):
         time_s = (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
         colour = colours[drive.condition]

@@ -28,6 +28,9 @@ from lavt.experiment.table import EMPTY, Table, table_of
 CHUNK_BYTES = 64 * 1024
 """What a crash can cost at most: only whole chunks can be read again."""
 
+_LARGEST_BYTES = 256 * 1024 * 1024
+"""A longer entry is damage: a flipped bit in its length must not fill the memory."""
+
 VIDEO = "video"
 """The channel of access units; its payload has `stamp_ns` and `data`."""
 
@@ -176,7 +179,7 @@ def _readable_records(
     topic_of: dict[int, str] = {}
     with path.open("rb") as stream:
         try:
-            for item in StreamReader(stream, validate_crcs=True).records:
+            for item in StreamReader(stream, validate_crcs=True, record_size_limit=_LARGEST_BYTES).records:
                 if isinstance(item, Channel):
                     topic_of[item.id] = item.topic
                 elif isinstance(item, Message):

@@ -15,7 +15,9 @@ from lavt.experiment import page
 from lavt.experiment.breakdown import Share, breakdown
 from lavt.experiment.drives import Drive, one_of_each_condition, read_drive
 from lavt.experiment.figures import (
+    Colours,
     breakdown_figure,
+    condition_colours,
     frames_figure,
     injected_figure,
     loop_figure,
@@ -56,10 +58,11 @@ def write_report(
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)
     drives = _read_drives(results)
+    colours = condition_colours(str(run["condition"]) for run in summary["runs"])
     parts = [
         *_head(summary, left_out),
-        *_overview(summary, report_dir),
-        *(part for kind in ("virtual", "real") for part in _of_one_kind(kind, drives, report_dir)),
+        *_overview(summary, report_dir, colours),
+        *(part for kind in ("virtual", "real") for part in _of_one_kind(kind, drives, report_dir, colours)),
         *_groups(summary),
         page.heading("Every run"),
         run_table(summary["runs"]),
@@ -115,7 +118,7 @@ def _head(summary: Mapping[str, Any], left_out: Sequence[str]) -> list[str]:
     return parts
 
 
-def _overview(summary: Mapping[str, Any], report_dir: Path) -> list[str]:
+def _overview(summary: Mapping[str, Any], report_dir: Path, colours: Colours) -> list[str]:
     kinds = {"virtual": summary["conditions"], "real": summary["real"]}
     kinds = {kind: conditions for kind, conditions in kinds.items() if conditions}
     parts = [page.heading("Conditions")]
@@ -129,14 +132,14 @@ def _overview(summary: Mapping[str, Any], report_dir: Path) -> list[str]:
             note=True,
         ),
         _save(
-            loop_figure(kinds),
+            loop_figure(kinds, colours),
             report_dir,
             "loop.png",
             "completion and error over loop latency",
             "What the loop latency, frame stamped to its command applied on the server's own clock, does to driving.",
         ),
         _save(
-            injected_figure(kinds),
+            injected_figure(kinds, colours),
             report_dir,
             "injected.png",
             "injected against measured latency",
@@ -147,7 +150,7 @@ def _overview(summary: Mapping[str, Any], report_dir: Path) -> list[str]:
     return parts
 
 
-def _of_one_kind(kind: str, all_drives: Sequence[Drive], report_dir: Path) -> list[str]:
+def _of_one_kind(kind: str, all_drives: Sequence[Drive], report_dir: Path, colours: Colours) -> list[str]:
     """Figures of single runs; those in real and in virtual time are never drawn into one."""
     drives = [drive for drive in all_drives if drive.result["time"] == kind]
     if not drives:
@@ -160,14 +163,18 @@ def _of_one_kind(kind: str, all_drives: Sequence[Drive], report_dir: Path) -> li
         caption = "Road wheel angle and distance from the lane's centre, left positive; one run of each condition: "
         names = ", ".join(str(drive.result["run"]) for drive in driven)
         parts.append(
-            _save(time_figure(driven), report_dir, f"time_{kind}.png", "steering over time", f"{caption}{names}.")
+            _save(
+                time_figure(driven, colours), report_dir, f"time_{kind}.png", "steering over time", f"{caption}{names}."
+            )
         )
     for route in sorted({str(drive.result["route"]) for drive in drives}):
         on_route = [drive for drive in drives if str(drive.result["route"]) == route and len(drive.truth)]
         if on_route:
             name = f"route_{re.sub('[^A-Za-z0-9]+', '_', route).strip('_')}_{kind}.png"
             caption = f"Route {route}: {len(on_route)} runs. A red cross is where a run ended before its goal."
-            parts.append(_save(route_figure(on_route), report_dir, name, f"trajectories on route {route}", caption))
+            parts.append(
+                _save(route_figure(on_route, colours), report_dir, name, f"trajectories on route {route}", caption)
+            )
     pictures = received_pictures(chosen[0].directory / "client.mcap")
     if pictures:
         caption = f"Pictures as the client received them, run {chosen[0].result['run']}; the stamp is at the top left."

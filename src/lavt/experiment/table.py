@@ -112,7 +112,7 @@ def _column(values: list[Any]) -> NDArray[Any]:
         return np.array(values, np.bool_)
     if kinds == {int} and all(value is None or abs(value) <= -(MISSING + 1) for value in values):
         return np.array([MISSING if value is None else value for value in values], np.int64)
-    if kinds <= {int, float}:
+    if kinds <= {int, float} and kinds != {int}:  # whole numbers too large for 64 bits stay what they are
         return np.array([np.nan if value is None else value for value in values], np.float64)
     column = np.empty(len(values), object)
     column[:] = values
