@@ -11,7 +11,7 @@ from lavt.errors import UserError
 from lavt.streams import stream
 from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.rtp import split_nal_units
-from lavt.transport.stamp import read_stamp, write_stamp
+from lavt.transport.stamp import STAMP_PX, read_stamp, write_stamp
 
 WIDTH, HEIGHT = 320, 240
 START_NS = 1_790_000_000_000_000_000
@@ -68,9 +68,13 @@ def test_picture_is_the_picture(pictures: list[Picture], access_units: list[byte
     assert np.abs(decoded.picture.astype(int) - pictures[0]).mean() < 12
     plain = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     plain[:] = 200, 100, 50
+    plain[:STAMP_PX, :STAMP_PX] = 255
+    plain[-STAMP_PX:, -STAMP_PX:] = 0
     seen = Decoder().decode(encoder().encode(plain))
     assert seen is not None
-    assert np.abs(seen.picture.mean(axis=(0, 1)) - (200, 100, 50)).max() < 3
+    assert np.abs(seen.picture[120, 160].astype(int) - (200, 100, 50)).max() < 4
+    assert abs(int(seen.luma[20, 20]) - 235) < 3
+    assert abs(int(seen.luma[-20, -20]) - 16) < 3
 
 
 def test_same_pictures_same_bytes(pictures: list[Picture], access_units: list[bytes]) -> None:
@@ -157,7 +161,7 @@ def test_keyframe_after_damage(access_units: list[bytes]) -> None:
 
 
 def test_lost_access_units(access_units: list[bytes]) -> None:
-    """After two lost pictures in a row the next ones come out all the same, each with no delay."""
+    """After two lost pictures in a row the next ones come out all the same, and the next keyframe at once."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     for number in range(3, 15):
@@ -235,7 +239,9 @@ def test_picture_of_another_size() -> None:
         encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))
 
 
-def test_silence(capfd: pytest.CaptureFixture[str], access_units: list[bytes]) -> None:
+def test_silence(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, access_units: list[bytes]
+) -> None:
     """Neither a damaged stream nor the end of an encoder prints anything."""
     receiver = Decoder()
     receiver.decode(access_units[1])
@@ -244,3 +250,4 @@ def test_silence(capfd: pytest.CaptureFixture[str], access_units: list[bytes]) -
     sender.encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     del sender
     assert capfd.readouterr() == ("", "")
+    assert caplog.records == []

@@ -45,6 +45,9 @@ def test_start() -> None:
     assert numbers(ordered) == [10, 11, 12]
     assert gaps(ordered) == []
     assert buffer.next_wake_ns() is None
+    buffer.push(packet(10), 100 + HOLD_NS)
+    buffer.push(packet(9), 100 + HOLD_NS)
+    assert (buffer.duplicate, buffer.late) == (1, 1)
 
 
 def test_in_order() -> None:
@@ -130,6 +133,14 @@ def test_one_stray_packet() -> None:
     assert numbers(buffer.push(packet(1), STARTED_NS)) == [1]
     assert buffer.stray == 2
     assert buffer.next_wake_ns() is None
+
+
+def test_stray_packets_apart() -> None:
+    """Two stray packets that are not in a row, or not one right after the other, move nothing."""
+    buffer = started()
+    for number, released in ((20_000, []), (20_002, []), (1, [1]), (20_003, []), (2, [2])):
+        assert numbers(buffer.push(packet(number), STARTED_NS)) == released
+    assert buffer.stray == 3
 
 
 def test_jump() -> None:

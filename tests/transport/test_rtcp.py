@@ -78,6 +78,7 @@ def test_compound() -> None:
         picture_loss(1, 2)[8:],
         picture_loss(1, 2)[:-4],
         SOME_REPORT + b"\x81\xce",
+        SOME_REPORT + b"\x81\xca\x00\x05",
         b"\x82" + SOME_REPORT[1:],
         b"\x41" + SOME_REPORT[1:],
         b"\xa1" + SOME_REPORT[1:] + picture_loss(1, 2),

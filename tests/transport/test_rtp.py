@@ -205,6 +205,23 @@ def test_a_whole_access_unit_is_lost() -> None:
     assert [unit.complete for unit in units] == [False, True, True, False]
 
 
+def test_only_a_keyframe_stands_alone() -> None:
+    """After a loss only a keyframe is complete, whatever else an access unit begins with."""
+    for head in (b"\x09\x10", SPS):
+        (unit,) = push_all(Depacketizer(), packets_of(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
+        assert not unit.complete
+
+
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_a_slice_is_lost(missing: int) -> None:
+    """Of a picture in slices, each with a packet of its own, no slice is missing unnoticed."""
+    packets = [packet(SLICE + b"%d" % number, 1, marker=number == 2) for number in range(3)]
+    depacketizer = Depacketizer()
+    units = push_all(depacketizer, packets[:missing])
+    units += push_all(depacketizer, [*packets[missing + 1 :], packet(SLICE, 2)], lost_before=True)
+    assert [(unit.timestamp, unit.complete) for unit in units] == [(1, False)]
+
+
 def test_nothing_left() -> None:
     """An access unit of which only useless packets came leaves empty and incomplete."""
     (unit,) = push_all(Depacketizer(), packets_of(PICTURE)[1:], lost_before=True)
@@ -239,6 +256,7 @@ MALFORMED = {
     "empty STAP-A": b"\x78",
     "STAP-A cut off": b"\x78\x00\x04abc",
     "STAP-A with an empty unit": b"\x78\x00\x00\x00\x01A",
+    "STAP-A that ends with an empty unit": b"\x78\x00\x00",
     "STAP-A with half a size": b"\x78\x00",
     "STAP-A in STAP-A": b"\x78\x00\x01\x78",
     "FU-A without header": b"\x7c",

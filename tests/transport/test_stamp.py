@@ -62,8 +62,15 @@ def test_centre_of_the_cells() -> None:
     luma = picture[..., 0].copy()
     edges = np.ones((8, 8), bool)
     edges[2:6, 2:6] = False
-    luma[np.tile(edges, (8, 8))] = 128
+    luma[np.tile(edges, (8, 8))] ^= 255
     assert read_stamp(luma) == 0x0123_4567_89AB_CDEF
+
+
+def test_threshold() -> None:
+    """A cell is white when its mean is above 128, the middle between black and white."""
+    picture = np.zeros((64, 64, 3), np.uint8)
+    write_stamp(picture, 0x0123_4567_89AB_CDEF)
+    assert read_stamp(np.where(picture[..., 0] > 0, 129, 128).astype(np.uint8)) == 0x0123_4567_89AB_CDEF
 
 
 def test_too_small() -> None:

@@ -32,8 +32,8 @@ _KEYFRAME_KINDS: Final = {5, 7, 8}
 """An IDR slice, a sequence and a picture parameter set (H.264, table 7-1)."""
 _PRESETS: Final = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
 
-# What FFmpeg would print about a damaged stream is counted here anyway, and libx264 prints a summary at every end.
-av.logging.set_level(av.logging.PANIC)
+# What FFmpeg says of a damaged stream the caller counts anyway, and libx264 sums itself up at every end.
+av.logging.set_level(None)
 
 
 class Encoder:
@@ -137,7 +137,12 @@ class Decoder:
         self._damaged = False
 
     def decode(self, access_unit: bytes) -> DecodedPicture | None:
-        """Decode one access unit (annex B); None when it gives no picture, whatever its bytes."""
+        """Decode one access unit (annex B); None when it gives no picture, whatever its bytes.
+
+        After the loss of a whole keyframe, or of two pictures in a row where the 4-bit frame number wraps, FFmpeg may
+        take the next pictures for older than those before and give none until that number has caught up (measured: up
+        to 14 pictures), or until the next keyframe.
+        """
         if not access_unit:
             return None  # to FFmpeg an empty packet means the end of the stream: nothing would come out ever after
         # FFmpeg carries something of a damaged picture over into the next keyframe, which then is visibly wrong without
@@ -159,8 +164,7 @@ def _new_context() -> VideoCodecContext:
     context = av.CodecContext.create("h264", "r")
     context.thread_type = ThreadType.SLICE
     context.thread_count = 1
-    # Without output_corrupt two lost pictures in a row leave the screen frozen until the next keyframe.
-    context.flags |= Flags.low_delay | Flags.output_corrupt
+    context.flags |= Flags.low_delay
     context.options = {"max_pixels": str(_MAX_DECODED_PX)}
     return context
 

@@ -35,8 +35,8 @@ def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
     if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
         raise UserError(f"a picture must be at least {STAMP_PX} x {STAMP_PX} pixels for the stamp; use a larger one")
     stamp_bytes = np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)
-    cells = np.unpackbits(stamp_bytes).reshape(_CELLS, 1, _CELLS, 1) * np.uint8(255)
-    rows = cells.repeat(_CELL_PX, axis=2).reshape(_CELLS, 1, STAMP_PX, 1)
+    cells = np.unpackbits(stamp_bytes) * np.uint8(255)
+    rows = cells.repeat(_CELL_PX * 3).reshape(_CELLS, 1, STAMP_PX, 3)
     corner = picture_bgr[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, STAMP_PX, 3)
     corner[...] = rows
 
