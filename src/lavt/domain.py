@@ -85,7 +85,7 @@ class GroundTruth:
     """Distance along the lane's centre since the start of the route."""
 
 
-EventKind = Literal["lane_invasion", "collision", "off_road", "completed", "timeout", "fault"]
+EventKind = Literal["lane_invasion", "collision", "off_road", "completed", "timeout", "fault", "late"]
 
 Ending = Literal["completed", "collision", "off_road", "timeout", "safe_stop"]
 

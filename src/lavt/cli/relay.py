@@ -43,6 +43,8 @@ def relay(
             )
         while not told.is_set():
             opened.step()
+    if as_json:
+        console.show_json({"lateness_ms": opened.lateness_ms()})
     opened.close()
 
 

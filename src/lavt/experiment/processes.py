@@ -38,7 +38,8 @@ class Process:
                 start_new_session=True,  # Ctrl-C at the terminal goes to who started it, who ends it in order
                 env={**os.environ, "OPENCV_FOR_THREADS_NUM": "1"},
             )
-        threading.Thread(target=self._read, name=f"{name} lines", daemon=True).start()
+        self._reader = threading.Thread(target=self._read, name=f"{name} lines", daemon=True)
+        self._reader.start()
 
     def ready(self) -> dict[str, Any]:
         """Wait for the first line; raises `WorkError` where the process ends or says nothing."""
@@ -70,21 +71,24 @@ class Process:
             except subprocess.TimeoutExpired:
                 self.popen.kill()
         self.popen.wait()
+        self._reader.join()
         if self.popen.stdout is not None:
             self.popen.stdout.close()
 
+    def last_line(self) -> dict[str, Any]:
+        """Give the last line that the process printed before it ended."""
+        self._reader.join()
+        return self.latest
+
     def _read(self) -> None:
         assert self.popen.stdout is not None  # noqa: S101 (a pipe was asked for)
-        try:
-            for text in self.popen.stdout:
-                try:
-                    line = json.loads(text)
-                except ValueError:
-                    continue
-                self.latest = line
-                self._first.put(line)
-        except ValueError:  # closed in the middle of a read
-            pass
+        for text in self.popen.stdout:
+            try:
+                line = json.loads(text)
+            except ValueError:
+                continue
+            self.latest = line
+            self._first.put(line)
         self._first.put(None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from lavt.experiment.network import injected_network
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import Process, Processes
 from lavt.experiment.sides import client_config, server_config
+from lavt.experiment.validity import injection_reasons
 from lavt.experiment.virtual_run import read_costs
 from lavt.transport.delay import DelayLaw
 
@@ -71,18 +73,25 @@ def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path,
     return Loop(server_router, server, relay, client_router, client)
 
 
-def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
-    """Drive once, leaving the two records in `out`; raises `WorkError` where a part ends or nobody gets to drive."""
+def drive_real(
+    planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None
+) -> list[str]:
+    """Drive once, leaving the two records in `out`; returns what was wrong with the injected delay.
+
+    Raises `WorkError` where a part ends or nobody gets to drive.
+    """
     clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
         with Processes(work) as processes:
             loop = start_loop(processes, planned, work, work)
             _wait_for_the_end(processes, loop, clock, progress)
-            loop.client.end()
-            loop.server.end()
+            for process in reversed(processes.started):
+                process.end()
+            injected = _as_injected(planned, loop.relay)
         for side in ("server", "client"):
-            (work / side / f"{side}.mcap").replace(out / f"{side}.mcap")
+            shutil.move(work / side / f"{side}.mcap", out / f"{side}.mcap")
+    return injected
 
 
 def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: Progress | None) -> None:
@@ -100,6 +109,16 @@ def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: 
         pause(STATUS_PERIOD_NS)
     if loop.server.popen.poll() not in (None, 0):
         raise WorkError(f"the server failed: {loop.server.said()}")
+
+
+def _as_injected(planned: PlannedRun, relay: Process | None) -> list[str]:
+    """Compare what the relay says it did with what was asked of it."""
+    if relay is None:
+        return []
+    asked = planned.identity["injected_ms"]
+    lateness = relay.last_line().get("lateness_ms", {})
+    late = {"video": lateness.get("video downstream"), "control": lateness.get("control upstream")}
+    return injection_reasons(asked, {name: None if late[name] is None else asked[name] + late[name] for name in late})
 
 
 def _start_router(processes: Processes, name: str, file: str, dialled: list[str]) -> tuple[Process, str, str]:

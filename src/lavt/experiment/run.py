@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
     cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
     prepare_directory(out)
     (out / "config.yaml").write_text(yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False))
-    digest = None
+    digest, reasons = None, []
     if planned.config.time == "virtual":
         loop = build_loop(planned, out)
         drive(loop)
@@ -32,14 +32,16 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
         if not loop.tap.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
     else:
-        drive_real(planned, out, progress=progress)
-    return compute_result(out, planned.identity, digest)
+        reasons = drive_real(planned, out, progress=progress)
+    return compute_result(out, planned.identity, digest, reasons)
 
 
-def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
-    """Compute `result.json` from the records in `out`."""
+def compute_result(
+    out: Path, identity: Mapping[str, Any], digest: str | None, reasons: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Compute `result.json` from the records in `out`; `reasons` are those against the run that records do not show."""
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-    result = run_result(identity, server, client, digest=digest)
+    result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
     return result
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from lavt.domain import NS_PER_MS
-from lavt.experiment.metrics import Measured, count
+from lavt.experiment.latency import frames_within
+from lavt.experiment.metrics import Measured, count, driving_interval
 from lavt.experiment.record import Record
 from lavt.experiment.table import MISSING, Table
 
@@ -31,7 +32,7 @@ def invalid_because(server: Record, client: Record, measured: Measured) -> list[
         *_step_reasons("server", server.table("clock")),
         *_step_reasons("client", client.table("clock")),
         *_closure_reasons(measured),
-        *_tick_reasons(server, measured),
+        *_tick_reasons(server),
     ]
 
 
@@ -69,13 +70,18 @@ def _closure_reasons(measured: Measured) -> list[str]:
     return [f"the parts of the loop miss the whole by {closure_ms:.2f} ms (p95, limit {CLOSURE_LIMIT_MS} ms)"]
 
 
-def _tick_reasons(server: Record, measured: Measured) -> list[str]:
-    reasons = [] if measured.entry["ending"] is not None else ["the record has no ending"]
-    late = count(server, "physics_late") or 0
+def _tick_reasons(server: Record) -> list[str]:
+    """Look at what was late or missed while it was driven; before and after it does not matter."""
+    began_ns, ended_ns, ending = driving_interval(server)
+    reasons = [] if ending is not None else ["the record has no ending"]
+    events = server.table("event")
+    driving = (events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns)
+    late = events.where(driving).texts("kind").count("late")
     if late > 0:
         reasons.append(f"the physics was late {late} times")
-    skipped = count(server, "frames_skipped") or 0
-    ticks = skipped + len(server.table("frame"))
+    numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
+    ticks = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
+    skipped = ticks - len(numbers)
     if skipped > SKIPPED_LIMIT * ticks:
         reasons.append(f"the camera missed {skipped} of {ticks} ticks (limit {SKIPPED_LIMIT:.0%})")
     return reasons

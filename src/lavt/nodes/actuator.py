@@ -149,8 +149,10 @@ class ActuatorNode:
 
     def _advance(self, message: Message, now: Now) -> list[VehicleEvent]:
         due_ns = min(self.vehicle.next_wake_ns(), message.arrived.mono_ns)
-        self.counts["physics_late"] += now.mono_ns - due_ns > LATE_NS
         events = self.vehicle.advance(now.mono_ns)
+        if now.mono_ns - due_ns > LATE_NS:
+            late_ms = (now.mono_ns - due_ns) // NS_PER_MS
+            events.append(VehicleEvent(now.mono_ns, "late", f"the physics was {late_ms} ms late"))
         self.gate.watch(now.mono_ns)
         self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
         return events

@@ -11,11 +11,13 @@ import heapq
 import selectors
 import socket
 import struct
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from statistics import median
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.delay import DelayLaw, DelayLine
 
@@ -24,6 +26,9 @@ BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_PAUSE_S = 0.05
 CLIENT_SILENCE_NS = 30 * NS_PER_S
 """A client that sent nothing for so long loses its socket."""
+
+REMEMBERED = 20_000
+"""So many datagrams count for what the relay says of its own lateness."""
 
 Address = tuple[str, int]
 NONE = DelayLaw(0.0)
@@ -63,6 +68,8 @@ class _Way:
     held: Callable[[bytes], bool]
     count: int = 0
     in_heap: bool = False
+    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """How much later than due the last datagrams were sent."""
 
 
 @dataclass
@@ -89,6 +96,15 @@ class Relay:
     def ports(self) -> dict[str, int]:
         """Tell the port that was opened for each flow."""
         return {each.flow.name: each.port for each in self._flows}
+
+    def lateness_ms(self) -> dict[str, float | None]:
+        """Tell for each flow and direction the median of how much later than due its datagrams were sent."""
+        late = {
+            f"{each.flow.name} {direction}": [late_ns for way in ways for late_ns in way.late_ns]
+            for each in self._flows
+            for direction, ways in each.ways().items()
+        }
+        return {name: median(values) / NS_PER_MS if values else None for name, values in late.items()}
 
     def step(self) -> None:
         """Wait for what comes first, a datagram or one that is due, and deal with it."""
@@ -127,7 +143,8 @@ class Relay:
             return
         way.count += 1
         index = way.count if way.index is None else way.index(datagram)
-        way.line.push(datagram, self.now_ns(), index)
+        now_ns = self.now_ns()
+        way.line.push((datagram, now_ns + way.line.law.delay_ns(index)), now_ns, index)
         self._schedule(way)
 
     def _schedule(self, way: _Way) -> None:
@@ -141,8 +158,9 @@ class Relay:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
             _, _, way = heapq.heappop(self._heap)
             way.in_heap = False
-            for datagram in way.line.pop_due(now_ns):
+            for datagram, due_ns in way.line.pop_due(now_ns):
                 self._send(way, datagram)
+                way.late_ns.append(self.now_ns() - due_ns)
             self._schedule(way)
 
     def _send(self, way: _Way, datagram: bytes) -> None:
@@ -162,6 +180,10 @@ class _OpenFlow:
         self._socket = _bound_socket(flow.listen, flow.name)
         self.port = int(self._socket.getsockname()[1])
         relay.watch(self._socket, self._from_clients)
+
+    def ways(self) -> dict[str, list[_Way]]:
+        clients = self._clients.values()
+        return {"upstream": [client.up for client in clients], "downstream": [client.down for client in clients]}
 
     def close(self) -> None:
         for client in self._clients.values():
