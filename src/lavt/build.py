@@ -238,13 +238,21 @@ def build_server(
 def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy) -> ClientNodes:
     """Make the client's nodes."""
     controller = config.controller
-    detector = LaneDetector(camera_model(config.camera))
+    model = camera_model(config.camera)
+    detector = LaneDetector(model)
     lane_keeper = make_controller(controller.kind, controller.preset, controller.wheelbase_m)
     start = now()
     session = ClientSession(config.who, entropy.number(64), rearm=controller.rearm, start_ns=start.mono_ns)
     return ClientNodes(
         ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
-        DriverNode(Decoder(), detector, lane_keeper, session, CLIENT_LIMITS),
+        DriverNode(
+            Decoder(),
+            detector,
+            lane_keeper,
+            session,
+            CLIENT_LIMITS,
+            picture_shape=(model.height_px, model.width_px, 3),
+        ),
         ClockSyncNode(start.mono_ns),
     )
 

@@ -41,6 +41,10 @@ class Drive:
     step_s: float = 0.0
     """Step of the client's wall clock halfway."""
     server_counts: tuple[tuple[str, int], ...] = ()
+    skipped: int = 0
+    """Frames that the camera missed in the middle of the drive."""
+    late: int = 0
+    """So often the physics was late."""
 
     def server(self, at_ns: int) -> Now:
         """Read the server's clocks; its wall clock is the reference."""
@@ -84,9 +88,13 @@ def write_server(drive: Drive, path: Path) -> None:
     writer.write(
         "event", {"mono_ns": drive.server(5).mono_ns, "kind": "lane_invasion", "detail": "left"}, drive.server(5)
     )
+    for _ in range(drive.late):
+        writer.write("event", {"mono_ns": drive.server(6).mono_ns, "kind": "late", "detail": "60 ms"}, drive.server(6))
     sequence = 0
     for number in range(-3, end_ns // FRAME_NS + 1):
         at_ns = number * FRAME_NS
+        if 100 <= number < 100 + drive.skipped:
+            continue
         write_frame(writer, drive, number)
         for repeat in range(2):
             sequence += 1

@@ -63,6 +63,8 @@ class DriverNode:
         controller: DriveController,
         session: ClientSession,
         limits: ClientLimits,
+        *,
+        picture_shape: tuple[int, int, int],
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.session = session
@@ -71,6 +73,8 @@ class DriverNode:
         self._controller = controller
         self._watch = LaneWatch()
         self._limits = limits
+        self._picture_shape = picture_shape
+        self._in_doubt = True
         self._sequence = 0
         self._view: View | None = None
         self._view_ns = 0
@@ -95,12 +99,18 @@ class DriverNode:
 
     def _decode(self, message: Message, now: Now) -> Decoded:
         unit: ReceivedUnit = message.payload
+        self._in_doubt = not unit.complete or (self._in_doubt and not unit.keyframe)
         return Decoded(unit, self._decoder.decode(unit.data), now.mono_ns)
 
     def _read_stamp(self, decoded: Decoded, now: Now) -> StampRead:
         decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
         if decoded.picture is None:
             return StampRead(decoded, 0, "no picture")
+        if decoded.picture.picture.shape != self._picture_shape:
+            height_px, width_px, _ = decoded.picture.picture.shape
+            return StampRead(
+                decoded, 0, f"a picture of {width_px} x {height_px} pixels, which is not what was configured"
+            )
         stamp_ns = read_stamp(decoded.picture.luma)
         if not stamp_agrees(stamp_ns, decoded.unit.rtp_timestamp):
             return StampRead(decoded, 0, "stamp and RTP timestamp disagree")
@@ -112,11 +122,20 @@ class DriverNode:
         self.counts["frames_decoded"] += decoded.picture is not None
         self.counts["frames_unreadable"] += not readable
         picture = PictureRead(
-            read.stamp_ns, readable, read.reason, unit.rtp_timestamp, unit.packet_mono_ns, decoded.decoded_mono_ns,
-            now.mono_ns, now.wall_ns,
-        )  # fmt: skip
+            read.stamp_ns if readable else None,
+            readable,
+            read.reason,
+            self._in_doubt,
+            unit.rtp_timestamp,
+            unit.packet_mono_ns,
+            decoded.decoded_mono_ns,
+            now.mono_ns,
+            now.wall_ns,
+        )
         sends = [Send("video", VideoUnit(read.stamp_ns, unit.data)), Send("picture", picture)]
-        if readable and decoded.picture is not None:
+        if decoded.picture is None:
+            sends.append(Send("picture_lost", None))
+        elif readable:
             sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture.picture)))
         return sends
 

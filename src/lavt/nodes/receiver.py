@@ -43,6 +43,7 @@ class ReceiverNode:
         self.chains: Mapping[str, Sequence[Hop]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
             "path_token": (("note", self._note_token),),
+            "picture_lost": (("ask", lambda _message, now: self._ask_for_keyframe(now.mono_ns)),),
             WAKE: (("expire", self._wake), ("depacketize", self._depacketize)),
         }
 
@@ -95,30 +96,37 @@ class ReceiverNode:
                 self.counts["access_units_incomplete"] += not unit.complete
                 received = ReceivedUnit(unit.data, unit.timestamp, unit.complete, unit.keyframe, arrived.mono_ns)
                 sends.append(Send("access_unit", received))
-            if lost_before and self._media_ssrc is not None and now.mono_ns >= self._picture_loss_ns:
-                self._picture_loss_ns = now.mono_ns + PICTURE_LOSS_PAUSE_NS
-                self.counts["picture_loss_requests"] += 1
-                sends.append(self._feedback(picture_loss(SSRC, self._media_ssrc)))
+            if lost_before:
+                sends += self._ask_for_keyframe(now.mono_ns)
         return sends
 
+    def _ask_for_keyframe(self, now_ns: int) -> list[Send]:
+        """Ask for a keyframe after a loss, and no more often than one can come."""
+        if self._media_ssrc is None or now_ns < self._picture_loss_ns:
+            return []
+        self._picture_loss_ns = now_ns + PICTURE_LOSS_PAUSE_NS
+        self.counts["picture_loss_requests"] += 1
+        return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
+
     def _report(self, media_ssrc: int) -> Send:
-        lost = self._reorder.lost - self._lost_at_report
+        lost_in_all = self._reorder.lost - self._reorder.late
+        lost = max(0, lost_in_all - self._lost_at_report)
         expected = self._packets_since_report + lost
         fraction = lost / expected if expected else 0.0
-        self._packets_since_report, self._lost_at_report = 0, self._reorder.lost
+        self._packets_since_report, self._lost_at_report = 0, lost_in_all
         return self._feedback(
             receiver_report(
                 SSRC,
                 media_ssrc,
                 highest_sequence=self._reorder.highest_sequence,
                 lost_fraction=fraction,
-                cumulative_lost=self._reorder.lost,
+                cumulative_lost=lost_in_all,
                 jitter=round(self._jitter),
             )
         )
 
     def _note_transit(self, arrived_ns: int, timestamp: int) -> None:
-        """Interarrival jitter in units of the RTP clock (RFC 3550, section 6.4.1)."""
+        """Keep the interarrival jitter, in units of the RTP clock (RFC 3550, section 6.4.1)."""
         transit = (arrived_ns * 9 // 100_000 - timestamp) & 0xFFFFFFFF
         if self._transit is not None:
             difference = (transit - self._transit + 2**31) % 2**32 - 2**31

@@ -53,10 +53,12 @@ class View:
 class PictureRead:
     """What became of a received access unit."""
 
-    stamp_ns: int
-    """0 where it could not be read."""
+    stamp_ns: int | None
+    """None where it could not be read."""
     readable: bool
     reason: str
+    in_doubt: bool
+    """Something of it, or of a picture it refers to, was lost since the last clean keyframe."""
     rtp_timestamp: int
     packet_mono_ns: int
     decoded_mono_ns: int

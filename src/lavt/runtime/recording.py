@@ -63,7 +63,7 @@ WIRE: dict[str, Callable[[bytes], object]] = {
 }
 """How the bytes of a channel that crosses the network are written down."""
 
-UNRECORDED = ("pose", "view", "video_token", "path_token", "access_unit", "clock_query", "clock_report")
+UNRECORDED = ("pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report")
 """Written down elsewhere (the truth, the pictures' units, the clock samples), or secret."""
 
 

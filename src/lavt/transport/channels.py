@@ -33,6 +33,7 @@ CHANNELS: dict[str, Channel] = {
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),
+    "picture_lost": Channel("local", "driver", ("receiver",)),
     "path_token": Channel("local", "driver", ("receiver",)),
     # across the network
     "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
