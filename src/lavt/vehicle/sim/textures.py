@@ -86,7 +86,7 @@ def _finest() -> Textures:
     gravel = np.array([98, 112, 122], dtype=np.float32) * pebbles[..., None]
     chips = 0.9 * stones + 0.6 * grain + 1.3 * seamless_noise("chips", size, 160)
     wear = 205 + 26 * np.clip(-1.1 - 0.5 * chips, -4.0, 0.6) + 8 * patches
-    return Textures(_bytes(asphalt), _bytes(grass), _bytes(gravel), _bytes(wear))
+    return Textures(_bytes(np.maximum(asphalt, 30)), _bytes(grass), _bytes(gravel), _bytes(wear))
 
 
 def _bytes(values: Field | FloatArray) -> NDArray[np.uint8]:
