@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from lavt.control.drive_controller import PRESETS
 from lavt.experiment.theory import (
     DELAY_PER_LOOKAHEAD,
     LateralLoop,
@@ -61,7 +62,7 @@ def test_the_margin_vanishes_where_the_loop_turns_unstable() -> None:
 def test_a_fraction_of_a_frame_joins_the_whole_frames() -> None:
     """The response is continuous in the delay where the fraction turns into one more frame."""
     loop = LateralLoop(1.0)
-    before, after = (open_loop(loop, 3 / 30 + shift, 2.0) for shift in (-1e-7, 1e-7))
+    before, after = (open_loop(loop, 3 / 30 + shift, np.array([2.0]))[0] for shift in (-1e-7, 1e-7))
     assert before == pytest.approx(after, abs=1e-5)
 
 
@@ -89,3 +90,9 @@ def test_whatever_slows_the_loop_costs_delay(slower: LateralLoop, faster: Latera
 def test_a_lookahead_that_is_too_short_is_unstable_without_any_delay() -> None:
     """The lags of the car alone can use up the whole margin."""
     assert critical_delay_s(LateralLoop(0.2)) == 0.0
+
+
+def test_the_designed_preset_is_what_the_model_gives() -> None:
+    """The lookahead in the table of presets is the smallest with 30 degrees of margin at 81 ms, rounded up."""
+    smallest_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
+    assert PRESETS["designed"].lookahead_s == math.ceil(100 * smallest_s) / 100

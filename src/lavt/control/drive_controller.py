@@ -122,7 +122,6 @@ class LaneKeeper:
         return min(by_wheel, self._preset.lateral_limit_mps2 / max(speed_mps, 1.0) ** 2)
 
 
-
 class ControllerFactory(Protocol):
     """Makes a controller from a preset and what the car is like."""
 

@@ -173,14 +173,18 @@ def critical_delay_s(loop: LateralLoop) -> float:
     return math.inf
 
 
-def open_loop(loop: LateralLoop, total_delay_s: float, frequency_radps: float) -> complex:
-    """Give the loop's frequency response from command to command, cut open at the controller's output."""
-    sampled = _sampled(loop, total_delay_s)
-    z = np.exp(1j * frequency_radps / loop.frame_rate_hz)
-    delayed: ComplexArray = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
-    state = np.linalg.solve(z * np.eye(5) - sampled.transition, delayed)
-    average = loop.smoothing / (1 - (1 - loop.smoothing) / z)
-    return complex(-(loop.gain @ state[2:4]) * average)
+def open_loop(loop: LateralLoop, total_delay_s: float, frequencies_radps: FloatArray) -> ComplexArray:
+    """Give the loop's frequency response from command to command, cut open at the controller's output, (n,)."""
+    return _response(loop, _sampled(loop, total_delay_s), frequencies_radps)
+
+
+def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
+    z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
+    delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
+    resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition
+    states = np.linalg.solve(resolvents, delayed[..., np.newaxis])[..., 0]
+    averages = loop.smoothing / (1 - (1 - loop.smoothing) / z[:, 0])
+    return np.asarray(-(states[:, 2:4] @ loop.gain) * averages, dtype=np.complex128)
 
 
 def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
@@ -188,8 +192,9 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
 
     Negative where the loop is unstable; infinite where the gain never reaches 1.
     """
-    frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 400)
-    responses = np.array([open_loop(loop, total_delay_s, float(frequency)) for frequency in frequencies])
+    sampled = _sampled(loop, total_delay_s)
+    frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 200)
+    responses = _response(loop, sampled, frequencies)
     above = np.flatnonzero(np.abs(responses) > 1)
     if len(above) == 0:
         return math.inf
@@ -197,14 +202,14 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
     if last + 1 == len(frequencies):
         return -math.inf
     crossover = _crossing(
-        lambda frequency: 1 - abs(open_loop(loop, total_delay_s, frequency)),
+        lambda frequency: 1 - float(np.abs(_response(loop, sampled, np.array([frequency])))[0]),
         low=float(frequencies[last]),
         high=float(frequencies[last + 1]),
     )
     # Unwrapped from the low end, where two integrations make it -180 degrees: a margin below -180 stays one.
-    phase = float(np.unwrap(np.angle(np.append(responses[: last + 1], open_loop(loop, total_delay_s, crossover))))[-1])
-    start = float(np.angle(responses[0]))
-    return math.pi + phase - (2 * math.pi if start > 0 else 0.0)
+    upwards = np.append(frequencies[: last + 1], crossover)
+    phases = np.unwrap(np.angle(_response(loop, sampled, upwards)))
+    return float(math.pi + phases[-1] - (2 * math.pi if phases[0] > 0 else 0.0))
 
 
 def smallest_lookahead_s(margin_rad: float, total_delay_s: float) -> float:
