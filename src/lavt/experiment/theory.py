@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from lavt.domain import FloatArray
+from lavt.perception.lane_detector import SMOOTHING
+from lavt.vehicle.sim.dynamics import CarParameters
 
 ComplexArray = NDArray[np.complex128]
 
@@ -34,31 +36,11 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 
 |L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase left there, atan(w / a), is acos(sqrt(2) - 1)."""
 
+DEFAULT_CAR = CarParameters()
+"""The simulator's car; of its parameters the model takes those of the lateral motion at small slip."""
+
 _LONGEST_DELAY_S = 3.0  # past every delay that is of interest; the search ends there
 _SEARCH_STEP_S = 0.005
-
-
-@dataclass(frozen=True, slots=True)
-class LinearCar:
-    """What the linear model knows of a car; the defaults are the simulator's, an MKZ class saloon.
-
-    Mass and axle stiffness: Apollo's lateral controller configuration for the Lincoln MKZ; yaw inertia and the split of
-    the wheelbase are estimates.
-    """
-
-    mass_kg: float = 2080.0
-    yaw_inertia_kgm2: float = 3300.0
-    front_stiffness_n_per_rad: float = 155_495.0
-    rear_stiffness_n_per_rad: float = 155_495.0
-    front_axle_m: float = 1.40
-    """Centre of gravity to front axle."""
-    rear_axle_m: float = 1.4448
-    """Centre of gravity to rear axle."""
-
-    @property
-    def wheelbase_m(self) -> float:
-        """Distance of the axles."""
-        return self.front_axle_m + self.rear_axle_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +50,9 @@ class LateralLoop:
     lookahead_s: float
     speed_mps: float = 30 / 3.6
     frame_rate_hz: float = 30.0
-    steering_lag_s: float = 0.12
-    smoothing: float = 0.6
+    smoothing: float = SMOOTHING
     """Weight of the newest picture in the moving average; 1 is none."""
-    car: LinearCar = LinearCar()
+    car: CarParameters = DEFAULT_CAR
 
     @property
     def gain(self) -> FloatArray:
@@ -87,18 +68,18 @@ def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
     angle.
     """
     car, speed = loop.car, loop.speed_mps
-    front, rear = car.front_stiffness_n_per_rad, car.rear_stiffness_n_per_rad
-    ahead, behind = car.front_axle_m, car.rear_axle_m
+    ahead, stiffness = car.front_axle_to_gravity_m, car.axle_stiffness_nprad
+    behind = car.wheelbase_m - ahead
     mass, inertia = car.mass_kg, car.yaw_inertia_kgm2
-    coupling = rear * behind - front * ahead
+    coupling = stiffness * (behind - ahead)
     a = np.zeros((5, 5))
-    a[0] = [-(front + rear) / (mass * speed), coupling / (mass * speed) - speed, 0, 0, front / mass]
-    yaw_damping = (front * ahead**2 + rear * behind**2) / (inertia * speed)
-    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * ahead / inertia]
+    a[0] = [-2 * stiffness / (mass * speed), coupling / (mass * speed) - speed, 0, 0, stiffness / mass]
+    yaw_damping = stiffness * (ahead**2 + behind**2) / (inertia * speed)
+    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, stiffness * ahead / inertia]
     a[2] = [1, -behind, 0, speed, 0]
     a[3, 1] = 1
-    a[4, 4] = -1 / loop.steering_lag_s
-    return a, np.array([0, 0, 0, 0, 1 / loop.steering_lag_s])
+    a[4, 4] = -1 / car.steering_lag_s
+    return a, np.array([0, 0, 0, 0, 1 / car.steering_lag_s])
 
 
 def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArray, FloatArray]:
