@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 
+from lavt.control.drive_controller import PRESETS
 from lavt.experiment.theory import (
     DELAY_PER_LOOKAHEAD,
     LateralLoop,
@@ -13,6 +14,7 @@ from lavt.experiment.theory import (
     smallest_lookahead_s,
     spectral_radius,
 )
+from lavt.vehicle.sim.dynamics import CarParameters
 
 PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an independent computation of the same model
     (0.60, 0.15, 114),
@@ -28,13 +30,13 @@ PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an indepe
 @pytest.mark.parametrize(("lookahead_s", "steering_lag_s", "critical_ms"), PROTOTYPE_TABLE)
 def test_reproduces_the_prototype(lookahead_s: float, steering_lag_s: float, critical_ms: float) -> None:
     """The critical delays are those of an independent computation, within 3 ms."""
-    loop = LateralLoop(lookahead_s, steering_lag_s=steering_lag_s)
+    loop = LateralLoop(lookahead_s, car=CarParameters(steering_lag_s=steering_lag_s))
     assert 1e3 * critical_delay_s(loop) == pytest.approx(critical_ms, abs=3)
 
 
 def test_without_lag_filter_and_hold_the_bound_is_the_textbook_one() -> None:
     """As lag, averaging, hold and tyres vanish, the critical delay becomes 0.5205 lookahead / speed."""
-    bare = LateralLoop(2.0, speed_mps=1.0, frame_rate_hz=100.0, steering_lag_s=1e-3, smoothing=1.0)
+    bare = LateralLoop(2.0, speed_mps=1.0, frame_rate_hz=100.0, smoothing=1.0, car=CarParameters(steering_lag_s=1e-3))
     bound_s = DELAY_PER_LOOKAHEAD * 2.0
     assert pytest.approx(0.52049, abs=1e-5) == DELAY_PER_LOOKAHEAD
     # 1 ms of lag, half a frame of hold and the 7 ms in which tyres relax at 1 m/s take their share.
@@ -61,7 +63,7 @@ def test_the_margin_vanishes_where_the_loop_turns_unstable() -> None:
 def test_a_fraction_of_a_frame_joins_the_whole_frames() -> None:
     """The response is continuous in the delay where the fraction turns into one more frame."""
     loop = LateralLoop(1.0)
-    before, after = (open_loop(loop, 3 / 30 + shift, 2.0) for shift in (-1e-7, 1e-7))
+    before, after = (open_loop(loop, 3 / 30 + shift, np.array([2.0]))[0] for shift in (-1e-7, 1e-7))
     assert before == pytest.approx(after, abs=1e-5)
 
 
@@ -78,7 +80,10 @@ def test_the_smallest_lookahead_leaves_just_the_margin() -> None:
         (LateralLoop(0.74, speed_mps=50 / 3.6), LateralLoop(0.74, speed_mps=20 / 3.6)),
         (LateralLoop(0.74, frame_rate_hz=15), LateralLoop(0.74, frame_rate_hz=60)),
         (LateralLoop(0.74, smoothing=0.3), LateralLoop(0.74, smoothing=1.0)),
-        (LateralLoop(0.74, steering_lag_s=0.2), LateralLoop(0.74, steering_lag_s=0.05)),
+        (
+            LateralLoop(0.74, car=CarParameters(steering_lag_s=0.2)),
+            LateralLoop(0.74, car=CarParameters(steering_lag_s=0.05)),
+        ),
     ],
 )
 def test_whatever_slows_the_loop_costs_delay(slower: LateralLoop, faster: LateralLoop) -> None:
@@ -89,3 +94,9 @@ def test_whatever_slows_the_loop_costs_delay(slower: LateralLoop, faster: Latera
 def test_a_lookahead_that_is_too_short_is_unstable_without_any_delay() -> None:
     """The lags of the car alone can use up the whole margin."""
     assert critical_delay_s(LateralLoop(0.2)) == 0.0
+
+
+def test_the_designed_preset_is_what_the_model_gives() -> None:
+    """The lookahead in the table of presets is the smallest with 30 degrees of margin at 81 ms, rounded up."""
+    smallest_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
+    assert PRESETS["designed"].lookahead_s == math.ceil(100 * smallest_s) / 100

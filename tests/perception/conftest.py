@@ -14,7 +14,7 @@ from lavt.perception.bird_eye import ground_to_picture
 
 ROAD_GREY, SKY_GREY = 85, 190
 MARK_WIDTH_M = 0.125
-FINE = 3  # rays along and across one pixel
+FINE = 2  # rays along and across one pixel
 
 
 @dataclass(frozen=True)

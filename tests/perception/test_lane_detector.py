@@ -4,7 +4,7 @@ from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene
 
 from lavt.domain import CameraModel, Lane, Picture
 from lavt.perception.bird_eye import STAMP_SIDE_PX
-from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING, LaneDetector
+from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING, TRACK_CONFIDENCE, LaneDetector
 
 MODEL = CameraModel()
 GREY = np.full((480, 640, 3), 128, dtype=np.uint8)
@@ -55,6 +55,15 @@ def test_dashes_that_run_alike_are_enough(scene: Scene, phase_m: float) -> None:
     assert lane.confidence > 0.5
 
 
+@pytest.mark.parametrize("light", [0.45, 1.1])
+def test_the_light_does_not_matter(scene: Scene, light: float) -> None:
+    """In half the light, or in more of it, the lane is found in the same place and as surely."""
+    picture = scene.picture(FOUR_LANES, 1 / 87)
+    bright, other = detect(picture), detect((picture * light).astype(np.uint8))
+    assert other.centre == pytest.approx(bright.centre, abs=0.02)
+    assert other.confidence > 0.8
+
+
 def test_yellow_lines_are_lines(scene: Scene) -> None:
     """A lane between a yellow and a white line is a lane."""
     yellow = (60, 170, 200)
@@ -74,9 +83,9 @@ def test_a_grey_picture_gives_no_confidence(scene: Scene) -> None:
 
 
 def test_noise_alone_is_not_driven_on() -> None:
-    """Coarse black and white noise is not taken for a well-seen lane."""
+    """Black and white noise is not taken for a lane."""
     noise = np.random.Generator(np.random.Philox(5)).integers(0, 2, (120, 160, 1)).astype(np.uint8) * 255
-    assert detect(noise.repeat(4, 0).repeat(4, 1).repeat(3, 2)).confidence < 0.5
+    assert detect(noise.repeat(4, 0).repeat(4, 1).repeat(3, 2)).confidence < TRACK_CONFIDENCE
 
 
 def test_the_first_lane_stands_alone_and_later_ones_are_averaged(scene: Scene) -> None:

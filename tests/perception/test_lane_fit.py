@@ -124,8 +124,8 @@ def test_too_few_points_are_no_lane() -> None:
 
 
 def test_speckle_is_hardly_believed() -> None:
-    """Points all over the place give a low confidence, because most of those near the lines are not on them."""
+    """Points all over the place give no lane to follow: as many lie on the lines as by chance."""
     generator = stream(1, "speckle")
     points = Points(generator.uniform(3.6, 20, 3000), generator.uniform(-7, 7, 3000))
     fit = fit_lane(points, sides_near(points, (0.0, 0.0, 0.0), 3.5), GRID, 3.5)
-    assert fit is None or fit.confidence < 0.5
+    assert fit is None or fit.confidence < 0.1

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from lavt.domain import FloatArray
+from lavt.perception.lane_detector import SMOOTHING
+from lavt.vehicle.sim.dynamics import CarParameters
 
 ComplexArray = NDArray[np.complex128]
 
@@ -34,31 +36,11 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 
 |L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase left there, atan(w / a), is acos(sqrt(2) - 1)."""
 
+DEFAULT_CAR = CarParameters()
+"""The simulator's car; of its parameters the model takes those of the lateral motion at small slip."""
+
 _LONGEST_DELAY_S = 3.0  # past every delay that is of interest; the search ends there
 _SEARCH_STEP_S = 0.005
-
-
-@dataclass(frozen=True, slots=True)
-class LinearCar:
-    """What the linear model knows of a car; the defaults are the simulator's, an MKZ class saloon.
-
-    Mass and axle stiffness: Apollo's lateral controller configuration for the Lincoln MKZ; yaw inertia and the split of
-    the wheelbase are estimates.
-    """
-
-    mass_kg: float = 2080.0
-    yaw_inertia_kgm2: float = 3300.0
-    front_stiffness_n_per_rad: float = 155_495.0
-    rear_stiffness_n_per_rad: float = 155_495.0
-    front_axle_m: float = 1.40
-    """Centre of gravity to front axle."""
-    rear_axle_m: float = 1.4448
-    """Centre of gravity to rear axle."""
-
-    @property
-    def wheelbase_m(self) -> float:
-        """Distance of the axles."""
-        return self.front_axle_m + self.rear_axle_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +50,9 @@ class LateralLoop:
     lookahead_s: float
     speed_mps: float = 30 / 3.6
     frame_rate_hz: float = 30.0
-    steering_lag_s: float = 0.12
-    smoothing: float = 0.6
+    smoothing: float = SMOOTHING
     """Weight of the newest picture in the moving average; 1 is none."""
-    car: LinearCar = LinearCar()
+    car: CarParameters = DEFAULT_CAR
 
     @property
     def gain(self) -> FloatArray:
@@ -87,18 +68,18 @@ def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
     angle.
     """
     car, speed = loop.car, loop.speed_mps
-    front, rear = car.front_stiffness_n_per_rad, car.rear_stiffness_n_per_rad
-    ahead, behind = car.front_axle_m, car.rear_axle_m
+    ahead, stiffness = car.front_axle_to_gravity_m, car.axle_stiffness_nprad
+    behind = car.wheelbase_m - ahead
     mass, inertia = car.mass_kg, car.yaw_inertia_kgm2
-    coupling = rear * behind - front * ahead
+    coupling = stiffness * (behind - ahead)
     a = np.zeros((5, 5))
-    a[0] = [-(front + rear) / (mass * speed), coupling / (mass * speed) - speed, 0, 0, front / mass]
-    yaw_damping = (front * ahead**2 + rear * behind**2) / (inertia * speed)
-    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * ahead / inertia]
+    a[0] = [-2 * stiffness / (mass * speed), coupling / (mass * speed) - speed, 0, 0, stiffness / mass]
+    yaw_damping = stiffness * (ahead**2 + behind**2) / (inertia * speed)
+    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, stiffness * ahead / inertia]
     a[2] = [1, -behind, 0, speed, 0]
     a[3, 1] = 1
-    a[4, 4] = -1 / loop.steering_lag_s
-    return a, np.array([0, 0, 0, 0, 1 / loop.steering_lag_s])
+    a[4, 4] = -1 / car.steering_lag_s
+    return a, np.array([0, 0, 0, 0, 1 / car.steering_lag_s])
 
 
 def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArray, FloatArray]:
@@ -173,14 +154,18 @@ def critical_delay_s(loop: LateralLoop) -> float:
     return math.inf
 
 
-def open_loop(loop: LateralLoop, total_delay_s: float, frequency_radps: float) -> complex:
-    """Give the loop's frequency response from command to command, cut open at the controller's output."""
-    sampled = _sampled(loop, total_delay_s)
-    z = np.exp(1j * frequency_radps / loop.frame_rate_hz)
-    delayed: ComplexArray = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
-    state = np.linalg.solve(z * np.eye(5) - sampled.transition, delayed)
-    average = loop.smoothing / (1 - (1 - loop.smoothing) / z)
-    return complex(-(loop.gain @ state[2:4]) * average)
+def open_loop(loop: LateralLoop, total_delay_s: float, frequencies_radps: FloatArray) -> ComplexArray:
+    """Give the loop's frequency response from command to command, cut open at the controller's output, (n,)."""
+    return _response(loop, _sampled(loop, total_delay_s), frequencies_radps)
+
+
+def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
+    z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
+    delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
+    resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition
+    states = np.linalg.solve(resolvents, delayed[..., np.newaxis])[..., 0]
+    averages = loop.smoothing / (1 - (1 - loop.smoothing) / z[:, 0])
+    return np.asarray(-(states[:, 2:4] @ loop.gain) * averages, dtype=np.complex128)
 
 
 def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
@@ -188,8 +173,9 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
 
     Negative where the loop is unstable; infinite where the gain never reaches 1.
     """
-    frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 400)
-    responses = np.array([open_loop(loop, total_delay_s, float(frequency)) for frequency in frequencies])
+    sampled = _sampled(loop, total_delay_s)
+    frequencies = np.geomspace(0.05, math.pi * loop.frame_rate_hz * 0.999, 200)
+    responses = _response(loop, sampled, frequencies)
     above = np.flatnonzero(np.abs(responses) > 1)
     if len(above) == 0:
         return math.inf
@@ -197,14 +183,14 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
     if last + 1 == len(frequencies):
         return -math.inf
     crossover = _crossing(
-        lambda frequency: 1 - abs(open_loop(loop, total_delay_s, frequency)),
+        lambda frequency: 1 - float(np.abs(_response(loop, sampled, np.array([frequency])))[0]),
         low=float(frequencies[last]),
         high=float(frequencies[last + 1]),
     )
     # Unwrapped from the low end, where two integrations make it -180 degrees: a margin below -180 stays one.
-    phase = float(np.unwrap(np.angle(np.append(responses[: last + 1], open_loop(loop, total_delay_s, crossover))))[-1])
-    start = float(np.angle(responses[0]))
-    return math.pi + phase - (2 * math.pi if start > 0 else 0.0)
+    upwards = np.append(frequencies[: last + 1], crossover)
+    phases = np.unwrap(np.angle(_response(loop, sampled, upwards)))
+    return float(math.pi + phases[-1] - (2 * math.pi if phases[0] > 0 else 0.0))
 
 
 def smallest_lookahead_s(margin_rad: float, total_delay_s: float) -> float:

@@ -11,6 +11,8 @@ from lavt.perception.lane_pixels import lane_pixels
 
 SMOOTHING = 0.6
 """Weight of the newest picture in the moving average; `lavt.experiment.theory` reckons with it."""
+GRID = GroundGrid()
+"""The piece of ground that is looked at."""
 LANE_WIDTH_M = 3.5
 """Width of the lane where it cannot be measured yet."""
 TRACK_CONFIDENCE = 0.2
@@ -22,12 +24,12 @@ FORGET_AFTER = 3
 class LaneDetector:
     """Finds the lane by sliding windows at first, then near where it was, and averages over pictures.
 
-    Confidence is (share of the left line seen + share of the right line seen) / 2 x share of the paint near the lines
-    that lies on them; seen paint vouches for 3 m to either side. It speaks of the newest picture alone: with nothing in
-    it the confidence is 0, and the lane is the one that was seen last.
+    Confidence is (share of the left line seen + share of the right line seen) / 2 x (share of the paint near the lines
+    that lies on them, put so that speckle gets 0 and clean lines 1); seen paint vouches for 3 m to either side. It
+    speaks of the newest picture alone: with nothing in it the confidence is 0, and the lane is the one seen last.
     """
 
-    def __init__(self, model: CameraModel, grid: GroundGrid = GroundGrid(), lane_width_m: float = LANE_WIDTH_M) -> None:  # noqa: B008
+    def __init__(self, model: CameraModel, grid: GroundGrid = GRID, lane_width_m: float = LANE_WIDTH_M) -> None:
         self._shape = (model.height_px, model.width_px, 3)
         self._view = bird_eye(model, grid)
         self._lane_width_m = lane_width_m

@@ -61,8 +61,9 @@ class LaneFit:
 
     @property
     def confidence(self) -> float:
-        """Mean share of the two lines seen, times the share of points that fit."""
-        return (self.left_seen + self.right_seen) / 2 * self.fitting
+        """Mean share of the two lines seen, times how much better than by chance the points fit."""
+        by_chance = OUTLIER_M / CORRIDOR_M
+        return (self.left_seen + self.right_seen) / 2 * max(self.fitting - by_chance, 0.0) / (1 - by_chance)
 
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:

@@ -1,6 +1,7 @@
 """Which pixels may be paint: white or yellow, brighter than the road around, and between edges that stand upright.
 
-All thresholds are on 8-bit values. They were chosen on rendered daylight pictures before any drive under delay.
+All thresholds are on 8-bit values, none on brightness itself, which light and exposure decide. They were chosen on
+rendered daylight pictures before any drive under delay.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ Mask = NDArray[np.uint8]
 
 WHITE_ABOVE_ROAD = 28
 """White paint is this much brighter than the mean around it, which shadows and exposure move as well."""
-WHITE_AT_LEAST = 120
-"""Paint in daylight is never darker; worn asphalt seldom brighter."""
+WHITE_OVER_ROAD = 1.3
+"""And so many times as bright: in bright light the grain of asphalt alone exceeds any fixed difference."""
 YELLOW_RED_OVER_BLUE = 55
 """Yellow paint has this much less blue than red."""
 EDGE_AT_LEAST = 48
@@ -36,12 +37,12 @@ def lane_pixels(region: Picture) -> Mask:
 
 
 def white_pixels(grey: NDArray[np.uint8]) -> Mask:
-    """Find what is bright, and brighter than its surroundings."""
+    """Find what is brighter than its surroundings, by difference and by ratio; how bright it is does not matter."""
     width, height = AROUND_PX
     around = cv2.blur(grey, (_scaled(width, grey), height))
     above = cv2.threshold(cv2.subtract(grey, around), WHITE_ABOVE_ROAD, 255, cv2.THRESH_BINARY)[1]
-    bright = cv2.threshold(grey, WHITE_AT_LEAST, 255, cv2.THRESH_BINARY)[1]
-    return np.asarray(cv2.bitwise_and(above, bright), dtype=np.uint8)
+    over = cv2.threshold(cv2.addWeighted(grey, 1.0, around, -WHITE_OVER_ROAD, 0.0), 0, 255, cv2.THRESH_BINARY)[1]
+    return np.asarray(cv2.bitwise_and(above, over), dtype=np.uint8)
 
 
 def yellow_pixels(region: Picture) -> Mask:

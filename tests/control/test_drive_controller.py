@@ -1,0 +1,130 @@
+import math
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from lavt.control import drive_controller
+from lavt.control.drive_controller import DESIGNED, LOST_BRAKING_MPS2, PRESETS, LaneKeeper, Preset, make_controller
+from lavt.control.lane_watch import BRAKE_AFTER_NS, STOP_AFTER_NS
+from lavt.control.pure_pursuit import curvature_per_m
+from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
+from lavt.errors import UserError
+
+WHEELBASE_M = 2.8448
+SPEED_MPS = 30 / 3.6
+FRAME_NS = NS_PER_S // 30
+
+
+def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0, confidence: float = 1.0) -> Lane:
+    return Lane((c0, c1, c2), 3.5, 3.6, 20.0, confidence)
+
+
+def keeper(preset: Preset = DESIGNED) -> LaneKeeper:
+    return LaneKeeper(preset, wheelbase_m=WHEELBASE_M, max_acceleration_mps2=2.0, max_braking_mps2=6.0)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_decision_is_within_what_a_command_may_hold(name: str) -> None:
+    """Whatever the lane, pedals are in [0, 1], one of them 0, and the path has its points, all finite."""
+    for centre in ((0.0, 0.0, 0.0), (6.0, 1.0, 0.05), (-30.0, 0.0, 0.0), (0.0, -5.0, 0.1)):
+        decision = keeper(PRESETS[name]).decide(lane(*centre), SPEED_MPS, 0)
+        assert 0 <= decision.throttle <= 1
+        assert 0 <= decision.brake <= 1
+        assert decision.throttle * decision.brake == 0
+        assert len(decision.path_curvature_per_m) == PATH_POINTS
+        assert all(math.isfinite(value) for value in (decision.steering_rad, *decision.path_curvature_per_m))
+
+
+@pytest.mark.parametrize("speed_mps", [5.0, SPEED_MPS, 14.0])
+def test_designed_keeps_to_3_mps2(speed_mps: float) -> None:
+    """The steering asked for never needs more than 3 m/s2 to the side, however far off the lane is."""
+    decision = keeper().decide(lane(3.0), speed_mps, 0)
+    for curvature in (curvature_per_m(decision.steering_rad, WHEELBASE_M), *decision.path_curvature_per_m):
+        assert abs(curvature) * speed_mps**2 <= 3.0 + 1e-9
+    assert curvature_per_m(decision.steering_rad, WHEELBASE_M) * speed_mps**2 == pytest.approx(3.0)
+
+
+def test_paper_calibrated_keeps_to_a_wheel_angle() -> None:
+    """The steering asked for is at most 0.21 rad, which is 5.2 m/s2 at 30 km/h."""
+    decision = keeper(PRESETS["paper_calibrated"]).decide(lane(-4.0), SPEED_MPS, 0)
+    assert decision.steering_rad == pytest.approx(-0.21)
+
+
+def test_the_lane_is_followed_as_soon_as_it_is_seen() -> None:
+    """The first picture is enough: no time passes before the first decision."""
+    decision = keeper().decide(lane(0.3), 0.0, 123)
+    assert decision.steering_rad > 0
+    assert decision.throttle == 1.0
+
+
+def lose_lane(controller: LaneKeeper, after_ns: int) -> Decision:
+    """Show a left curve, then nothing, picture for picture until `after_ns`."""
+    decision = controller.decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
+    for now_ns in range(FRAME_NS, after_ns + 1, FRAME_NS):
+        decision = controller.decide(lane(confidence=0.0), SPEED_MPS, now_ns)
+    return decision
+
+
+def test_without_a_lane_there_is_no_throttle_then_brake() -> None:
+    """A lost lane lifts the foot at once and brakes with 3 m/s2 after half a second."""
+    assert (lose_lane(keeper(), FRAME_NS).throttle, lose_lane(keeper(), FRAME_NS).brake) == (0.0, 0.0)
+    braking = lose_lane(keeper(), BRAKE_AFTER_NS + FRAME_NS)
+    assert (braking.throttle, braking.brake) == (0.0, LOST_BRAKING_MPS2 / 6.0)
+
+
+def test_after_a_long_time_without_a_lane_it_brakes_harder() -> None:
+    """When it is time to stop, the controller brakes as a safe stop does."""
+    assert lose_lane(keeper(), STOP_AFTER_NS + FRAME_NS).brake == pytest.approx(4.0 / 6.0)
+
+
+def test_a_lost_lane_is_followed_from_memory() -> None:
+    """Half a second into blindness on a curve the wheel is still turned as the curve asks."""
+    seen = keeper().decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
+    assert lose_lane(keeper(), BRAKE_AFTER_NS).steering_rad == pytest.approx(seen.steering_rad, rel=0.15)
+
+
+def test_an_offset_is_not_steered_against_twice() -> None:
+    """A lane lost while the car was beside it is reached by memory, not circled: the wheel comes back."""
+    controller = keeper()
+    first = controller.decide(lane(0.8), SPEED_MPS, 0).steering_rad
+    for now_ns in range(FRAME_NS, 2 * NS_PER_S, FRAME_NS):
+        last = controller.decide(lane(confidence=0.0), SPEED_MPS, now_ns).steering_rad
+    assert abs(last) < 0.2 * first
+
+
+def test_a_lane_seen_again_is_followed_at_once() -> None:
+    """After a loss the first lane counts, not the memory."""
+    controller = keeper()
+    lose_lane(controller, NS_PER_S)
+    again = controller.decide(lane(-0.5), SPEED_MPS, NS_PER_S + FRAME_NS)
+    assert again.steering_rad == keeper().decide(lane(-0.5), SPEED_MPS, 0).steering_rad
+
+
+def test_unknown_names_are_told_with_the_known_ones() -> None:
+    """A controller or preset that is not there is the user's mistake, and the message names those there are."""
+    with pytest.raises(UserError, match="lane_keeper"):
+        make_controller("lane_keper", "designed", WHEELBASE_M)
+    with pytest.raises(UserError, match="designed, paper_calibrated"):
+        make_controller("lane_keeper", "tuned", WHEELBASE_M)
+
+
+class Statue:
+    """A controller of somebody else's."""
+
+    def __init__(
+        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
+    ) -> None:
+        self.known = (preset.name, wheelbase_m, max_acceleration_mps2, max_braking_mps2)
+
+    def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
+        """Stand still."""
+        del lane, speed_mps, now_ns
+        return Decision(0.0, 0.0, 1.0, (0.0,) * PATH_POINTS)
+
+
+def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A controller registered in the group `lavt.controllers` is found by its name and told what the car is like."""
+    entry = EntryPoint("statue", f"{__name__}:Statue", drive_controller.ENTRY_POINTS)
+    monkeypatch.setattr(drive_controller, "entry_points", lambda group: [entry] if group == "lavt.controllers" else [])
+    controller = make_controller("statue", "designed", WHEELBASE_M, max_braking_mps2=8.0)
+    assert getattr(controller, "known", None) == ("designed", WHEELBASE_M, 2.0, 8.0)
