@@ -13,6 +13,7 @@ STAMP_TO_STAMP = (
     ("camera", "stamp"),
     ("camera", "encode"),
     ("camera", "packetize"),
+    ("driver", "wait_access_unit"),
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )

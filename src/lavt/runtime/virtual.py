@@ -74,7 +74,7 @@ class VirtualHost:
     nodes: Sequence[Node]
     recorder: Recorder
     costs_ns: Mapping[tuple[str, str], int]
-    """(node, hop) to its cost; what is not named costs nothing."""
+    """(node, hop) to its cost, (node, "wait_CHANNEL") to that of waking the node; what is not named costs nothing."""
     clock_source: Callable[[int], ClockReport]
     peer: Peer = None
     """How this host looks from the other side."""
@@ -163,7 +163,8 @@ class VirtualRuntime:
 
     def _walk(self, running: _Running, message: Message, start: Now) -> None:
         host, node = running.host, running.node
-        spent_ns = 0
+        spent_ns = host.costs_ns.get((node.name, f"wait_{message.channel}"), 0)
+        start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
 
         def after(hop: str, _before: Now) -> Now:
             nonlocal spent_ns

@@ -1,0 +1,102 @@
+"""Measures what the loop costs, and writes it to `configs/costs.yaml`, which virtual time runs on.
+
+A real drive over the loopback without injection, with all its processes; then medians over its frames, from its
+records: each hop from the timelines, waking a node as what passes between a message's arrival and its first hop, and
+each link as what passes between the end of the sender's chain and the arrival at the receiver (one machine: one clock).
+
+    python benchmarks/measure_costs.py [--drives 3] [--out configs/costs.yaml]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from collections import defaultdict
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import yaml
+
+from lavt.config import RunConfig, load_config, shipped
+from lavt.experiment.plan import plan_run
+from lavt.experiment.record import Record, read_record
+from lavt.experiment.run import run_once
+
+US = 1000.0
+Samples = dict[tuple[str, str], list[float]]
+
+
+def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, int]]]]:
+    """Give node, channel, stamp, arrival and hops of every timeline of a record."""
+    table = record.table("timeline")
+    columns = (table.texts("node"), table.texts("channel"), table.ints("stamp_ns").tolist(),
+               table.ints("arrived_mono_ns").tolist(), table.objects("hops"))  # fmt: skip
+    return list(zip(*columns, strict=True))
+
+
+def add_hops(record: Record, hops: Samples) -> None:
+    """Collect the duration of every hop, and of waking for every message."""
+    for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
+        if channel != "wake":
+            hops[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / US)
+        for (_, begin_ns), (name, end_ns) in pairwise(ends):
+            hops[node, name].append((end_ns - begin_ns) / US)
+
+
+def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> None:
+    """Collect what the links cost: video and control by stamp and sequence, state by its send time."""
+    sent = {stamp_ns: ends[-1][1] for node, _, stamp_ns, _, ends in timelines(server) if node == "camera"}
+    for node, channel, stamp_ns, arrived_ns, _ in timelines(client):
+        if node == "driver" and channel == "access_unit" and stamp_ns in sent:
+            links["video"].append((arrived_ns - sent[stamp_ns]) / US)
+    admission = server.table("admission")
+    links["control"] += ((admission.ints("received_wall_ns") - admission.ints("sent_wall_ns")) / US).tolist()
+    state = client.table("state")
+    links["state"] += ((state.wall_ns - state.ints("sent_wall_ns")) / US).tolist()
+
+
+def costs_of(drives: int) -> dict[str, Any]:
+    """Drive and measure."""
+    hops: Samples = defaultdict(list)
+    links: dict[str, list[float]] = defaultdict(list)
+    loads = []
+    for number in range(drives):
+        with TemporaryDirectory() as folder:
+            changes = ["time=real", "network.injection=none", f"seed={number + 1}"]
+            out = Path(folder) / "run"
+            result = run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
+            print(f"drive {number + 1}: {result['ending']}, tau_v {result['tau_v_ms']['p50']:.2f} ms, "
+                  f"tau_c {result['tau_c_ms']['p50']:.2f} ms, loop {result['loop_ms']['p50']:.2f} ms")  # fmt: skip
+            server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+            add_hops(server, hops)
+            add_hops(client, hops)
+            add_links(server, client, links)
+            loads.append(os.getloadavg()[0])
+    table: dict[str, dict[str, float]] = defaultdict(dict)
+    for (node, hop), samples in sorted(hops.items()):
+        table[node][hop] = round(median(samples), 1)
+    link_us = {name: round(float(np.median(samples)), 1) for name, samples in sorted(links.items())}
+    link_us["control"] = round(link_us["control"] - table["driver"]["command"], 1)
+    machine = f"{os.cpu_count()} cores, {platform.machine()}, load {max(loads):.1f}, {drives} drives"
+    return {"measured_on": machine, "hops_us": {node: dict(each) for node, each in table.items()}, "links_us": link_us}
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--drives", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=shipped("configs/costs.yaml"))
+    arguments = parser.parse_args()
+    costs = costs_of(arguments.drives)
+    head = "# Medians in microseconds, written by benchmarks/measure_costs.py; virtual time runs on them.\n"
+    arguments.out.write_text(head + yaml.safe_dump(costs, sort_keys=False))
+    print(arguments.out.read_text())
+
+
+if __name__ == "__main__":
+    main()
