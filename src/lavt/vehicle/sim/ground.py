@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
 from lavt.vehicle.sim.road import Road
-from lavt.vehicle.sim.textures import PERIOD_M, SCALES_M, Grey, all_textures
+from lavt.vehicle.sim.textures import SCALES_M, Grey, all_textures
 
 TILE_M = (16.0, 32.0, 64.0)
 """Edge of a tile at each scale."""
@@ -22,6 +23,7 @@ TILE_M = (16.0, 32.0, 64.0)
 DASH_M, GAP_M = 3.0, 6.0
 """Broken marks; the map does not say how long they are, so this is our choice."""
 
+_MARK_M = 0.125
 _KEPT_TILES = (128, 512, 512)
 _CHUNK_M = 8.0
 _OVERLAP_M = 0.03
@@ -88,43 +90,67 @@ class Ground:
         return tile
 
     def _paint(self, level: int, column: int, row: int) -> Picture:
-        size_m, scale_m = TILE_M[level], SCALES_M[level]
-        left_m, low_m = column * size_m, row * size_m
-        pixels = round(size_m / scale_m)
+        place = _Place(level, column * TILE_M[level], row * TILE_M[level])
         textures = all_textures()[level]
-
-        def surface(texture: Picture) -> Picture:
-            period = round(PERIOD_M / scale_m)
-            rows = (np.arange(pixels) + row * pixels) % period
-            columns = (np.arange(pixels) + column * pixels) % period
-            return texture[rows[:, None], columns]
-
-        def mask(strips: Strips) -> Grey | None:
-            return _filled(strips.near(left_m, low_m, size_m), (left_m, low_m), scale_m, pixels)
-
-        picture = _mottled(surface(textures.grass), left_m, low_m, size_m)
-        gravel = mask(self._gravel)
-        if gravel is None:
-            return picture
-        picture = _blend(picture, surface(textures.gravel), gravel)
-        asphalt = mask(self._asphalt)
+        asphalt = place.mask(self._asphalt)
+        if asphalt is None or asphalt.min() < 255:
+            picture = _mottled(place.surface(textures.grass), place)
+            gravel = place.mask(self._gravel)
+            if gravel is not None:
+                picture = _blend(picture, place.surface(textures.gravel), gravel)
         if asphalt is None:
             return picture
-        grey = surface(textures.asphalt)
-        shade = np.zeros_like(grey)
+        shade = np.zeros_like(asphalt)
         for strips, depth in self._tracks:
-            _fill(shade, strips.near(left_m, low_m, size_m), (left_m, low_m), scale_m, depth)
-        grey = np.asarray(cv2.subtract(grey, shade), dtype=np.uint8)
-        picture = _blend(picture, np.dstack([grey, grey, grey - 2]), asphalt)
-        wear = surface(textures.wear)
+            place.fill(shade, strips, depth)
+        grey = np.asarray(cv2.subtract(place.surface(textures.asphalt), shade), dtype=np.uint8)
+        road = np.dstack([grey, grey, grey - 2])
+        picture = road if asphalt.min() == 255 else _blend(picture, road, asphalt)
+        # A mark thinner than a texel is still drawn about one texel wide: let as much of the road through.
+        thinness = min(1.0, _MARK_M * 1.3 / SCALES_M[level])
         for colour, strips in self._marks.items():
-            paint = mask(strips)
+            paint = place.mask(strips)
             if paint is not None:
-                # A mark thinner than a texel is still drawn about one texel wide: let as much of the road through.
-                thinness = min(1.0, 1.3 * 0.125 / scale_m)
+                wear = place.surface(textures.wear)
                 alpha = np.asarray(cv2.multiply(paint, wear, scale=thinness / 255), dtype=np.uint8)
-                picture = _blend(picture, np.full_like(picture, _PAINT[colour]), alpha)
+                picture = _blend(picture, np.array(_PAINT[colour], dtype=np.uint8), alpha)
         return picture
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a tile is: its scale and its corner."""
+
+    level: int
+    left_m: float
+    low_m: float
+
+    @property
+    def pixels(self) -> int:
+        return round(TILE_M[self.level] / SCALES_M[self.level])
+
+    def surface(self, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Cut the tile's part of a pattern; a period is a whole number of tiles or a tile one of periods."""
+        pixels, period = self.pixels, len(texture)
+        if pixels > period:
+            count = pixels // period
+            return np.tile(texture, (count, count, 1)[: texture.ndim])
+        row = round(self.low_m / SCALES_M[self.level]) % period
+        column = round(self.left_m / SCALES_M[self.level]) % period
+        return texture[row : row + pixels, column : column + pixels]
+
+    def mask(self, strips: Strips) -> Grey | None:
+        """Make a mask of the strips; None when none is in the tile."""
+        mask = np.zeros((self.pixels, self.pixels), dtype=np.uint8)
+        self.fill(mask, strips, 255)
+        return mask if mask.any() else None
+
+    def fill(self, mask: Grey, strips: Strips, value: int) -> None:
+        """Paint the strips into `mask`."""
+        corners_m = strips.near(self.left_m, self.low_m, TILE_M[self.level])
+        corners_px = (corners_m - np.array([self.left_m, self.low_m])) / SCALES_M[self.level] - 0.5
+        for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
+            cv2.fillConvexPoly(mask, polygon, (value,), lineType=cv2.LINE_AA, shift=_SUBPIXEL_BITS)
 
 
 def _strips(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
@@ -172,34 +198,21 @@ def _marks(road: Road, colour: str) -> Strips:
     return _join(found) if found else Strips(np.empty((0, 4, 2)), np.empty((0, 4)))
 
 
-def _filled(corners_m: FloatArray, low_m: tuple[float, float], scale_m: float, pixels: int) -> Grey | None:
-    """Make a mask of the quadrilaterals, None when there are none."""
-    if not len(corners_m):
-        return None
-    mask = np.zeros((pixels, pixels), dtype=np.uint8)
-    _fill(mask, corners_m, low_m, scale_m, 255)
-    return mask
-
-
-def _fill(mask: Grey, corners_m: FloatArray, low_m: tuple[float, float], scale_m: float, value: int) -> None:
-    corners_px = (corners_m - np.array(low_m)) / scale_m - 0.5
-    for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
-        cv2.fillConvexPoly(mask, polygon, (value,), lineType=cv2.LINE_AA, shift=_SUBPIXEL_BITS)
-
-
 def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
-    if alpha.min() == 255:
-        return over
+    """Lay `over`, a picture or one colour, over `under`."""
     weight = alpha.astype(np.uint16)[..., None]
     weight += weight >> 7  # 255 becomes 256, so that full paint is full
-    return ((over * weight + under * (256 - weight)) >> 8).astype(np.uint8)
+    mixed = over * weight
+    mixed += under * (256 - weight)
+    mixed >>= 8
+    return mixed.astype(np.uint8)
 
 
-def _mottled(grass: Picture, left_m: float, low_m: float, size_m: float) -> Picture:
-    """Large patches in the grass, of lengths that do not fit its period, so that the eye does not see it repeat."""
+def _mottled(grass: Picture, place: _Place) -> Picture:
+    """Lay large patches over the grass, of lengths that do not fit its period: the eye must not see it repeat."""
     count = 32
-    x_m = left_m + (np.arange(count) + 0.5) * size_m / count
-    y_m = (low_m + (np.arange(count) + 0.5) * size_m / count)[:, None]
+    middle_m = (np.arange(count) + 0.5) * TILE_M[place.level] / count
+    x_m, y_m = place.left_m + middle_m, (place.low_m + middle_m)[:, None]
     light = 1.0 + 0.06 * np.sin(0.071 * x_m + 0.113 * y_m) + 0.05 * np.sin(0.157 * x_m - 0.093 * y_m + 1.0)
     fine = np.asarray(cv2.resize(light.astype(np.float32), grass.shape[1::-1], interpolation=cv2.INTER_LINEAR))
     return np.asarray(np.clip(grass * fine[..., None], 0, 255), dtype=np.uint8)

@@ -19,6 +19,9 @@ MOVING_MPS = 0.1
 """The time of a drive counts from when the car is first faster than this."""
 
 
+Points = tuple[tuple[float, float], ...]
+
+
 @dataclass(frozen=True, slots=True)
 class Track:
     """A car against the centre of its lane; see `GroundTruth` for what is measured where."""
@@ -37,7 +40,7 @@ class Judge:
         front_m, rear_m = parameters.rear_axle_to_front_m, -parameters.rear_axle_to_rear_m
         self._left_corners = ((front_m, half_m), (rear_m, half_m))
         self._right_corners = ((front_m, -half_m), (rear_m, -half_m))
-        self._middle = ((front_m + rear_m) / 2, 0.0)
+        self._middle = (((front_m + rear_m) / 2, 0.0),)
         self._paved_left_m, self._paved_right_m = _carriageway(road)
         limit_s = road.length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
         self._limit_ns = round(limit_s * NS_PER_S)
@@ -55,13 +58,13 @@ class Judge:
         """Tell what has happened since the last call; call it at every step."""
         progress_m, _, _ = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         self._near_s_m = progress_m
-        left = [self._place(motion, corner) for corner in self._left_corners]
-        right = [self._place(motion, corner) for corner in self._right_corners]
+        left = self._places(motion, self._left_corners)
+        right = self._places(motion, self._right_corners)
         events = self._lane_events(max(lateral for _, lateral in left), min(lateral for _, lateral in right), at_ns)
         hit = self._rail_hit(left + right)
         if hit is not None:
             events += self._once("collision", f"the {hit} was reached at {progress_m:.1f} m", at_ns)
-        if hit is None and not self._on_asphalt(*self._place(motion, self._middle)):
+        if hit is None and not self._on_asphalt(*self._places(motion, self._middle)[0]):
             events += self._once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
         if progress_m >= self._road.length_m:
             events += self._once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
@@ -77,12 +80,14 @@ class Judge:
         self._happened.add(kind)
         return [VehicleEvent(at_ns, kind, detail)]
 
-    def _place(self, motion: CarMotion, corner: tuple[float, float]) -> tuple[float, float]:
-        """Station and lateral offset of a point of the body, given ahead and to the left of the rear axle."""
+    def _places(self, motion: CarMotion, points: Points) -> Points:
+        """Stations and lateral offsets of points of the body, given ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
-        x_m = motion.x_m + corner[0] * cosine - corner[1] * sine
-        y_m = motion.y_m + corner[0] * sine + corner[1] * cosine
-        return self._road.project(x_m, y_m, self._near_s_m)[:2]
+        project, near_s_m = self._road.project, self._near_s_m
+        return tuple(
+            project(motion.x_m + ahead * cosine - left * sine, motion.y_m + ahead * sine + left * cosine, near_s_m)[:2]
+            for ahead, left in points
+        )
 
     def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
         """Make an event for each edge of the body that is in another lane than before; lanes count from the right."""
@@ -97,7 +102,7 @@ class Judge:
             if old != new
         ]
 
-    def _rail_hit(self, corners: list[tuple[float, float]]) -> str | None:
+    def _rail_hit(self, corners: Points) -> str | None:
         for rail in self._road.rails:
             side = math.copysign(1.0, rail.offset_m)
             for s_m, lateral_m in corners:

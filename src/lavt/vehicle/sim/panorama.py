@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from lavt.domain import CameraModel, FloatArray, Picture
@@ -22,7 +23,9 @@ class Panorama:
     """The horizon for one camera model; a picture of it is a choice of columns."""
 
     def __init__(self, model: CameraModel, rows: int, *, plain: bool) -> None:
-        self._picture = _painted(rows, horizon_row(model), model.focal_px, plain=plain)
+        painted = _painted(rows, horizon_row(model), model.focal_px, plain=plain)
+        # Turned on its side, so that a column of the picture lies in one piece of memory.
+        self._columns = np.ascontiguousarray(painted.transpose(1, 0, 2))
         across_px = np.arange(model.width_px) - principal_point(model)[0]
         self._azimuth_rad = np.arctan2(across_px, model.focal_px)
 
@@ -30,7 +33,7 @@ class Panorama:
         """Write what a camera with this heading sees into `out`, the first rows of its picture."""
         turn = (self._azimuth_rad - heading_rad) / (2 * math.pi)
         columns = np.rint((turn - np.floor(turn)) * _COLUMNS).astype(np.intp) % _COLUMNS
-        np.take(self._picture, columns, axis=1, out=out)
+        cv2.transpose(self._columns[columns], out)
 
 
 @lru_cache(maxsize=4)

@@ -48,12 +48,10 @@ class Renderer:
         self._noise = _noise(model)
 
     def prepare(self) -> None:
-        """Paint the ground along the route beforehand, so that no frame has to wait for it."""
+        """Look along the route beforehand, so that no frame has to wait for the ground to be painted."""
         for s_m in np.arange(0.0, self._road.length_m + 10.0, 4.0):
             x_m, y_m, heading_rad, _ = (float(value) for value in self._road.point(s_m))
-            view = view_from(self._model, Pose(0, x_m, y_m, heading_rad))
-            for level, band in enumerate(self._bands):
-                self._window(level, band.low_tile(view))
+            self.render(Pose(0, x_m, y_m, heading_rad), 0)
 
     def render(self, pose: Pose, number: int) -> Picture:
         """Draw frame `number` as seen by a vehicle at `pose`; a new array each time."""

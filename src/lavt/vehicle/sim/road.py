@@ -156,26 +156,40 @@ class Road:
         """
         best = (near_s_m, math.inf, 0.0)
         best_distance_m = math.inf
-        for index, (s0_m, s1_m, x0_m, y0_m, heading0_rad, curvature_per_m) in enumerate(self._pieces):
-            low_m = max(s0_m if index else -math.inf, near_s_m - PROJECTION_WINDOW_M) - s0_m
-            high_m = min(s1_m if index < len(self._pieces) - 1 else math.inf, near_s_m + PROJECTION_WINDOW_M) - s0_m
-            if low_m > high_m:
+        first_m, last_m = near_s_m - PROJECTION_WINDOW_M, near_s_m + PROJECTION_WINDOW_M
+        for low_s_m, high_s_m, s0_m, x0_m, y0_m, heading0_rad, curvature_per_m, cosine, sine in self._searched:
+            if high_s_m < first_m or low_s_m > last_m:
                 continue
+            low_m, high_m = max(low_s_m, first_m) - s0_m, min(high_s_m, last_m) - s0_m
             dx_m, dy_m = x_m - x0_m, y_m - y0_m
-            cosine, sine = math.cos(heading0_rad), math.sin(heading0_rad)
             ahead_m, left_m = dx_m * cosine + dy_m * sine, dy_m * cosine - dx_m * sine
             along_m = _foot_m(ahead_m, left_m, curvature_per_m, (low_m + high_m) / 2)
             along_m = min(max(along_m, low_m), high_m)
-            turn_rad = curvature_per_m * along_m
-            chord_m = along_m if turn_rad == 0.0 else 2.0 * math.sin(turn_rad / 2) / curvature_per_m
-            ahead_m -= chord_m * math.cos(turn_rad / 2)
-            left_m -= chord_m * math.sin(turn_rad / 2)
-            distance_m = math.hypot(ahead_m, left_m)
+            if curvature_per_m == 0.0:
+                turn_rad, ahead_m, lateral_m = 0.0, ahead_m - along_m, left_m
+            else:
+                turn_rad = curvature_per_m * along_m
+                turn_cosine, turn_sine = math.cos(turn_rad), math.sin(turn_rad)
+                ahead_m -= turn_sine / curvature_per_m
+                left_m -= (1.0 - turn_cosine) / curvature_per_m
+                lateral_m = left_m * turn_cosine - ahead_m * turn_sine
+                ahead_m = ahead_m * turn_cosine + left_m * turn_sine
+            distance_m = math.hypot(ahead_m, lateral_m)
             if distance_m < best_distance_m:
                 best_distance_m = distance_m
-                lateral_m = left_m * math.cos(turn_rad) - ahead_m * math.sin(turn_rad)
                 best = (s0_m + along_m, lateral_m, heading0_rad + turn_rad)
         return best
+
+    @cached_property
+    def _searched(self) -> list[tuple[float, ...]]:
+        """For each segment: stations between which it serves, the table's row without its end, cosine and sine."""
+        found: list[tuple[float, ...]] = []
+        for index, (s0_m, s1_m, x_m, y_m, heading_rad, curvature_per_m) in enumerate(self._pieces):
+            low_m = s0_m if index else -math.inf
+            high_m = s1_m if index < len(self._pieces) - 1 else math.inf
+            place = (s0_m, x_m, y_m, heading_rad, curvature_per_m)
+            found.append((low_m, high_m, *place, math.cos(heading_rad), math.sin(heading_rad)))
+        return found
 
     @cached_property
     def _pieces(self) -> list[tuple[float, float, float, float, float, float]]:

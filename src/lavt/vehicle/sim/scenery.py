@@ -23,19 +23,29 @@ from lavt.vehicle.sim.sprites import TREE_KINDS, draw_tree
 _WORLD_SEED = 0
 _NEAR_M = 0.4
 _FAR_M = 160.0
+_DETAIL_M = 45.0
 _HAZE_M = 240.0
 _POST_SPACING_M = 4.0
 _LAMP_SPACING_M = 36.0
 _SUBPIXEL_BITS = 4
 
-_BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int]], ...]] = {
-    "barrier": ((0.0, 0.22, (132, 138, 140)), (0.22, 0.78, (164, 170, 172)), (0.78, 0.86, (190, 196, 198))),
-    "rail": ((0.44, 0.53, (150, 148, 144)), (0.53, 0.62, (108, 108, 106)), (0.62, 0.76, (178, 176, 170))),
+_BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
+    "barrier": (
+        (0.0, 0.86, (164, 170, 172), _FAR_M),
+        (0.0, 0.22, (132, 138, 140), _DETAIL_M),
+        (0.78, 0.86, (190, 196, 198), _DETAIL_M),
+    ),
+    "rail": (
+        (0.44, 0.76, (160, 158, 153), _FAR_M),
+        (0.53, 0.62, (108, 108, 106), _DETAIL_M),
+        (0.62, 0.76, (178, 176, 170), _DETAIL_M),
+    ),
 }
-"""The faces of a rail from below: from and to which height (m), and colour (blue green red)."""
+"""The faces of a rail in the order of painting: from and to which height (m), blue green red, how far it is seen."""
 
 _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 _WINDOW = (104, 88, 74)
+_STOREY_M = 3.2
 
 Drawing = tuple[float, Callable[[Picture], None]]
 """Depth (m) and what draws the thing."""
@@ -47,15 +57,16 @@ class Faces:
 
     corners_m: FloatArray
     colours: FloatArray
+    seen_to_m: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class Building:
-    """A box: its faces, and the windows of each face (n, 4, 3)."""
+class Walls:
+    """Walls of buildings: outlines (n, 4, 3) as of `Faces`, colours (n, 3), and the windows of each (m, 4, 3)."""
 
-    faces_m: FloatArray
+    outlines_m: FloatArray
+    colours: FloatArray
     windows_m: tuple[FloatArray, ...]
-    colour: tuple[int, int, int]
 
 
 class Scenery:
@@ -63,16 +74,16 @@ class Scenery:
 
     def __init__(self, road: Road, *, trees: bool) -> None:
         runs = [_stations(road, rail) for rail in road.rails]
-        self._faces = _rail_faces(road, runs)
+        self._faces = _join_faces([_rail_faces(road, runs), _lamp_faces(road, runs if trees else [])])
         self._poles = _poles(road, runs, lamps=trees)
         self._trees = _plant(road) if trees else np.empty((0, 4))
-        self._buildings = _build(road) if trees else ()
+        self._walls = _build(road) if trees else None
 
     def draw(self, view: View, picture: Picture) -> None:
         """Draw into `picture` what is in view."""
         things = self._rail_drawings(view) + self._pole_drawings(view) + self._tree_drawings(view)
-        for building in self._buildings:
-            things += _building_drawings(building, view)
+        if self._walls is not None:
+            things += _wall_drawings(self._walls, view)
         things.sort(key=lambda thing: -thing[0])
         for _, draw in things:
             draw(picture)
@@ -80,11 +91,12 @@ class Scenery:
     def _rail_drawings(self, view: View) -> list[Drawing]:
         corners, colours = self._faces.corners_m, self._faces.colours
         ahead = _ahead(corners[:, :2, :2], view)
-        shown = (ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < _FAR_M)
+        shown = (ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < self._faces.seen_to_m)
         points = view.project(_clipped(corners[shown], ahead[shown]))
         inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
         points = points[inside]
-        depth = points[:, :2, 2].mean(axis=1)
+        # Faces of one piece have one depth, and sorting keeps the order of painting among them.
+        depth = np.maximum(ahead[shown][inside], _NEAR_M).mean(axis=1)
         shades = _hazed(colours[shown][inside], depth).tolist()
         return [
             (far, _polygon(polygon, shade))
@@ -112,12 +124,13 @@ class Scenery:
         shown = (ahead > 3.0) & (ahead < _FAR_M)
         trees = self._trees[shown]
         feet = view.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
-        found: list[Drawing] = []
-        for (u_px, v_px, depth), (_, _, height_m, kind) in zip(feet.tolist(), trees.tolist(), strict=True):
-            height_px = round(height_m * view.model.focal_px / depth)
-            if height_px >= 3 and -height_px < u_px < view.model.width_px + height_px:
-                found.append((depth, _tree(int(kind), height_px, (u_px, v_px), _haze_share(depth))))
-        return found
+        heights = np.rint(trees[:, 2] * view.model.focal_px / feet[:, 2])
+        inside = (heights >= 3) & (feet[:, 0] > -heights) & (feet[:, 0] < view.model.width_px + heights)
+        rows = np.column_stack([feet, heights, trees[:, 3]])[inside]
+        return [
+            (depth, _tree(int(kind), int(height_px), (u_px, v_px), 1.0 - math.exp(-depth / _HAZE_M)))
+            for u_px, v_px, depth, height_px, kind in rows.tolist()
+        ]
 
 
 def _polygon(polygon: NDArray[np.int32], colour: list[float]) -> Callable[[Picture], None]:
@@ -139,23 +152,24 @@ def _tree(kind: int, height_px: int, foot: tuple[float, float], haze: float) -> 
     return lambda picture: draw_tree(picture, kind=kind, height_px=height_px, foot_px=foot, haze=haze)
 
 
-def _building_drawings(building: Building, view: View) -> list[Drawing]:
-    found: list[Drawing] = []
-    for face, windows in zip(building.faces_m, building.windows_m, strict=True):
-        centre, normal = face[:, :2].mean(axis=0), face[1, :2] - face[0, :2]
-        # Seen from outside, a face's outline runs from the left to the right.
-        towards = (view.x_m - centre[0]) * normal[1] - (view.y_m - centre[1]) * normal[0]
-        ahead = _ahead(face[:, :2], view)
-        if towards <= 0 or ahead.min() < _NEAR_M or ahead.min() > _FAR_M * 1.2:
-            continue
-        depth = float(ahead.mean())
-        light = 1.0 if abs(normal[0]) > abs(normal[1]) else 0.82
-        wall = _hazed(np.array([building.colour]) * light, np.array([depth])).tolist()[0]
-        glass = _hazed(np.array([_WINDOW]), np.array([depth])).tolist()[0]
-        found.append(
-            (depth, _facade(_subpixels(view.project(face)[None])[0], _subpixels(view.project(windows)), wall, glass))
-        )
-    return found
+def _wall_drawings(walls: Walls, view: View) -> list[Drawing]:
+    outlines = walls.outlines_m
+    begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
+    # Seen from outside, a wall's outline runs from the left to the right.
+    seen = (view.x_m - begin[:, 0]) * (end - begin)[:, 1] > (view.y_m - begin[:, 1]) * (end - begin)[:, 0]
+    ahead = _ahead(outlines[:, :2, :2], view)
+    seen &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < _FAR_M * 1.2)
+    points = view.project(outlines)
+    seen &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
+    shown = np.flatnonzero(seen)
+    depth = ahead[shown].mean(axis=1)
+    colours = _hazed(walls.colours[shown], depth).tolist()
+    glass = _hazed(np.broadcast_to(np.array(_WINDOW), (len(shown), 3)), depth).tolist()
+    outlines_px = _subpixels(points[shown])
+    return [
+        (far, _facade(outlines_px[i], _subpixels(view.project(walls.windows_m[wall])), colours[i], glass[i]))
+        for i, (wall, far) in enumerate(zip(shown.tolist(), depth.tolist(), strict=True))
+    ]
 
 
 def _facade(
@@ -189,10 +203,6 @@ def _subpixels(points: FloatArray) -> NDArray[np.int32]:
     return np.rint(np.clip(points[..., :2], -4000, 4000) * (1 << _SUBPIXEL_BITS)).astype(np.int32)
 
 
-def _haze_share(depth_m: float) -> float:
-    return 1.0 - math.exp(-depth_m / _HAZE_M)
-
-
 def _hazed(colours: FloatArray, depth_m: FloatArray) -> FloatArray:
     share = (1.0 - np.exp(-depth_m / _HAZE_M))[:, None]
     return np.asarray(np.rint(colours * (1 - share) + np.array(HAZE) * share))
@@ -203,20 +213,47 @@ def _stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
     return rail, np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _POST_SPACING_M) + 1))
 
 
+def _lamp_stations(stations: FloatArray) -> FloatArray:
+    return np.arange(stations[0] + 6.0, stations[-1], _LAMP_SPACING_M)
+
+
 def _rail_faces(road: Road, runs: list[tuple[Rail, FloatArray]]) -> Faces:
-    corners, colours = [], []
+    found = []
     for rail, stations in runs:
         line = road.across(stations, rail.offset_m)
-        for low_m, high_m, colour in _BANDS[rail.kind]:
-            low = np.column_stack([line, np.full(len(line), low_m)])
-            high = np.column_stack([line, np.full(len(line), high_m)])
-            corners.append(np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1))
-            # Every piece a little different, so that the eye can see them pass.
-            tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
-            colours.append(np.array(colour) + tone)
-    if not corners:
-        return Faces(np.empty((0, 4, 3)), np.empty((0, 3)))
-    return Faces(np.concatenate(corners), np.concatenate(colours))
+        # Every piece a little different, so that the eye can see them pass.
+        tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
+        found += [
+            Faces(_upright(line[:-1], line[1:], low_m, high_m), np.array(colour) + tone, np.full(len(tone), seen_to_m))
+            for low_m, high_m, colour, seen_to_m in _BANDS[rail.kind]
+        ]
+    return _join_faces(found)
+
+
+def _lamp_faces(road: Road, runs: list[tuple[Rail, FloatArray]]) -> Faces:
+    """Make the arms of lamp posts, to both sides."""
+    found = []
+    for rail, stations in runs:
+        if rail.kind == "barrier":
+            places = _lamp_stations(stations)
+            ends = road.across(places, rail.offset_m - 1.8), road.across(places, rail.offset_m + 1.8)
+            corners = _upright(*ends, 9.35, 9.55)
+            found.append(Faces(corners, np.full((len(corners), 3), 104.0), np.full(len(corners), _FAR_M)))
+    return _join_faces(found)
+
+
+def _upright(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
+    low, high = np.full(len(begin), low_m), np.full(len(begin), high_m)
+    corners = [(begin, low), (end, low), (end, high), (begin, high)]
+    return np.stack([np.column_stack(corner) for corner in corners], axis=1)
+
+
+def _join_faces(faces: list[Faces]) -> Faces:
+    return Faces(
+        np.concatenate([np.empty((0, 4, 3)), *(each.corners_m for each in faces)]),
+        np.concatenate([np.empty((0, 3)), *(each.colours for each in faces)]),
+        np.concatenate([np.empty(0), *(each.seen_to_m for each in faces)]),
+    )
 
 
 def _poles(road: Road, runs: list[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
@@ -226,8 +263,7 @@ def _poles(road: Road, runs: list[tuple[Rail, FloatArray]], *, lamps: bool) -> F
         if rail.kind == "rail":
             place, shape = road.across(stations, rail.offset_m), (0.0, 0.72, 0.12)
         elif lamps:
-            place = road.across(np.arange(stations[0] + 6.0, stations[-1], _LAMP_SPACING_M), rail.offset_m)
-            shape = (0.8, 9.5, 0.16)
+            place, shape = road.across(_lamp_stations(stations), rail.offset_m), (0.8, 9.5, 0.16)
         else:
             continue
         poles.append(np.column_stack([place, np.tile(shape, (len(place), 1))]))
@@ -248,7 +284,7 @@ def _free_places(road: Road, name: str, count: int, clear_m: float) -> FloatArra
 
 def _plant(road: Road) -> FloatArray:
     """Trees, (n, 4): x, y, height (m), kind."""
-    places = _free_places(road, "tree places", 420, clear_m=6.0)
+    places = _free_places(road, "tree places", 340, clear_m=6.0)
     random = stream(_WORLD_SEED, "tree shapes")
     kinds = random.integers(0, TREE_KINDS, len(places))
     heights = np.where(
@@ -257,34 +293,26 @@ def _plant(road: Road) -> FloatArray:
     return np.column_stack([places, heights, kinds])
 
 
-def _build(road: Road) -> tuple[Building, ...]:
+def _build(road: Road) -> Walls:
     random = stream(_WORLD_SEED, "building shapes")
-    found = []
-    for x_m, y_m in _free_places(road, "building places", 26, clear_m=24.0):
+    outlines, colours, windows = [], [], []
+    for place in _free_places(road, "building places", 26, clear_m=24.0):
         length_m, width_m, storeys = random.uniform(14, 34), random.uniform(10, 16), int(random.integers(2, 7))
         heading_rad = random.uniform(0, math.pi)
-        colour = _FACADES[int(random.integers(0, len(_FACADES)))]
-        found.append(_box((x_m, y_m), heading_rad, (length_m, width_m, 3.2 * storeys), colour))
-    return tuple(found)
-
-
-def _box(
-    centre: tuple[float, float], heading_rad: float, size_m: tuple[float, float, float], colour: tuple[int, int, int]
-) -> Building:
-    length_m, width_m, height_m = size_m
-    forward = np.array([math.cos(heading_rad), math.sin(heading_rad)]) * length_m / 2
-    left = np.array([-math.sin(heading_rad), math.cos(heading_rad)]) * width_m / 2
-    corners = np.array([forward - left, forward + left, -forward + left, -forward - left]) + np.array(centre)
-    faces, windows = [], []
-    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        columns = max(2, round(float(np.hypot(*(end - begin))) / 3.0))
-        rows = round(height_m / 3.2)
-        whole = (np.zeros(1), np.ones(1))
-        faces.append(_panels(begin, end, shares=whole, heights_m=(np.zeros(1), np.array([height_m])))[0])
-        first = (np.arange(columns) + 0.25) / columns
-        sill = np.linspace(1.0, 1.0 + 3.2 * (rows - 1), rows)
-        windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
-    return Building(np.array(faces), tuple(windows), colour)
+        colour = np.array(_FACADES[int(random.integers(0, len(_FACADES)))])
+        forward = np.array([math.cos(heading_rad), math.sin(heading_rad)]) * length_m / 2
+        left = np.array([-math.sin(heading_rad), math.cos(heading_rad)]) * width_m / 2
+        corners = np.array([forward - left, forward + left, -forward + left, -forward - left]) + place
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            columns = max(2, round(float(np.hypot(*(end - begin))) / 3.0))
+            first = (np.arange(columns) + 0.25) / columns
+            sill = np.linspace(1.0, 1.0 + _STOREY_M * (storeys - 1), storeys)
+            windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
+            whole, height_m = (np.zeros(1), np.ones(1)), (np.zeros(1), np.full(1, _STOREY_M * storeys))
+            outlines.append(_panels(begin, end, shares=whole, heights_m=height_m)[0])
+            sunny = abs(end[0] - begin[0]) > abs(end[1] - begin[1])
+            colours.append(colour * (1.0 if sunny else 0.82))
+    return Walls(np.array(outlines).reshape(-1, 4, 3), np.array(colours).reshape(-1, 3), tuple(windows))
 
 
 def _panels(

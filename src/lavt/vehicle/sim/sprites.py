@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
 from lavt.streams import stream
@@ -19,28 +20,40 @@ _WORLD_SEED = 0
 _HEIGHT_PX = 256
 _WIDTH_PX = 208
 _LARGEST_CACHED_PX = 110
+_HAZE_STEPS = 64
+
+Weights = NDArray[np.uint16]
 
 
 def draw_tree(picture: Picture, *, kind: int, height_px: int, foot_px: tuple[float, float], haze: float) -> None:
     """Draw a tree that is `height_px` high with its foot at (u, v); `haze` is the share of haze in its colour."""
-    colour, alpha = _cached(kind, height_px) if height_px <= _LARGEST_CACHED_PX else _scaled(kind, height_px)
-    rows, columns = alpha.shape
+    sprite = _cached if height_px <= _LARGEST_CACHED_PX else _covering
+    paint, see_through = sprite(kind, height_px, round(haze * _HAZE_STEPS))
+    rows, columns, _ = paint.shape
     left, top = round(foot_px[0] - columns / 2), round(foot_px[1]) - rows + 1
     low_u, high_u = max(left, 0), min(left + columns, picture.shape[1])
     low_v, high_v = max(top, 0), min(top + rows, picture.shape[0])
     if low_u >= high_u or low_v >= high_v:
         return
     part = np.s_[low_v - top : high_v - top, low_u - left : high_u - left]
-    weight = alpha[part].astype(np.uint16)[..., None]
-    share = round(256 * haze)
-    shown = colour[part].astype(np.uint16) * (256 - share) + (np.array(HAZE) * share).astype(np.uint16) >> 8
     under = picture[low_v:high_v, low_u:high_u]
-    under[:] = (shown * weight + under * (255 - weight) + 127) // 255
+    mixed = under * see_through[part]
+    mixed += paint[part]
+    np.right_shift(mixed, 8, out=under, casting="unsafe")
 
 
-@lru_cache(maxsize=TREE_KINDS * _LARGEST_CACHED_PX)
-def _cached(kind: int, height_px: int) -> tuple[Picture, Grey]:
-    return _scaled(kind, height_px)
+@lru_cache(maxsize=2000)
+def _cached(kind: int, height_px: int, haze_step: int) -> tuple[Weights, Weights]:
+    return _covering(kind, height_px, haze_step)
+
+
+def _covering(kind: int, height_px: int, haze_step: int) -> tuple[Weights, Weights]:
+    """Make what a sprite adds (rows, columns, 3) and leaves of what is behind (rows, columns, 1), times 256."""
+    colour, alpha = _scaled(kind, height_px)
+    share = haze_step / _HAZE_STEPS
+    cover = (alpha.astype(np.uint16) + (alpha >> 7))[..., None]
+    hazed = np.rint(colour * (1 - share) + np.array(HAZE) * share).astype(np.uint16)
+    return np.asarray(hazed * cover, dtype=np.uint16), np.asarray(256 - cover, dtype=np.uint16)
 
 
 def _scaled(kind: int, height_px: int) -> tuple[Picture, Grey]:

@@ -21,6 +21,7 @@ SCALES_M = (0.02, 0.08, 0.32)
 """Metres a texel, finest first."""
 
 Grey = NDArray[np.uint8]
+Field = NDArray[np.float32]
 
 _WORLD_SEED = 0
 """The world looks the same in every run; a run's seed moves only the sensor's noise."""
@@ -53,7 +54,7 @@ def _reduced(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def seamless_noise(name: str, size: int, cells: int) -> FloatArray:
+def seamless_noise(name: str, size: int, cells: int) -> Field:
     """Smooth random field (size x size, mean 0, deviation 1) of `cells` x `cells` bumps; its edges fit each other."""
     coarse = stream(_WORLD_SEED, name, cells).standard_normal((cells, cells))
     border = 4
@@ -62,28 +63,31 @@ def seamless_noise(name: str, size: int, cells: int) -> FloatArray:
     # The inverse of what cv2.resize does, with whole coarse cells of border: texel i looks at (i + 0.5) / scale - 0.5.
     index = ((np.arange(size) + 0.5) / scale - 0.5 + border).astype(np.float32)
     columns, rows = np.meshgrid(index, index)
-    field = np.asarray(cv2.remap(padded, columns, rows, cv2.INTER_CUBIC), dtype=np.float64)
-    return np.asarray((field - field.mean()) / field.std())
+    field = np.asarray(cv2.remap(padded, columns, rows, cv2.INTER_CUBIC), dtype=np.float32)
+    field -= field.mean()
+    field /= field.std()
+    return field
 
 
 def _finest() -> Textures:
     size = round(PERIOD_M / SCALES_M[0])
-    grain = stream(_WORLD_SEED, "grain").standard_normal((size, size))
+    grain = stream(_WORLD_SEED, "grain").standard_normal((size, size), dtype=np.float32)
     stones = seamless_noise("stones", size, size // 3)
     patches = seamless_noise("patches", size, 40) + 0.8 * seamless_noise("patches", size, 12)
-    asphalt = 92 + 5.5 * grain + 5.0 * stones + 2.4 * patches
+    asphalt = 100 + 9.0 * grain + 4.0 * stones + 1.2 * patches
     blades = seamless_noise("blades", size, size // 2)
     tufts = seamless_noise("tufts", size, 200) + seamless_noise("tufts", size, 64)
     meadow = seamless_noise("meadow", size, 9)
-    light = 1.0 + 0.14 * blades + 0.11 * tufts + 0.08 * meadow
+    light = 1.0 + 0.10 * blades + 0.07 * tufts + 0.06 * meadow
     dry = 0.5 + 0.22 * seamless_noise("dry", size, 24)
-    grass = np.stack([46 + 18 * dry, 96 + 12 * dry, 78 + 44 * dry], axis=-1) * light[..., None]
-    pebbles = 1.0 + 0.12 * stones + 0.13 * grain + 0.04 * tufts
-    gravel = np.array([98.0, 112.0, 122.0]) * pebbles[..., None]
+    grass = np.stack([46 + 18 * dry, 96 + 12 * dry, 78 + 44 * dry], axis=-1)
+    grass *= light[..., None]
+    pebbles = 1.0 + 0.07 * stones + 0.10 * grain + 0.04 * tufts
+    gravel = np.array([98, 112, 122], dtype=np.float32) * pebbles[..., None]
     chips = 0.9 * stones + 0.6 * grain + 1.3 * seamless_noise("chips", size, 160)
     wear = 205 + 26 * np.clip(-1.1 - 0.5 * chips, -4.0, 0.6) + 8 * patches
-    return Textures(_bytes(asphalt), _bytes(grass), _bytes(gravel), _bytes(wear))
+    return Textures(_bytes(np.maximum(asphalt, 30)), _bytes(grass), _bytes(gravel), _bytes(wear))
 
 
-def _bytes(values: FloatArray) -> NDArray[np.uint8]:
+def _bytes(values: Field | FloatArray) -> NDArray[np.uint8]:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
