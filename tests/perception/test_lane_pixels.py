@@ -1,6 +1,6 @@
 import numpy as np
 
-from lavt.perception.lane_pixels import Mask, edge_pixels, lane_pixels, white_pixels, yellow_pixels
+from lavt.perception.lane_pixels import Mask, edge_pixels, lane_pixels, white_pixels
 
 ROAD = 85
 
@@ -22,9 +22,16 @@ def test_a_white_mark_is_found_and_nothing_else() -> None:
 def test_a_yellow_mark_is_found() -> None:
     """Yellow counts as paint though it is hardly brighter than the road."""
     picture = road()
-    picture[:, 300:308] = (40, 130, 150)
+    picture[:, 300:308] = (30, 95, 130)
+    assert not white_pixels(np.asarray(picture @ np.array([0.114, 0.587, 0.299])).astype(np.uint8)).any()
     assert lane_pixels(picture)[:, 301:307].all()
-    assert not white_pixels(picture[..., 1]).any() or yellow_pixels(picture)[:, 301:307].all()
+
+
+def test_grain_in_glaring_light_is_not_paint() -> None:
+    """Stripes that are 40 levels brighter than a bright road, but only by a fifth, are its own texture."""
+    picture = road() + np.uint8(115)
+    picture[:, 300:308] += np.uint8(40)
+    assert not lane_pixels(picture).any()
 
 
 def test_brighter_light_is_not_paint() -> None:

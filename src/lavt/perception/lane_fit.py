@@ -106,11 +106,11 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
 def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float) -> Sides:
     """Follow both lines from the near end with a pair of sliding windows that move as one.
 
-    They follow the centre `start` plus what they have seen themselves to be off it, and how fast that grows.
+    They follow the centre `start`, moved by how far off it they were seen to be last.
     """
     length_m, half_width_m = WINDOW_M
     offset_m = points.y_m - _along(points.x_m, start)[0]
-    off_m, drift_m = 0.0, 0.0
+    off_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
     for low_m in np.arange(grid.near_m, grid.far_m, length_m):
         inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
@@ -122,10 +122,7 @@ def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float
             if np.count_nonzero(caught) >= WINDOW_POINTS_AT_LEAST:
                 seen_m.append(float(np.mean(offset_m[caught])) - line_m)
         if seen_m:
-            error_m = sum(seen_m) / len(seen_m)
-            off_m += error_m
-            drift_m += 0.3 * error_m
-        off_m += drift_m
+            off_m += sum(seen_m) / len(seen_m)
     return sides
 
 
