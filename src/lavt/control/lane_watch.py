@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from lavt.domain import NS_PER_MS
+from lavt.control.limits import CLIENT_LIMITS
 
 LaneState = Literal["ok", "brake", "stop"]
 
 LANE_CONFIDENCE = 0.2
 """With less there is no lane: one line over 40 % of the length; a broken line alone gives twice that."""
-BRAKE_AFTER_NS = 500 * NS_PER_MS
-"""Without a lane: at 30 km/h 4 m have gone by, of the 16 m that were seen; a gap of broken marks is over."""
-STOP_AFTER_NS = 2500 * NS_PER_MS
-"""Without a lane: 2 s of braking have taken 6 m/s off 30 km/h, and the last path seen is nearly used up."""
+BRAKE_AFTER_NS = CLIENT_LIMITS.no_lane_brake_ns
+STOP_AFTER_NS = CLIENT_LIMITS.no_lane_stop_ns
 
 
 class LaneWatch:
