@@ -242,7 +242,13 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
     detector = LaneDetector(model)
     lane_keeper = make_controller(controller.kind, controller.preset, controller.wheelbase_m)
     start = now()
-    session = ClientSession(config.who, entropy.number(64), rearm=controller.rearm, start_ns=start.mono_ns)
+    session = ClientSession(
+        config.who,
+        entropy.number(64),
+        rearm=controller.rearm,
+        start_ns=start.mono_ns,
+        clear_stop=controller.clear_emergency_stop,
+    )
     return ClientNodes(
         ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
         DriverNode(

@@ -81,6 +81,8 @@ class ControllerConfig(Section):
     """Of the vehicle that is driven; the built-in car's."""
     rearm: bool = False
     """Arm again by itself after a safe stop."""
+    clear_emergency_stop: bool = False
+    """Clear an emergency stop that is found, as whoever set this has seen to what caused it."""
 
 
 class ClocksConfig(Section):

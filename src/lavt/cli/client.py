@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +26,7 @@ def client(
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
-    """Ask for the vehicle, arm it, and drive it by the video that comes.
+    """Ask for the vehicle, arm it, and drive it by the video that comes. SIGUSR1 is an emergency stop.
 
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
@@ -37,4 +38,5 @@ def client(
     ) as side:
         side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
         nodes = build_client(settings, clock.now, MachineEntropy())
+        signal.signal(signal.SIGUSR1, lambda *_: side.tell("operator", "emergency_stop"))
         run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)

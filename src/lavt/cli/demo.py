@@ -59,16 +59,21 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
 
 def _show(summary: dict[str, Any]) -> None:
     """Print the table of conditions."""
-    table = Table(
-        "time", "condition", "ending", "injected video + control", "tau_v", "tau_c", "loop", "cross-track P95"
-    )
+    columns = ("time", "condition", "ending", "injected", "tau_v", "tau_c", "loop", "P95")
+    units = ("", "", "", "video + control, ms", "ms", "ms", "ms", "cross-track, m")
+    table = Table(*("\n".join(each) for each in zip(columns, units, strict=True)))
     for run in summary["runs"]:
         asked = run["injected_ms"]
         table.add_row(
-            run["time"], run["condition"], run["ending"] + ("" if run["valid"] else " (not valid)"),
-            f"{asked['video']:g} + {asked['control']:g} ms", _ms(run["tau_v_ms"]), _ms(run["tau_c_ms"]),
-            _ms(run["loop_ms"]), "" if run["p95_m"] is None else f"{run['p95_m']:.2f} m",
-        )  # fmt: skip
+            run["time"],
+            run["condition"],
+            run["ending"] + ("" if run["valid"] else ", not valid"),
+            f"{asked['video']:g} + {asked['control']:g}",
+            _ms(run["tau_v_ms"]),
+            _ms(run["tau_c_ms"]),
+            _ms(run["loop_ms"]),
+            "" if run["p95_m"] is None else f"{run['p95_m']:.2f}",
+        )
     Console(width=120).print(table)
 
 
@@ -76,4 +81,4 @@ def _ms(summary: dict[str, Any]) -> str:
     if summary["p50"] is None:
         return "unknown"
     bound = summary.get("bound")
-    return f"{summary['p50']:.1f} ms" + ("" if bound is None else f" ± {bound:.2f}")
+    return f"{summary['p50']:.1f}" + ("" if bound is None else f" ± {bound:.2f}")

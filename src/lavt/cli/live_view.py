@@ -42,7 +42,7 @@ class LiveView:
         if self._live is not None:
             self._live.update(Text(text))
         elif self._updates % LINE_EVERY == 0:
-            self._console.print(text, highlight=False)
+            self._console.print(text, highlight=False, soft_wrap=True)
         self._updates += 1
 
 

@@ -93,6 +93,10 @@ class Side:
         self._udp.start()
         return self.runtime
 
+    def tell(self, channel: str, payload: Any) -> None:
+        """Hand a message to a node of this side."""
+        self._deliver(channel, payload, self.clock.now(), None)
+
     def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         if self.runtime is not None and not self.runtime.stopped.is_set():
             self.runtime.deliver(channel, payload, arrived, peer)

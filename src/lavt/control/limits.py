@@ -52,8 +52,7 @@ class ClientLimits:
     no_lane_brake_ns: int = 500 * NS_PER_MS
     """Without a lane: brake. At 30 km/h 4 m have gone by, of the 16 m that were seen; a gap of broken marks is over."""
     no_lane_stop_ns: int = 2500 * NS_PER_MS
-    """Without a lane: ask for a safe stop. 2 s of braking have taken 6 m/s off 30 km/h, and the last path seen is nearly
-    used up."""
+    """Without a lane: ask for a safe stop. 2 s of braking took 6 m/s off 30 km/h; the last path is nearly used up."""
     command_period_ns: int = 20 * NS_PER_MS
     """No longer than this between commands."""
     brake: float = 0.67

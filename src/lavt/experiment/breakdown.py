@@ -42,26 +42,28 @@ def breakdown(server: Record, client: Record, result: Mapping[str, Any]) -> list
 
 
 def _hops(timelines: Table, nodes: Sequence[str], frames: Table, *, from_stamp: bool = False) -> list[Share]:
-    """Median duration of each hop of `nodes`, over the first timeline that each node wrote for each frame.
+    """Median duration of each hop of `nodes`, over the first timeline that each chain of a node wrote for each frame.
 
     With `from_stamp` only what happened after the frame was stamped counts: the loop begins there.
     """
     stamps = timelines.ints("stamp_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
-    names, arrivals_ns = timelines.texts("node"), timelines.ints("arrived_mono_ns")
+    names, channels = timelines.texts("node"), timelines.texts("channel")
+    arrivals_ns = timelines.ints("arrived_mono_ns")
     every_hops = timelines.objects("hops")
     durations_ns: dict[tuple[str, str], list[int]] = {}
-    seen: set[tuple[str, int]] = set()
-    for node, stamp_ns, start_ns, arrived_ns, hops in zip(
-        names, stamps.tolist(), stamped_ns.tolist(), arrivals_ns.tolist(), every_hops, strict=True
+    seen: set[tuple[str, str, int]] = set()
+    for node, channel, stamp_ns, start_ns, arrived_ns, hops in zip(
+        names, channels, stamps.tolist(), stamped_ns.tolist(), arrivals_ns.tolist(), every_hops, strict=True
     ):
-        if node not in nodes or start_ns == MISSING or (node, stamp_ns) in seen:
+        if node not in nodes or start_ns == MISSING or (node, channel, stamp_ns) in seen:
             continue
-        seen.add((node, stamp_ns))
+        seen.add((node, channel, stamp_ns))
         before_ns = max(arrived_ns, start_ns) if from_stamp else arrived_ns
         for name, end_ns in hops or []:
             if end_ns > before_ns or not from_stamp:
-                durations_ns.setdefault((node, name), []).append(end_ns - before_ns)
+                shown = f"wait for {channel}" if name == "wait" else name
+                durations_ns.setdefault((node, shown), []).append(end_ns - before_ns)
                 before_ns = end_ns
     ordered = sorted(durations_ns, key=lambda hop: nodes.index(hop[0]))
     return [(node, name, float(np.median(durations_ns[node, name])) / NS_PER_MS) for node, name in ordered]

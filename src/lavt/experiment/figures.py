@@ -71,6 +71,7 @@ def loop_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
     figure = _figure(8, 3.6)
     completion, error = figure.subplots(1, 2)
     for kind, conditions in kinds.items():
+        names: dict[tuple[Axes, tuple[int, int]], tuple[tuple[float, float], list[str]]] = {}
         for name, condition in conditions.items():
             loop_ms = condition["loop_ms"]["p50"]
             for axes, value, interval, unit in (
@@ -80,7 +81,10 @@ def loop_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
                 if loop_ms is not None and value is not None:
                     place = (loop_ms, value * unit)
                     _point(axes, place, interval=interval, unit=unit, marker=_marker(kind, colours[name]))
-                    axes.annotate(name, place, **_beside(kind))
+                    about = (round(place[0] / 8), round(place[1] / unit / 0.1))
+                    names.setdefault((axes, about), (place, []))[1].append(name)
+        for (axes, _), (place, together) in names.items():
+            axes.annotate(", ".join(together), place, **_beside(kind))
     _tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion, Wilson interval")
     completion.set_ylim(-5, 105)
     _tidy(

@@ -8,6 +8,7 @@ from string import Template
 from typing import Any
 
 NOTHING = "–"
+UNBROKEN = "\N{NO-BREAK SPACE}"
 
 _PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -27,9 +28,9 @@ figure { margin: 1rem 0; }
 figure img { max-width: 100%; height: auto; }
 figcaption, .note { color: #555; font-size: .88rem; }
 .scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .6rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top;
-         white-space: nowrap; }
+table { border-collapse: collapse; font-size: .8rem; font-variant-numeric: tabular-nums; }
+th, td { padding: .2rem .4rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top;
+}
 th { border-bottom: 2px solid #888; vertical-align: bottom; }
 th:first-child, td:first-child, .text { text-align: left; }
 td.long { white-space: normal; text-align: left; min-width: 14rem; }
@@ -91,17 +92,17 @@ def percent(value: float | None) -> str:
 
 
 def interval(bounds: Sequence[float] | None, *, unit: float = 1.0, digits: int = 0) -> str:
-    """Write an interval as "low to high"."""
+    """Write an interval as "low to high", not to be broken."""
     if bounds is None:
         return NOTHING
-    return f"{bounds[0] * unit:.{digits}f} to {bounds[1] * unit:.{digits}f}"
+    return f"{bounds[0] * unit:.{digits}f} to {bounds[1] * unit:.{digits}f}".replace(" ", UNBROKEN)
 
 
 def latency(summary: Mapping[str, Any]) -> str:
-    """Write a latency: median, p5 to p95, and the bound of what the clocks can make of it (not of a loop)."""
+    """Write a latency: median, the bound of what the clocks can make of it (not of a loop), and p5 to p95."""
     if summary["p50"] is None:
         return NOTHING
-    text = f"{summary['p50']:.1f} ({summary['p5']:.1f} to {summary['p95']:.1f})"
-    if "bound" not in summary:
-        return text
-    return f"{text} ± {summary['bound']:.2f}" if summary["bound"] is not None else f"{text} ± unknown"
+    median, spread = f"{summary['p50']:.1f}", f"({summary['p5']:.1f} to {summary['p95']:.1f})"
+    if "bound" in summary:
+        median += f" ± {summary['bound']:.2f}" if summary["bound"] is not None else " ± unknown"
+    return f"{median.replace(' ', UNBROKEN)} {spread.replace(' ', UNBROKEN)}"

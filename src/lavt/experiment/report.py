@@ -101,7 +101,7 @@ def _head(summary: Mapping[str, Any], left_out: Sequence[str]) -> list[str]:
         if any(run["time"] == kind for run in runs)
     )
     invalid = sum(not run["valid"] for run in runs)
-    verdict = f"{invalid} of them do not count, for reasons given below, and are in no statistic"
+    verdict = f"{invalid} not valid, for reasons given below, and in no statistic"
     parts = [page.paragraph(f"{len(runs)} runs: {counted}. {verdict if invalid else 'All of them count'}.")]
     speed = summary["speed"]
     if speed["wall_s"]:

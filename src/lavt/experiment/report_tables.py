@@ -25,9 +25,6 @@ def condition_table(conditions: Mapping[str, Mapping[str, Any]]) -> str:
     headers = [
         "condition",
         "injected ms (video / control)",
-        "loop ms",
-        "τ video ms",
-        "τ control ms",
         "runs",
         "completed",
         "95 % interval",
@@ -35,14 +32,14 @@ def condition_table(conditions: Mapping[str, Mapping[str, Any]]) -> str:
         "lane invasions / run",
         "p95 error m",
         "95 % interval",
+        "loop ms",
+        "τ video ms",
+        "τ control ms",
     ]
     rows = [
         [
             name,
             f"{number(entry['injected_ms']['video'], 0)} / {number(entry['injected_ms']['control'], 0)}",
-            latency(entry["loop_ms"]),
-            latency(entry["tau_v_ms"]),
-            latency(entry["tau_c_ms"]),
             str(entry["runs"]),
             percent(entry["completion_rate"]),
             interval(entry["completion_interval"], unit=100.0),
@@ -50,6 +47,9 @@ def condition_table(conditions: Mapping[str, Mapping[str, Any]]) -> str:
             number(entry["lane_invasions_per_run"], 2),
             number(entry["p95_m"], 2),
             interval(entry["p95_interval"], digits=2),
+            latency(entry["loop_ms"]),
+            latency(entry["tau_v_ms"]),
+            latency(entry["tau_c_ms"]),
         ]
         for name, entry in conditions.items()
     ]

@@ -14,9 +14,12 @@ ASK_PERIOD_NS = NS_PER_S
 
 
 class ClientSession:
-    """Asks for the vehicle until it is granted, and again until the vehicle is armed: asking twice changes nothing."""
+    """Asks for the vehicle until it is granted, and again until the vehicle is armed: asking twice changes nothing.
 
-    def __init__(self, who: str, instance: int, *, rearm: bool, start_ns: int) -> None:
+    With `rearm` it begins anew after a safe stop; with `clear_stop` it clears an emergency stop that it finds.
+    """
+
+    def __init__(self, who: str, instance: int, *, rearm: bool, start_ns: int, clear_stop: bool = False) -> None:
         self.phase: Phase = "seeking"
         self.epoch = 0
         self.emergency_stop = 0
@@ -27,6 +30,7 @@ class ClientSession:
         self._who = who
         self._instance = instance
         self._rearm = rearm
+        self._clear_stop = clear_stop
         self._ask_ns = start_ns
         self._highest_emergency_stop = 0
 
@@ -45,6 +49,8 @@ class ClientSession:
         if due is None or now_ns < due:
             return None
         self._ask_ns = now_ns + ASK_PERIOD_NS
+        if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
+            return SessionRequest("clear_emergency_stop", self._who, self._instance, 0)
         return SessionRequest("hold", self._who, self._instance, 0)
 
     def note_reply(self, reply: SessionReply, _now_ns: int) -> None:

@@ -87,6 +87,7 @@ class DriverNode:
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),
             "session_reply": (("note", self._note_reply),),
+            "operator": (("stop", self._stop_now),),
             WAKE: (("command", self._wake),),
         }
 
@@ -198,6 +199,10 @@ class DriverNode:
             brake = max(decision.brake, self._limits.brake)
             return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
         return "drive", decision
+
+    def _stop_now(self, _message: Message, now: Now) -> list[Send]:
+        """Raise an emergency stop: by a query at once, and by a flag in every command from now on."""
+        return [Send("session", encode(self.session.stop_now(now.wall_ns))), *self._command(now)]
 
     # The vehicle tells.
 

@@ -34,6 +34,7 @@ CHANNELS: dict[str, Channel] = {
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),
     "picture_lost": Channel("local", "driver", ("receiver",)),
+    "operator": Channel("local", "operator", ("driver",)),  # a person asks for an emergency stop
     "path_token": Channel("local", "driver", ("receiver",)),
     # across the network
     "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
