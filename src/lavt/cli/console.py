@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lavt.errors import LavtError, UserError
+from lavt.errors import LavtError, UserError, WorkError
 
 Out = Annotated[Path | None, typer.Option(help="Directory for what is written.")]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Change a config value: a.b=value, as often as needed.")]
@@ -53,9 +53,15 @@ def run_command(command: Callable[[], None]) -> None:
     except LavtError as error:
         say(f"lavt: {error}")
         raise SystemExit(1) from None
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C in the middle of long work be an end that says so."""
+    try:
+        yield
     except KeyboardInterrupt:
-        say("lavt: stopped; what was finished is kept")
-        raise SystemExit(1) from None
+        raise WorkError("stopped; what was finished is kept") from None
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
+from lavt.cli.progress import progress
 from lavt.config import RunConfig, SweepConfig, load_config, parse_config, shipped
 from lavt.experiment.plan import plan_run, plan_sweep
 from lavt.experiment.report import write_report
@@ -35,17 +36,9 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
     out = out or Path("out") / "demo"
     config = shipped("configs/demo.yaml")
     prepare_directory(out)
-    for name in REAL_CONDITIONS:
-        run = load_config(RunConfig, config, ["time=real", f"network.condition={name}"])
-        planned = plan_run(run, name=f"real_{run.vehicle.route}_{name}_00")
-        with LiveView(f"real time, {name}") as view:
-            result = run_once(planned, out / "runs" / planned.name, progress=view.update)
-        console.say(f"real time, {name}: {result['ending']}")
-    base = load_config(RunConfig, config, ["time=virtual"])
-    axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
-    sweep = parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config))
-    console.say("virtual time, L0 to L5")
-    driven, speed = run_all(plan_sweep(sweep), out / "runs", jobs=None, tell=console.say)
+    with console.interruptible():
+        _drive_real(config, out)
+        failed, speed = _drive_virtual(config, out)
     page = write_report(out, speed=speed)
     summary = read_json(out / "summary.json")
     if as_json:
@@ -53,8 +46,27 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
     else:
         _show(summary)
         console.show(f"the report is {page}")
-    if driven.failed:
+    if failed:
         raise typer.Exit(1)
+
+
+def _drive_real(config: Path, out: Path) -> None:
+    for name in REAL_CONDITIONS:
+        run = load_config(RunConfig, config, ["time=real", f"network.condition={name}"])
+        planned = plan_run(run, name=f"real_{run.vehicle.route}_{name}_00")
+        with LiveView(f"real time, {name}") as view:
+            result = run_once(planned, out / "runs" / planned.name, progress=view.update)
+        console.say(f"real time, {name}: {result['ending']}")
+
+
+def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any]]:
+    """Drive the same under all conditions; tell whether any run failed, and the speed."""
+    base = load_config(RunConfig, config, ["time=virtual"])
+    axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
+    planned = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
+    with progress("virtual time, L0 to L5", len(planned)) as tell:
+        driven, speed = run_all(planned, out / "runs", jobs=None, tell=tell)
+    return bool(driven.failed), speed
 
 
 def _show(summary: dict[str, Any]) -> None:

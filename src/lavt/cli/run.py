@@ -31,7 +31,8 @@ def run(
     """
     planned = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
-    with LiveView(f"driving {planned.config.vehicle.route} under {planned.config.network.condition}") as view:
+    title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
+    with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)
     if as_json:
         console.show_json(result)

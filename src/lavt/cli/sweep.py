@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lavt.cli import console
+from lavt.cli.progress import progress
 from lavt.config import SweepConfig, load_config
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
@@ -33,8 +34,8 @@ def sweep(
     """
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
-    console.say(f"{len(planned)} runs into {out}")
-    page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=console.say)
+    with console.interruptible(), progress(f"sweep into {out}", len(planned)) as tell:
+        page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=tell)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
     if as_json:

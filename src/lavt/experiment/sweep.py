@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -49,20 +50,21 @@ def run_all(
             todo.append(each)
     jobs = 1 if any(each.config.time == "real" for each in todo) else jobs
     context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
-    with ProcessPoolExecutor(jobs, mp_context=context) as executor:
+    ignore = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only this one decides
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=signal.signal, initargs=ignore) as executor:
         futures = {executor.submit(run_once, each, runs_dir / each.name): each for each in todo}
         try:
-            for number, future in enumerate(as_completed(futures), 1):
+            for future in as_completed(futures):
                 name = futures[future].name
                 try:
                     result = future.result()
                     results.append(result)
-                    tell(f"{number}/{len(todo)} {name}: {result['ending']}")
+                    tell(f"{name}: {result['ending']}")
                 except LavtError as error:
                     failed.append((name, str(error)))
-                    tell(f"{number}/{len(todo)} {name} failed: {error}")
+                    tell(f"{name} failed: {error}")
         except KeyboardInterrupt:
-            executor.shutdown(wait=False, cancel_futures=True)
+            executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
             raise
     speed = {
         "simulated_s": sum(result["duration_s"] or 0.0 for result in results),

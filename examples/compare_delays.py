@@ -1,0 +1,29 @@
+"""Drive one route in virtual time under two conditions, and compare how well the lane was kept.
+
+python examples/compare_delays.py [DIRECTORY]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from tempfile import mkdtemp
+
+from lavt.config import RunConfig, load_config, shipped
+from lavt.experiment.plan import plan_run
+from lavt.experiment.run import run_once
+
+
+def main() -> None:
+    """Drive at L0 and at L3, and print a line for each."""
+    directory = Path(sys.argv[1] if len(sys.argv) > 1 else mkdtemp(prefix="lavt-"))
+    for condition in ("L0", "L3"):
+        changes = [f"network.condition={condition}", "vehicle.scenery=none"]
+        run = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
+        result = run_once(run, directory / condition)
+        print(f"{condition}: {result['ending']}, cross-track P95 {result['p95_m']:.2f} m, "
+              f"loop latency {result['loop_ms']['p50']:.0f} ms")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lavt.clock import pause
+from lavt.config import SweepConfig, load_config, shipped
+from lavt.domain import NS_PER_MS
+from lavt.experiment.plan import PlannedRun, plan_sweep
+from lavt.experiment.sweep import sweep
+
+CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
+
+
+def two_runs() -> list[PlannedRun]:
+    return plan_sweep(load_config(SweepConfig, shipped("configs/sweep.yaml"), CHANGES))
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of two runs, driven by two processes."""
+    out = tmp_path_factory.mktemp("sweep") / "out"
+    sweep(two_runs(), out, jobs=2, resume=False, tell=lambda _: None)
+    return out
+
+
+def test_a_sweep_leaves_a_whole_directory(swept: Path) -> None:
+    """A sweep leaves a directory for each run with config, both records and result, a summary, and a report."""
+    for run in two_runs():
+        names = {path.name for path in (swept / "runs" / run.name).iterdir()}
+        assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
+    assert (swept / "report" / "index.html").is_file()
+    summary = json.loads((swept / "summary.json").read_text())
+    assert list(summary["conditions"]) == ["L0", "L3"]
+    assert summary["conditions"]["L3"]["injected_ms"] == {"video": 225.0, "control": 0.0}
+    assert summary["speed"]["jobs"] == 2
+    assert summary["real"] == {}
+
+
+def test_resuming_drives_only_what_is_missing(swept: Path) -> None:
+    """A sweep that lost a run drives that run alone again, with the same digest, and gives the same summary."""
+    before = json.loads((swept / "summary.json").read_text())
+    first, second = (swept / "runs" / run.name for run in two_runs())
+    kept = (second / "result.json").stat().st_mtime_ns
+    (first / "result.json").unlink()  # as if it had been killed while driving
+    sweep(two_runs(), swept, jobs=1, resume=True, tell=lambda _: None)
+    after = json.loads((swept / "summary.json").read_text())
+    assert (second / "result.json").stat().st_mtime_ns == kept
+    assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
+    assert after["conditions"] == before["conditions"]
+
+
+@pytest.mark.realtime
+def test_ctrl_c_ends_a_sweep_and_keeps_what_is_finished(tmp_path: Path) -> None:
+    """Ctrl-C ends a sweep with a sentence and exit code 1, without a traceback, and keeps the finished runs."""
+    out = tmp_path / "out"
+    sets = [part for change in (*CHANGES[:2], "repetitions=3") for part in ("--set", change)]
+    started = subprocess.Popen(
+        [sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--out", str(out)],
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
+    )  # fmt: skip
+    for _ in range(600):
+        if list(out.glob("runs/*/result.json")):
+            break
+        pause(100 * NS_PER_MS)
+    os.killpg(started.pid, signal.SIGINT)  # as a terminal does: to all processes
+    _, said = started.communicate(timeout=60)
+    assert started.returncode == 1
+    assert "stopped; what was finished is kept" in said
+    assert "Traceback" not in said
+    assert list(out.glob("runs/*/result.json"))
