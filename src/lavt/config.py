@@ -72,6 +72,18 @@ class SafetyConfig(Section):
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
 
 
+class RecordConfig(Section):
+    """What is written down."""
+
+    video: bool = True
+    """The access units as sent and as received: nine tenths of a record."""
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """Channels that stay out of the record."""
+        return frozenset() if self.video else frozenset({"video"})
+
+
 class ControllerConfig(Section):
     """Who drives."""
 
@@ -118,6 +130,7 @@ class RunConfig(Section):
     video: VideoConfig = VideoConfig()
     network: NetworkConfig = NetworkConfig()
     safety: SafetyConfig = SafetyConfig()
+    record: RecordConfig = RecordConfig()
     clocks: ClocksConfig = ClocksConfig()
     study: StudyConfig = StudyConfig()
     time: Literal["real", "virtual"] = "virtual"
@@ -160,6 +173,7 @@ class ServerConfig(Section):
     video: ServerVideoConfig = ServerVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
     safety: SafetyConfig = SafetyConfig()
+    record: RecordConfig = RecordConfig()
     seed: int = Field(1, ge=0, lt=2**63)
 
 
@@ -181,6 +195,7 @@ class ClientConfig(Section):
     camera: CameraConfig = CameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
+    record: RecordConfig = RecordConfig()
 
 
 class DelayConfig(Section):

@@ -10,13 +10,12 @@ from types import TracebackType
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel
 
 import lavt
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
-from lavt.config import ZenohConfig
+from lavt.config import ClientConfig, ServerConfig, ZenohConfig
 from lavt.domain import Now
 from lavt.errors import WorkError
 from lavt.experiment.live import LiveTap
@@ -46,7 +45,7 @@ class Side:
     def __init__(
         self,
         name: Literal["server", "client"],
-        config: BaseModel,
+        config: ServerConfig | ClientConfig,
         out: Path | None,
         clock: MachineClock,
         *,
@@ -73,7 +72,7 @@ class Side:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
-            self._writer = RecordWriter(out / f"{name}.mcap", name)
+            self._writer = RecordWriter(out / f"{name}.mcap", name, left_out=config.record.left_out)
             self._writer.annotate("versions", {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}})
             self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
             recorder = self._queue = QueuedRecorder(self._writer)

@@ -76,11 +76,15 @@ class RecordWriter:
     """Writes the record of one side.
 
     `digest`, where there is one, gets every message: side, channel, monotonic time, length and JSON. Both sides of a
-    run in virtual time share one, so it also holds the order between them. What `annotate` writes stays out of it.
+    run in virtual time share one, so it also holds the order between them. What `annotate` writes stays out of it, and
+    so do the channels `left_out`, which are not recorded.
     """
 
-    def __init__(self, path: Path, side: Side, digest: Digest | None = None) -> None:
+    def __init__(
+        self, path: Path, side: Side, digest: Digest | None = None, *, left_out: Container[str] = frozenset()
+    ) -> None:
         self._side = side
+        self._left_out = left_out
         self._digest = digest
         self._file = path.open("wb")
         self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES)
@@ -94,6 +98,8 @@ class RecordWriter:
 
         Raises `TypeError` for values that JSON has no words for.
         """
+        if channel in self._left_out:
+            return
         data = _video_json(payload) if channel == VIDEO else to_json(payload)
         channel_id = self._channels.get((channel, type(payload))) or self._register(channel, type(payload))
         self._sequence += 1

@@ -13,6 +13,7 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
         video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
         zenoh=ZenohConfig(router=router),
         safety=run.safety,
+        record=run.record,
         seed=seed,
     )
 
@@ -24,4 +25,5 @@ def client_config(run: RunConfig, *, router: str = "", video_port: int = 0) -> C
         camera=run.camera,
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
         zenoh=ZenohConfig(router=router),
+        record=run.record,
     )

@@ -79,7 +79,11 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     """Make both sides of a run and the links between them, recording into `out`."""
     config, seed, costs = planned.config, planned.seed, read_costs()
     digest = hashlib.sha256()
-    writers = (RecordWriter(out / "server.mcap", "server", digest), RecordWriter(out / "client.mcap", "client", digest))
+    left_out = config.record.left_out
+    writers = (
+        RecordWriter(out / "server.mcap", "server", digest, left_out=left_out),
+        RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),
+    )
     tap = EndingTap(writers[0])
     server_clock, client_clock = clocks or host_clocks(config)
     server = build_server(
