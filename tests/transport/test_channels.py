@@ -65,7 +65,9 @@ def test_what_nodes_send(nodes: Sequence[Node]) -> None:
     assert {channel for _, channel in sent} <= CHANNELS.keys()
     heard = {(module, channel) for module, channel in sent if CHANNELS[channel].carrier != "record"}
     names = {node.name for node in nodes}
-    assert heard == {(row.sender, name) for name, row in CHANNELS.items() if row.sender in names and row.carrier != "record"}
+    assert heard == {
+        (row.sender, name) for name, row in CHANNELS.items() if row.sender in names and row.carrier != "record"
+    }
 
 
 def test_table_names_nodes(nodes: Sequence[Node]) -> None:

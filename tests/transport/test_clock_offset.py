@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.transport import clock_offset
 from lavt.transport.clock_offset import ClockReport, kernel_identity, parse_tracking, read_clock
 
 SLOW = (
@@ -78,7 +77,8 @@ def test_any_line(line: str, normal: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    "failure", [FileNotFoundError(), subprocess.TimeoutExpired("chronyc", 1), subprocess.CalledProcessError(1, "chronyc")]
+    "failure",
+    [FileNotFoundError(), subprocess.TimeoutExpired("chronyc", 1), subprocess.CalledProcessError(1, "chronyc")],
 )
 def test_no_chrony(failure: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where chrony is not there, hangs or fails, the report says so and has no bound."""
@@ -86,7 +86,7 @@ def test_no_chrony(failure: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(*_arguments: Any, **_options: Any) -> None:
         raise failure
 
-    monkeypatch.setattr(clock_offset.subprocess, "run", run)
+    monkeypatch.setattr(subprocess, "run", run)
     assert read_clock() == ClockReport(kernel_identity(), "none", 0.0, None)
 
 

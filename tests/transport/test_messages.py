@@ -105,7 +105,8 @@ REPLIES = st.builds(
 @given(st.one_of(COMMANDS, STATES, REQUESTS, REPLIES))
 def test_round_trip(message: AnyMessage) -> None:
     """Every message whose fields are in range is read back as it was."""
-    assert decode(type(message), encode(message)) == message
+    kind: Any = type(message)
+    assert decode(kind, encode(message)) == message
 
 
 @pytest.mark.parametrize("letter", ["a", "é", "€", "🚗"])
@@ -156,15 +157,16 @@ NAN, INF = float("nan"), float("inf")
 NOT_AN_INTEGER: list[Any] = [True, False, 1.0, NAN, "1", b"1", None, [], {}, -(2**63)]
 NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 - 1]
 NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
-TOO_LONG_A_TIME = [-1, 2**63, 2**64 - 1]
+NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {
         "epoch": [*NOT_AN_INTEGER, -1],
-        **{
-            name: NOT_AN_INTEGER + TOO_LONG_A_TIME
-            for name in ("sequence", "sent_wall_ns", "stamp_ns", "stamp_received_wall_ns", "emergency_stop")
-        },
+        "sequence": NOT_A_TIME,
+        "sent_wall_ns": NOT_A_TIME,
+        "stamp_ns": NOT_A_TIME,
+        "stamp_received_wall_ns": NOT_A_TIME,
+        "emergency_stop": NOT_A_TIME,
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "throttle": [*NOT_A_NUMBER, 1.0001, -0.0001],
         "brake": [*NOT_A_NUMBER, 1.0001, -0.0001],
@@ -175,8 +177,8 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "mode": [*NOT_A_TEXT, "", "fly", "Drive", "drive "],
     },
     State: {
-        "sent_wall_ns": NOT_AN_INTEGER + TOO_LONG_A_TIME,
-        "state_mono_ns": NOT_AN_INTEGER + TOO_LONG_A_TIME,
+        "sent_wall_ns": NOT_A_TIME,
+        "state_mono_ns": NOT_A_TIME,
         "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "gear": [*NOT_A_TEXT, "", "sideways"],
@@ -189,7 +191,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "operation": [*NOT_A_TEXT, "", "steal"],
         "who": [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"],
         "instance": [*NOT_AN_INTEGER, -1],
-        "number": NOT_AN_INTEGER + TOO_LONG_A_TIME,
+        "number": NOT_A_TIME,
     },
     SessionReply: {
         "granted": [0, 1, 1.0, "true", None, []],
@@ -198,7 +200,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "token": ["", "x" * 16, None, 0, bytes(15), bytes(17), [0] * 16],
         "video_port": [*NOT_AN_INTEGER, -1, 65536],
         "host": [*NOT_A_TEXT, "x" * 65],
-        "emergency_stop": NOT_AN_INTEGER + TOO_LONG_A_TIME,
+        "emergency_stop": NOT_A_TIME,
     },
 }  # fmt: skip
 

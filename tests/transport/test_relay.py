@@ -29,9 +29,11 @@ class ManualClock:
         self.mono_ns = 1_000 * NS_PER_S
 
     def now(self) -> Now:
+        """Read both clocks."""
         return Now(self.mono_ns, self.mono_ns)
 
     def advance(self, duration_ms: float) -> None:
+        """Let time go by."""
         self.mono_ns += round(duration_ms * NS_PER_MS)
 
 
@@ -44,9 +46,11 @@ class End:
         self.address: tuple[str, int] = self.socket.getsockname()
 
     def send(self, datagram: bytes, to: tuple[str, int]) -> None:
+        """Send a datagram."""
         self.socket.sendto(datagram, to)
 
     def receive(self) -> tuple[bytes, tuple[str, int]]:
+        """Wait for the next datagram."""
         self.socket.settimeout(ARRIVES_S)
         datagram, address = self.socket.recvfrom(65_535)
         return datagram, address
@@ -60,6 +64,7 @@ class End:
         return datagrams
 
     def hears_nothing(self) -> bool:
+        """Whether nothing has come so far."""
         return not self.waiting()
 
 
@@ -79,6 +84,7 @@ class Net:
         self.at = {name: ("127.0.0.1", port) for name, port in self.relay.ports().items()}
 
     def end(self) -> End:
+        """Open a socket that is closed with the net."""
         self.ends.append(End())
         return self.ends[-1]
 
@@ -103,6 +109,7 @@ class Net:
         return client, ("127.0.0.1", seen_at[1])
 
     def close(self) -> None:
+        """Close everything."""
         self.relay.close()
         for end in self.ends:
             end.socket.close()
@@ -261,7 +268,7 @@ def test_lateness(net: Net) -> None:
 
 
 def test_silent_client(net: Net) -> None:
-    """A client that was silent for half a minute loses its socket when another comes, and begins anew when it speaks."""
+    """A client silent for half a minute loses its socket when another comes, and begins anew when it speaks."""
     client, seen_at = net.connect("video")
     net.later(31_000)
     net.connect("video")

@@ -27,6 +27,7 @@ class ShiftedClock:
         self._wall_ns = round(wall_s * NS_PER_S)
 
     def now(self) -> Now:
+        """Read both clocks."""
         now = MachineClock().now()
         return Now(now.mono_ns + 10**15, now.wall_ns + self._wall_ns)
 
@@ -38,9 +39,11 @@ class Heard:
         self.messages: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
 
     def __call__(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        """Take a message."""
         self.messages.put((channel, payload, arrived, peer))
 
     def next(self) -> tuple[str, Any, Now, Any]:
+        """Wait for the next message."""
         return self.messages.get(timeout=ARRIVES_S)
 
 
@@ -129,7 +132,7 @@ def test_send_to_a_peer(sender: socket.socket) -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_send_to_the_remote(sender: socket.socket, known: bool) -> None:
-    """A client's link sends to its remote: to the port that is configured, or else to the one that the session named."""
+    """A client's link sends to its remote: to the configured port, or else to the one that the session named."""
     port = sender.getsockname()[1]
     with closing(opened(Heard(), remote=("localhost", port if known else 0))) as link:
         link.send(Send("feedback", b"hello", 9 if known else port))
