@@ -6,12 +6,13 @@ import math
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import Protocol
 
 import numpy as np
 
-from lavt.config import CameraConfig, ClientConfig, SafetyConfig, ServerConfig
+from lavt.config import CameraConfig, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import make_controller
 from lavt.control.limiter import Limiter
 from lavt.control.limits import CLIENT_LIMITS, LIMITS, Limits
@@ -159,14 +160,26 @@ VEHICLES: dict[str, Callable[[ServerConfig], Plant]] = {"simulator": build_simul
 
 def build_plant(config: ServerConfig) -> Plant:
     """Make the configured vehicle with its camera; raises `UserError` naming the known kinds."""
-    kind = config.vehicle.kind
+    return _vehicle(config.vehicle.kind)(config)
+
+
+def _vehicle(kind: str) -> Callable[[ServerConfig], Plant]:
     if kind in VEHICLES:
-        return VEHICLES[kind](config)
+        return VEHICLES[kind]
     custom = {entry.name: entry for entry in entry_points(group=CUSTOM_VEHICLES)}
     if kind not in custom:
         raise UserError(f"there is no vehicle {kind!r}: the known kinds are {', '.join([*VEHICLES, *custom])}")
-    plant: Plant = custom[kind].load()(config)
-    return plant
+    build: Callable[[ServerConfig], Plant] = custom[kind].load()
+    return build
+
+
+@lru_cache(maxsize=64)  # a sweep asks for each of its runs
+def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
+    """Raise `UserError` for a vehicle, route, controller or preset that does not exist, before any work is begun."""
+    _vehicle(vehicle.kind)
+    if vehicle.kind == "simulator":
+        load_road(vehicle.route)
+    make_controller(controller.kind, controller.preset, controller.wheelbase_m)
 
 
 def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
@@ -266,7 +279,7 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
 def parse_address(key: str, text: str) -> tuple[str, int]:
     """Read `host:port`; raises `UserError` naming `key`."""
     host, colon, port = text.rpartition(":")
-    if not colon or not host or not port.isdigit() or int(port) > 65535:
+    if not colon or not host or not (port.isascii() and port.isdigit()) or len(port) > 5 or int(port) > 65535:
         raise UserError(f"{key}: {text!r} is not an address: write it as host:port")
     return host, int(port)
 

@@ -24,7 +24,7 @@ def shipped(name: str) -> Path:
 class Section(BaseModel):
     """A part of a config: no unknown keys, no silent conversion, not changed once read."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class VehicleConfig(Section):
@@ -251,17 +251,35 @@ def load_config(kind: type[Config], path: Path, changes: Iterable[str] = ()) -> 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds a mapping; raises `UserError` where it does not."""
     try:
-        data = yaml.safe_load(path.read_text())
+        text = path.read_text()
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): name an existing file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        where = " ".join(str(error).split())
-        raise UserError(f"{path} is not YAML: {where}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not YAML: {error}") from error
+    data = parse_yaml(text, str(path))
     if data is None:
         return {}
     if not isinstance(data, dict):
         raise UserError(f"{path} must hold keys and values, not a {type(data).__name__}")
     return data
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Read YAML; raises `UserError`, which names `where` the text is from, for everything that is not."""
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
+        # a date that no calendar has, a number that is none, a thousand brackets: the library lets these through
+        raise UserError(f"{where} is not YAML: {' '.join(str(error).split())}") from error
+
+
+def split_change(change: str) -> tuple[list[str], Any]:
+    """Read a `--set` change, `a.b=value` with the value in YAML, as the parts of its key and its value."""
+    key, equals, text = change.partition("=")
+    parts = key.split(".")
+    if not equals or not all(parts):
+        raise UserError(f"--set {change!r} is not of the form a.b=value")
+    return parts, parse_yaml(text, f"--set {change!r}: the value")
 
 
 def parse_config(kind: type[Config], data: Mapping[str, Any], where: str) -> Config:
@@ -287,14 +305,7 @@ def condition(name: str) -> Condition:
 
 
 def _set(data: dict[str, Any], change: str) -> None:
-    key, equals, text = change.partition("=")
-    if not equals or not key:
-        raise UserError(f"--set {change!r} is not of the form a.b=value")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UserError(f"--set {change!r}: the value is not YAML") from error
-    *sections, last = key.split(".")
+    (*sections, last), value = split_change(change)
     for section in sections:
         data = data.setdefault(section, {})
         if not isinstance(data, dict):

@@ -13,10 +13,11 @@ from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.cli.progress import progress
 from lavt.config import RunConfig, SweepConfig, load_config, parse_config, shipped
+from lavt.experiment.directory import prepare_directory
 from lavt.experiment.plan import plan_run, plan_sweep
 from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
-from lavt.experiment.run import prepare_directory, run_once
+from lavt.experiment.run import run_once
 from lavt.experiment.sweep import run_all
 
 REAL_CONDITIONS = ("L0", "L5")

@@ -80,5 +80,6 @@ def _resolved(key: str, text: str) -> tuple[str, int]:
     host, port = parse_address(key, text)
     try:
         return socket.gethostbyname(host), port
-    except OSError as error:
-        raise UserError(f"{key}: the host {host!r} is not known ({error.strerror})") from error
+    except (OSError, ValueError) as error:  # ValueError: what cannot be a name at all
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{key}: the host {host!r} is not known ({why})") from error

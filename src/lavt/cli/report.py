@@ -9,6 +9,7 @@ import typer
 
 from lavt.cli import console
 from lavt.errors import UserError
+from lavt.experiment.directory import make_directory
 from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
 from lavt.experiment.run import RESULT, compute_result
@@ -27,12 +28,14 @@ def report(
 
     Example: lavt report out/sweep --out out/sweep
     """
+    out = out or directories[0]
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is not a directory: name another with --out")
     runs = [run for directory in directories for run in _runs(directory)]
     for run in runs:
         result = read_json(run / RESULT)
         compute_result(run, result, result.get("digest"))
-    out = out or directories[0]
-    out.mkdir(parents=True, exist_ok=True)
+    make_directory(out)
     console.show(f"the report is {write_report(out, run_dirs=runs)}")
 
 

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-import yaml
 
 from lavt.cli import console
-from lavt.config import shipped
-from lavt.errors import UserError
+from lavt.config import shipped, split_change
 
 
 def register(app: typer.Typer) -> None:
@@ -32,14 +30,16 @@ def router(
 
     quiet_logs()
     opened = Router(find(file), overrides(changes or []))
-    with console.until_told() as told:
-        locators = opened.locators()
-        if as_json:
-            console.show_json({"locators": locators})
-        else:
-            console.show(f"routing at {', '.join(locators)}; Ctrl-C ends it")
-        told.wait()
-    opened.close()
+    try:
+        with console.until_told() as told:
+            locators = opened.locators()
+            if as_json:
+                console.show_json({"locators": locators})
+            else:
+                console.show(f"routing at {', '.join(locators)}; Ctrl-C ends it")
+            told.wait()
+    finally:
+        opened.close()  # without it the process would not end
 
 
 def find(file: Path) -> Path:
@@ -49,10 +49,4 @@ def find(file: Path) -> Path:
 
 def overrides(changes: list[str]) -> dict[str, Any]:
     """Read `--set a.b=value` as Zenoh's keys with slashes."""
-    values = {}
-    for change in changes:
-        key, equals, text = change.partition("=")
-        if not equals:
-            raise UserError(f"--set {change!r} is not of the form a.b=value")
-        values[key.replace(".", "/")] = yaml.safe_load(text)
-    return values
+    return {"/".join(parts): value for parts, value in map(split_change, changes)}

@@ -18,6 +18,7 @@ from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig, ZenohConfig
 from lavt.domain import Now
 from lavt.errors import WorkError
+from lavt.experiment.directory import check_directory, prepare_directory
 from lavt.experiment.live import LiveTap
 from lavt.experiment.record import RecordWriter
 from lavt.node import Node
@@ -55,9 +56,14 @@ class Side:
     ) -> None:
         self.clock = clock
         self.runtime: RealRuntime | None = None
+        self._name = name
+        self._config = config
+        self._out = out
         self._writer: RecordWriter | None = None
         self._queue: QueuedRecorder | None = None
         self._udp: UdpLink | None = None
+        if out is not None:
+            check_directory(out)
         quiet_logs()
         self._zenoh = ZenohLink(
             clock,
@@ -68,15 +74,7 @@ class Side:
             vehicle=vehicle,
             who=who,
         )
-        recorder: Recorder = NoRecorder()
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            (out / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
-            self._writer = RecordWriter(out / f"{name}.mcap", name, left_out=config.record.left_out)
-            self._writer.annotate("versions", {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}})
-            self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
-            recorder = self._queue = QueuedRecorder(self._writer)
-        self.tap = LiveTap(recorder)
+        self.tap = LiveTap(NoRecorder())
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
         """Open the video's socket, whose datagrams come in on `channel`, and tell its port."""
@@ -84,8 +82,10 @@ class Side:
         return self._udp.port
 
     def start(self, nodes: Sequence[Node]) -> RealRuntime:
-        """Start the runtime, then let messages in."""
+        """Begin the record, start the runtime, then let messages in."""
         assert self._udp is not None, "the video is opened before the nodes are built"  # noqa: S101
+        if self._out is not None:
+            self.tap = LiveTap(self._open_record(self._out))
         self.runtime = RealRuntime(self.clock, nodes, self.tap, read_clock)
         self._zenoh.start()
         self.runtime.start({"video": self._udp, "zenoh": self._zenoh})
@@ -95,6 +95,16 @@ class Side:
     def tell(self, channel: str, payload: Any) -> None:
         """Hand a message to a node of this side."""
         self._deliver(channel, payload, self.clock.now(), None)
+
+    def _open_record(self, out: Path) -> Recorder:
+        """Begin the record only now that nothing can be wrong with the input any more."""
+        prepare_directory(out)
+        (out / "config.yaml").write_text(yaml.safe_dump(self._config.model_dump(mode="json"), sort_keys=False))
+        self._writer = RecordWriter(out / f"{self._name}.mcap", self._name, left_out=self._config.record.left_out)
+        self._writer.annotate("versions", {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}})
+        self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
+        self._queue = QueuedRecorder(self._writer)
+        return self._queue
 
     def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         if self.runtime is not None and not self.runtime.stopped.is_set():

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lavt.build import run_seed
+from lavt.build import check_names, run_seed
 from lavt.config import RunConfig, SweepConfig, condition, parse_config
 from lavt.errors import UserError
+
+TAKEN = {"vehicle.route": "routes", "network.condition": "conditions"}
+"""What a sweep varies anyway, by keys of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +29,9 @@ class PlannedRun:
 def plan_run(
     config: RunConfig, *, name: str = "run", repetition: int = 0, axes: Mapping[str, Any] | None = None
 ) -> PlannedRun:
-    """Plan one run; raises `UserError` for a condition that does not exist."""
+    """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
     asked = condition(config.network.condition)
+    check_names(config.vehicle, config.controller)
     seed = run_seed(config.seed, config.vehicle.route, repetition)
     identity = {
         "run": name,
@@ -50,7 +55,12 @@ def plan_run(
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
-    """Plan every route under every condition, repeated, over every combination of the further axes."""
+    """Plan every route under every condition, repeated, over every combination of the further axes.
+
+    Raises `UserError` for what `plan_run` refuses, for a sweep of nothing, and for one that asks for a run twice.
+    """
+    for key in sweep.axes.keys() & TAKEN:
+        raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[key]!r}")
     base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetitions", "axes"})
     runs = []
     for values in itertools.product(*sweep.axes.values()):
@@ -59,12 +69,17 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
             changes = {"vehicle.route": route, "network.condition": name, **axes}
             config = parse_config(RunConfig, _changed(base, changes), "the sweep")
             runs.append(plan_run(config, name=_name(route, name, repetition, axes), repetition=repetition, axes=axes))
+    if not runs:
+        raise UserError("the sweep asks for no run: give routes, conditions and axes at least one value each")
+    twice = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
+    if twice:
+        raise UserError(f"the sweep asks for {twice[0]} more than once: give each route, condition and value once")
     return runs
 
 
 def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
     parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
-    return "_".join("".join(c if c.isalnum() or c in "=.-_" else "-" for c in part) for part in parts)
+    return "_".join("".join(c if (c.isascii() and c.isalnum()) or c in "=.-_" else "-" for c in part) for part in parts)
 
 
 def _changed(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

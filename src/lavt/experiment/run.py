@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import yaml
 
-from lavt.errors import UserError, WorkError
+from lavt.errors import WorkError
+from lavt.experiment.directory import check_directory, prepare_directory
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.real_run import Progress, drive_real
 from lavt.experiment.record import read_record
@@ -22,18 +23,24 @@ RESULT = "result.json"
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     """Drive, compute the result, and leave everything in `out`; raises `WorkError` where nobody got to drive."""
     cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
-    prepare_directory(out)
-    (out / "config.yaml").write_text(yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False))
+    check_directory(out)
     digest, reasons = None, []
     if planned.config.time == "virtual":
         loop = build_loop(planned, out)
+        _write_config(planned, out)
         drive(loop)
         digest = loop.digest.hexdigest()
         if not loop.tap.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
     else:
+        prepare_directory(out)
+        _write_config(planned, out)
         reasons = drive_real(planned, out, progress=progress)
     return compute_result(out, planned.identity, digest, reasons)
+
+
+def _write_config(planned: PlannedRun, out: Path) -> None:
+    (out / "config.yaml").write_text(yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False))
 
 
 def compute_result(
@@ -44,13 +51,3 @@ def compute_result(
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
     return result
-
-
-def prepare_directory(out: Path) -> None:
-    """Make the directory; what is in it is never overwritten."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out} is not an empty directory: name another with --out, or remove it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out} cannot be made ({error.strerror}): name another directory with --out") from error

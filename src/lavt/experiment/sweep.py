@@ -14,10 +14,11 @@ from typing import Any
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
+from lavt.experiment.directory import prepare_directory
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
-from lavt.experiment.run import RESULT, prepare_directory, run_once
+from lavt.experiment.run import RESULT, run_once
 
 Tell = Callable[[str], None]
 

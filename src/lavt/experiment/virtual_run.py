@@ -11,6 +11,7 @@ from typing import Any
 from lavt.build import ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig, condition, load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, Now
+from lavt.experiment.directory import make_directory
 from lavt.experiment.network import Network, injected_network, virtual_network
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.record import RecordWriter
@@ -76,8 +77,18 @@ def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
 
 
 def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
-    """Make both sides of a run and the links between them, recording into `out`."""
+    """Make both sides of a run and the links between them, recording into `out`, which is made where it is not there.
+
+    Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
+    """
     config, seed, costs = planned.config, planned.seed, read_costs()
+    server_clock, client_clock = clocks or host_clocks(config)
+    server = build_server(
+        server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
+        host="virtual-server", video_port=SERVER_VIDEO_PORT,
+    )  # fmt: skip
+    client = build_client(client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"))
+    make_directory(out)
     digest = hashlib.sha256()
     left_out = config.record.left_out
     writers = (
@@ -85,12 +96,6 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),
     )
     tap = EndingTap(writers[0])
-    server_clock, client_clock = clocks or host_clocks(config)
-    server = build_server(
-        server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
-        host="virtual-server", video_port=SERVER_VIDEO_PORT,
-    )  # fmt: skip
-    client = build_client(client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"))
     costs_ns = {
         (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,12 +38,19 @@ def parse_tracking(host: str, line: str) -> ClockReport:
     """Read the answer of `chronyc -c tracking`: field 5 is the correction, positive where the local clock is slow.
 
     The bound is the root distance: half the root delay plus the root dispersion (chronyc's manual, "tracking").
-    Before chrony has synchronised, the correction is 0 and the bound unknown.
+    Before chrony has synchronised, and where the line is not what chrony writes, the correction is 0 and the bound
+    unknown.
     """
+    unknown = ClockReport(host, "chrony, not synchronised", 0.0, None)
     fields = line.strip().split(",")
     if len(fields) != TRACKING_FIELDS or fields[13] != "Normal" or fields[0] == "00000000":
-        return ClockReport(host, "chrony, not synchronised", 0.0, None)
-    correction_s, delay_s, dispersion_s = (float(fields[index]) for index in (4, 10, 11))
+        return unknown
+    try:
+        correction_s, delay_s, dispersion_s = (float(fields[index]) for index in (4, 10, 11))
+    except ValueError:
+        return unknown
+    if not (math.isfinite(correction_s) and 0 <= delay_s < math.inf and 0 <= dispersion_s < math.inf):
+        return unknown
     return ClockReport(host, "chrony", correction_s, delay_s / 2 + dispersion_s)
 
 

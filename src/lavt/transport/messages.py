@@ -19,7 +19,7 @@ from lavt.errors import BadMessage
 
 VERSION = 1
 MAX_MESSAGE_BYTES = 1024
-NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}$")
+NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """What a vehicle and a client may be called: nothing that means something in a Zenoh key."""
 
 Check = Callable[[Any], bool]
@@ -34,7 +34,8 @@ def _number(low: float, high: float) -> Check:
 
 
 def _text(longest: int) -> Check:
-    return lambda value: type(value) is str and len(value) <= longest
+    """Check a text's bytes, not its letters: all that passes the checks together fits into a message."""
+    return lambda value: type(value) is str and len(value.encode()) <= longest
 
 
 def _one_of(*choices: str) -> Check:

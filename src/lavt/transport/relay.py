@@ -91,7 +91,13 @@ class Relay:
         self._heap: list[tuple[int, int, _Way]] = []
         self._number = 0
         self.not_sent = 0
-        self._flows = [_OpenFlow(self, flow) for flow in flows]
+        self._flows: list[_OpenFlow] = []
+        try:
+            for flow in flows:
+                self._flows.append(_OpenFlow(self, flow))
+        except UserError:
+            self.close()
+            raise
 
     def ports(self) -> dict[str, int]:
         """Tell the port that was opened for each flow."""
@@ -106,10 +112,10 @@ class Relay:
         }
         return {name: median(values) / NS_PER_MS if values else None for name, values in late.items()}
 
-    def step(self) -> None:
-        """Wait for what comes first, a datagram or one that is due, and deal with it."""
+    def step(self, longest_pause_s: float = LONGEST_PAUSE_S) -> None:
+        """Wait for what comes first, a datagram, one that is due or the longest pause, and deal with it."""
         self._release()
-        pause_s = LONGEST_PAUSE_S
+        pause_s = longest_pause_s
         if self._heap:
             pause_s = max(0.0, min(pause_s, (self._heap[0][0] - self._clock.now().mono_ns) / NS_PER_S))
         for key, _events in self._selector.select(pause_s):

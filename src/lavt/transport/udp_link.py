@@ -46,16 +46,16 @@ class UdpLink:
         self._clock = clock
         self._channel = channel
         self._deliver = deliver
-        self._remote = remote
+        self._remote = None if remote is None else (_resolved(remote[0]), remote[1])
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         try:
             self._socket.bind(bind)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             self._socket.close()
             raise UserError(
-                f"the video port {bind[0]}:{bind[1]} cannot be opened ({error.strerror}): choose another, or 0 for any"
+                f"the video port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
             ) from error
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
@@ -109,3 +109,16 @@ class UdpLink:
                 if 0 <= queued_ns < QUEUED_LONGEST_NS:
                     return now.later(-queued_ns)
         return now
+
+
+def _resolved(host: str) -> str:
+    """Look a host up once: every datagram would ask again, and never say that nobody knows it."""
+    try:
+        return socket.gethostbyname(host)
+    except (OSError, ValueError) as error:
+        raise UserError(f"the video's server {host!r} is not known ({_why(error)}): name another host") from error
+
+
+def _why(error: OSError | ValueError) -> str:
+    """Say why an address cannot be used; a ValueError is that of a host that cannot be a name at all."""
+    return str(error.strerror if isinstance(error, OSError) else error)

@@ -56,16 +56,34 @@ def _load(path: Path, overrides: Mapping[str, Any]) -> zenoh.Config:
         raise UserError(f"there is no Zenoh config {path}: the shipped ones are in zenoh-configs/")
     try:
         config = zenoh.Config.from_file(str(path))
-        for key, value in overrides.items():
-            config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         raise UserError(f"{path} is not a Zenoh config: {_plain(error)}") from error
+    for key, value in overrides.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except (zenoh.ZError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{key.replace('/', '.')} cannot be {value!r} in a Zenoh config: {_plain(error)}"
+            ) from error
     return config
 
 
 def _plain(error: Exception) -> str:
-    """Error text of Zenoh without the places in its own source."""
-    return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))
+    """Error text of Zenoh in one line, without the places in its own source and the names of its own types."""
+    text = " ".join(re.sub(r" at /\S+\.rs:\d+\.?", "", str(error)).split())
+    text = re.sub(
+        r"(?:Json5Err\()?Message \{ msg: \"(.*)\", location: .*? line: (\d+), column: (\d+) .*", r"\1 (line \2)", text
+    )
+    return re.sub(r"^Str\(\"(.*)\"\)$", r"\1", text)
+
+
+def _listens(config: zenoh.Config) -> bool:
+    """Whether the config of a router names where it listens; what it does not name Zenoh fills in with everywhere."""
+    endpoints = config.get_json("listen/endpoints")
+    if endpoints == zenoh.Config().get_json("listen/endpoints"):
+        return False
+    named = json.loads(endpoints)
+    return bool(named.get("router") if isinstance(named, dict) else named)
 
 
 class Router:
@@ -75,8 +93,12 @@ class Router:
         config = _load(path, overrides)
         if json.loads(config.get_json("mode")) != "router":
             raise UserError(f'{path} is not the config of a router: it must say mode: "router"')
-        if not json.loads(config.get_json("listen/endpoints")):
+        if not _listens(config):
             raise UserError(f"{path} names no listen endpoints; without them Zenoh would listen on all interfaces")
+        if not json.loads(config.get_json("adminspace/enabled")):
+            raise UserError(
+                f"{path} must say adminspace: {{ enabled: true }}, or the router cannot tell where it listens"
+            )
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
@@ -89,7 +111,7 @@ class Router:
             if reply.ok is not None:
                 locators: list[str] = json.loads(reply.ok.payload.to_string())["locators"]
                 return locators
-        raise WorkError("the router does not tell where it listens: its config must enable adminspace")
+        raise WorkError(f"the router does not tell within {ROUTER_READY_S:.0f} s where it listens")
 
     def close(self) -> None:
         """Stop routing."""

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.build import (
+    MachineEntropy,
+    SeededEntropy,
+    build_plant,
+    camera_model,
+    check_names,
+    parse_address,
+    run_seed,
+)
+from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
+from lavt.errors import UserError
+
+
+@given(st.integers(0, 2**63 - 1), st.text(max_size=10), st.integers(0, 10_000))
+def test_run_seed(seed: int, route: str, repetition: int) -> None:
+    """The seed of a run is one that a config can hold, and the same whenever it is asked for."""
+    assert 0 <= run_seed(seed, route, repetition) < 2**63
+    assert run_seed(seed, route, repetition) == run_seed(seed, route, repetition)
+
+
+def test_run_seeds_differ() -> None:
+    """Other seeds, routes and repetitions give other seeds of runs."""
+    seeds = {run_seed(seed, route, again) for seed in range(5) for route in ("a", "b", "a 1") for again in range(50)}
+    assert len(seeds) == 5 * 3 * 50
+
+
+def test_seeded_entropy() -> None:
+    """Seeded entropy repeats with its seed and name, and gives numbers and tokens of the asked length."""
+    one, same, other = (SeededEntropy(seed, name) for seed, name in ((1, "server"), (1, "server"), (1, "client")))
+    values = [one.number(64), one.number(32), one.token(16)]
+    assert values == [same.number(64), same.number(32), same.token(16)]
+    assert values[0] != other.number(64)
+    assert len(one.token(16)) == 16
+    assert all(0 <= one.number(16) < 2**16 for _ in range(200))
+
+
+def test_machine_entropy() -> None:
+    """The machine's entropy does not repeat."""
+    entropy = MachineEntropy()
+    assert len({entropy.number(64) for _ in range(100)}) == 100
+    assert len({entropy.token(16) for _ in range(100)}) == 100
+
+
+def test_camera_model() -> None:
+    """Degrees of the config are radians in the geometry."""
+    model = camera_model(CameraConfig(field_of_view_deg=60.0, pitch_deg=-3.0, x_m=1.0, z_m=2.0))
+    assert (model.width_px, model.height_px, model.x_m, model.z_m) == (640, 480, 1.0, 2.0)
+    assert model.field_of_view_rad == pytest.approx(math.pi / 3)
+    assert model.pitch_rad == pytest.approx(-0.05236, abs=1e-5)
+
+
+@given(st.text(max_size=20))
+def test_any_address(text: str) -> None:
+    """No text raises anything but UserError when it is read as an address."""
+    with suppress(UserError):
+        host, port = parse_address("video.send_to", text)
+        assert host
+        assert 0 <= port <= 65535
+
+
+def test_addresses() -> None:
+    """An address is host:port."""
+    assert parse_address("key", "127.0.0.1:5600") == ("127.0.0.1", 5600)
+    assert parse_address("key", "desk.example:0") == ("desk.example", 0)
+    for bad in ("5600", ":5600", "desk:", "desk:65536", "desk:-1", "desk:²", "desk:1 ", "desk:" + "9" * 5000):
+        with pytest.raises(UserError, match="write it as host:port"):
+            parse_address("key", bad)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "controller", "said"),
+    [
+        ({"kind": "boat"}, {}, "'boat': the known kinds are simulator"),
+        ({"route": "z_key"}, {}, "'z_key'; known are: .*a_key"),
+        ({"route": "../a_key"}, {}, "no road"),
+        ({}, {"kind": "wizard"}, "'wizard'; choose one of lane_keeper"),
+        ({}, {"preset": "magic"}, "'magic'; choose one of designed, paper_calibrated"),
+    ],
+)
+def test_unknown_names(vehicle: dict[str, str], controller: dict[str, str], said: str) -> None:
+    """A vehicle, route, controller or preset that does not exist is refused with the names of those that do."""
+    with pytest.raises(UserError, match=said):
+        check_names(VehicleConfig(**vehicle), ControllerConfig(**controller))  # type: ignore[arg-type]
+
+
+def test_unknown_vehicle() -> None:
+    """A server of a vehicle that does not exist is not built."""
+    with pytest.raises(UserError, match="the known kinds are simulator"):
+        build_plant(ServerConfig(vehicle=VehicleConfig(kind="boat")))

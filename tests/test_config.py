@@ -1,0 +1,304 @@
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.build import limits_of
+from lavt.config import (
+    ClientConfig,
+    ClocksConfig,
+    Costs,
+    DelayConfig,
+    RelayConfig,
+    RunConfig,
+    SafetyConfig,
+    Section,
+    ServerConfig,
+    SweepConfig,
+    condition,
+    conditions,
+    load_config,
+    parse_config,
+    parse_yaml,
+    shipped,
+)
+from lavt.control.limits import LIMITS
+from lavt.errors import UserError
+
+SCHEMAS: dict[str, type[Section]] = {
+    "client.yaml": ClientConfig,
+    "costs.yaml": Costs,
+    "demo.yaml": RunConfig,
+    "relay.yaml": RelayConfig,
+    "server.yaml": ServerConfig,
+    "sweep.yaml": SweepConfig,
+}
+"""A file in configs/ that is not here has no test: name its schema."""
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in shipped("configs").iterdir()))
+def test_shipped_configs(name: str) -> None:
+    """Every file of configs/ is a config of the command that it is for."""
+    assert name in SCHEMAS, f"say in SCHEMAS what {name} is"
+    load_config(SCHEMAS[name], shipped("configs") / name)
+
+
+@pytest.mark.parametrize("name", sorted(set(SCHEMAS) - {"costs.yaml"}))
+def test_nothing_is_lost_by_writing(name: str) -> None:
+    """A config that is written out whole, as into a run directory, is read back as it was."""
+    config = load_config(SCHEMAS[name], shipped("configs") / name)
+    assert parse_config(SCHEMAS[name], config.model_dump(mode="json"), name) == config
+
+
+@pytest.mark.parametrize("name", ["configs/demo.yaml", "netem/conditions.yaml", "zenoh-configs/session.json5"])
+def test_shipped(name: str) -> None:
+    """What comes with LAVT is found from any working directory."""
+    assert shipped(name).is_file()
+    assert shipped(name).is_absolute()
+
+
+def test_demo_is_what_others_rely_on() -> None:
+    """The demo drives route A's key part with the gains fitted to the paper and the limits that these need."""
+    demo = load_config(RunConfig, shipped("configs/demo.yaml"))
+    assert (demo.vehicle.route, demo.controller.preset, demo.network.condition) == ("a_key", "paper_calibrated", "L0")
+    assert (demo.safety.lateral_acceleration_mps2, demo.safety.picture_age_limit_ms) == (6.0, 2000.0)
+
+
+PAPER = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
+
+
+def test_conditions() -> None:
+    """The conditions L0 to L5 inject what the paper did, in milliseconds of video and of control."""
+    known = conditions()
+    assert {name: (known[name].video_ms, known[name].control_ms) for name in PAPER} == PAPER
+    assert condition("L5") == known["L5"]
+
+
+def test_unknown_condition() -> None:
+    """A condition that does not exist is refused with the names of those that do."""
+    with pytest.raises(UserError, match=r"'L6'.*L0, L1, L2, L3, L4, L5"):
+        condition("L6")
+
+
+def refused(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes: tuple[str, ...] = ()) -> str:
+    """Give the sentence with which a config of this text is refused."""
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        load_config(kind, path, changes)
+    sentence = str(error.value)
+    assert "\n" not in sentence
+    return sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "near"),
+    [
+        ("sed: 3", "sed", "seed"),
+        ("vehicle: {rute: a_key}", "vehicle.rute", "route"),
+        ("camera: {width: 640}", "camera.width", "width_px"),
+        ("video:\n  bitrate_bps: 1000000", "video.bitrate_bps", "bit_rate_bps"),
+        ("safety: {lateral_acceleration: 3.0}", "safety.lateral_acceleration", "lateral_acceleration_mps2"),
+    ],
+)
+def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
+    """A key that does not exist is refused with its place and the nearest one that does, in sections too."""
+    assert f"unknown key {key!r}: did you mean {near!r}?" in refused(text, tmp_path)
+
+
+def test_unknown_key_like_no_other(tmp_path: Path) -> None:
+    """A key that is like none is refused with all that there are."""
+    sentence = refused("clocks: {xyzzy: 1}", tmp_path)
+    assert "unknown key 'clocks.xyzzy': known here: bound_us, drift_ppm, error_us, offset_ms" in sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("camera.width=640", "unknown key 'camera.width': did you mean 'width_px'?"),
+        ("vehicel.route=a_key", "unknown key 'vehicel': did you mean 'vehicle'?"),
+        ("seed=one", "'seed'"),
+        ("seed=1.5", "'seed'"),
+        ("camera.rate_hz=fast", "'camera.rate_hz'"),
+        ("seed", "not of the form a.b=value"),
+        ("=1", "not of the form a.b=value"),
+        ("camera.=1", "not of the form a.b=value"),
+        (".seed=1", "not of the form a.b=value"),
+        ("seed=[", "not YAML"),
+        ("seed=2026-13-45", "not YAML"),
+        ("seed=!!int x", "not YAML"),
+        ("seed.more=1", "seed is not a section"),
+        ("camera=3", "'camera'"),
+    ],
+)
+def test_bad_set(change: str, said: str, tmp_path: Path) -> None:
+    """A change by --set is checked like the file, and one that is not of its form is named."""
+    assert said in refused("seed: 1", tmp_path, changes=(change,))
+
+
+def test_set(tmp_path: Path) -> None:
+    """Changes reach every depth, make sections that the file leaves out, and the last of several wins."""
+    path = tmp_path / "my.yaml"
+    path.write_text("camera: {width_px: 320}")
+    changes = ["seed=7", "camera.rate_hz=20", "network.condition=L3", "seed=8", "time=real", "study.participant='07'"]
+    config = load_config(RunConfig, path, changes)
+    assert (config.seed, config.network.condition, config.time, config.study.participant) == (8, "L3", "real", "07")
+    assert (config.camera.width_px, config.camera.rate_hz) == (320, 20.0)
+
+
+def test_set_lists(tmp_path: Path) -> None:
+    """A list in a change is one in YAML, and a value may hold an equals sign."""
+    path = tmp_path / "my.yaml"
+    path.write_text("")
+    changes = ["conditions=[L0, L3]", "axes={video.bit_rate_bps: [1000000, 2000000]}", "study.participant=a=b"]
+    config = load_config(SweepConfig, path, changes)
+    assert config.conditions == ("L0", "L3")
+    assert config.axes == {"video.bit_rate_bps": [1_000_000, 2_000_000]}
+    assert config.study.participant == "a=b"
+
+
+BAD_VALUES: list[tuple[type[Section], str, str]] = [
+    (RunConfig, "seed: -1", "'seed'"),
+    (RunConfig, "seed: true", "'seed'"),
+    (RunConfig, "seed: '1'", "'seed'"),
+    (RunConfig, "time: soon", "'time'"),
+    (RunConfig, "camera: {width_px: 127}", "'camera.width_px'"),
+    (RunConfig, "camera: {width_px: 641}", "'camera.width_px'"),
+    (RunConfig, "camera: {rate_hz: 0}", "'camera.rate_hz'"),
+    (RunConfig, "camera: {rate_hz: .nan}", "'camera.rate_hz'"),
+    (RunConfig, "camera: {x_m: .nan}", "'camera.x_m'"),
+    (RunConfig, "camera: {z_m: .inf}", "'camera.z_m'"),
+    (RunConfig, "camera: {pitch_deg: 90}", "'camera.pitch_deg'"),
+    (RunConfig, "camera: null", "'camera'"),
+    (RunConfig, "camera: [640, 480]", "'camera'"),
+    (RunConfig, "network: {injection: magic}", "'network.injection'"),
+    (RunConfig, "network: {inherent: ether}", "'network.inherent'"),
+    (RunConfig, "safety: {lateral_acceleration_mps2: 6.1}", "'safety.lateral_acceleration_mps2'"),
+    (RunConfig, "safety: {picture_age_limit_ms: 2001}", "'safety.picture_age_limit_ms'"),
+    (RunConfig, "safety: {picture_age_limit_ms: -1}", "'safety.picture_age_limit_ms'"),
+    (RunConfig, "clocks: {error_us: 200, bound_us: 100}", "'clocks.bound_us'"),
+    (RunConfig, "1: 2", "'1'"),
+    (SweepConfig, "conditions: L0", "'conditions'"),
+    (SweepConfig, "conditions: [L0, 3]", "'conditions.1'"),
+    (SweepConfig, "repetitions: 0", "'repetitions'"),
+    (SweepConfig, "axes: [1]", "'axes'"),
+    (SweepConfig, "axes: {seed: 1}", "'axes.seed'"),
+    (ServerConfig, "video: {port: 65536}", "'video.port'"),
+    (ServerConfig, "video: {gop_frames: 0}", "'video.gop_frames'"),
+    (RelayConfig, "video_server: 127.0.0.1:1", "'control_server' is missing"),
+    (RelayConfig, "{video_server: a:1, control_server: a:1, video: {constant_ms: -1}}", "'video.constant_ms'"),
+    (RelayConfig, "{video_server: a:1, control_server: a:1, video: {jitter_median_ms: .inf}}", "jitter_median_ms"),
+]
+
+
+@pytest.mark.parametrize(("kind", "text", "said"), BAD_VALUES, ids=[text for _, text, _ in BAD_VALUES])
+def test_bad_values(kind: type[Section], text: str, said: str, tmp_path: Path) -> None:
+    """A value of a wrong type, out of range or not finite is refused with its key; nothing is converted silently."""
+    sentence = refused(text, tmp_path, kind)
+    assert said in sentence
+    assert "my.yaml" in sentence
+
+
+def test_all_problems_at_once(tmp_path: Path) -> None:
+    """Everything that is wrong in a config is said in one go."""
+    sentence = refused("seed: -1\ncamera: {width: 1, rate_hz: 0}", tmp_path)
+    assert all(key in sentence for key in ("'seed'", "'camera.width'", "'camera.rate_hz'"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("- 1\n- 2", "must hold keys and values, not a list"),
+        ("just words", "must hold keys and values, not a str"),
+        ("3", "must hold keys and values, not a int"),
+        ("a: [", "is not YAML"),
+        ("a: 1\n\tb: 2", "is not YAML"),
+        ("when: 2026-13-45", "is not YAML"),
+        ("x: !!python/object:os.system {}", "is not YAML"),
+        ("[" * 5000, "is not YAML"),
+    ],
+)
+def test_bad_files(text: str, said: str, tmp_path: Path) -> None:
+    """A file that is not YAML, or not a mapping, is refused in one line that names it."""
+    sentence = refused(text, tmp_path)
+    assert said in sentence
+    assert "my.yaml" in sentence
+
+
+def test_bytes_that_are_no_text(tmp_path: Path) -> None:
+    """A file that is not text is refused."""
+    path = tmp_path / "my.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(UserError, match=r"my\.yaml is not YAML"):
+        load_config(RunConfig, path)
+
+
+@pytest.mark.parametrize("name", ["nothing.yaml", "."])
+def test_missing_file(name: str, tmp_path: Path) -> None:
+    """A file that is not there, or is a directory, is refused with the advice to name an existing one."""
+    with pytest.raises(UserError, match=r"cannot be read .*name an existing file"):
+        load_config(RunConfig, tmp_path / name)
+
+
+def test_empty_file(tmp_path: Path) -> None:
+    """An empty file asks for the defaults."""
+    (tmp_path / "my.yaml").write_text("# nothing\n")
+    assert load_config(RunConfig, tmp_path / "my.yaml") == RunConfig()
+
+
+@given(st.text(max_size=60))
+def test_any_text(text: str) -> None:
+    """No text raises anything but UserError when it is read as YAML."""
+    with suppress(UserError):
+        parse_yaml(text, "here")
+
+
+LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=4))
+TREES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(LEAVES, inner, max_size=3))
+
+
+@given(st.sampled_from([RunConfig, SweepConfig, ServerConfig, ClientConfig, RelayConfig]), st.data())
+def test_any_values(kind: type[Section], data: Any) -> None:
+    """No values raise anything but UserError when they are taken as a config."""
+    keys = st.sampled_from([*kind.model_fields, "other"])
+    with suppress(UserError):
+        assert isinstance(parse_config(kind, data.draw(st.dictionaries(keys, TREES, max_size=4)), "here"), kind)
+
+
+def test_configs_do_not_change() -> None:
+    """A config that has been read is not changed any more."""
+    with pytest.raises(ValueError, match="frozen"):
+        RunConfig().seed = 2  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    "safety", [SafetyConfig(lateral_acceleration_mps2=3.1), SafetyConfig(picture_age_limit_ms=501.0)]
+)
+def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
+    """Limits beyond the defaults are for a simulated vehicle only; any other is refused with the two keys to lower."""
+    with pytest.raises(UserError, match=r"safety\.lateral_acceleration_mps2 and safety\.picture_age_limit_ms"):
+        limits_of(safety, simulated=False)
+    wide = limits_of(safety, simulated=True)
+    assert wide.lateral_acceleration_mps2 == safety.lateral_acceleration_mps2
+    assert wide.picture_age_limit_ns == safety.picture_age_limit_ms * 1e6
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_limits(simulated: bool) -> None:
+    """The defaults, and limits tighter than they are, hold for every vehicle, and no other limit can be configured."""
+    assert limits_of(SafetyConfig(), simulated=simulated) == LIMITS
+    tight = limits_of(SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0), simulated=simulated)
+    assert (tight.lateral_acceleration_mps2, tight.picture_age_limit_ns) == (2.0, 300_000_000)
+    assert tight.stop_after_ns == LIMITS.stop_after_ns
+    assert tight.stamp_memory_ns == LIMITS.stamp_memory_ns
+
+
+def test_nothing_is_delayed_by_default() -> None:
+    """Without being told, the relay holds nothing, and the clocks' error lies inside its bound."""
+    assert DelayConfig() == DelayConfig(constant_ms=0.0, jitter_median_ms=0.0, jitter_sigma=0.0)
+    assert ClocksConfig().error_us <= ClocksConfig().bound_us

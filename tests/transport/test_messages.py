@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import fields, replace
+from typing import Any
+
+import msgpack
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import PATH_POINTS, Command, SessionReply, SessionRequest, State
+from lavt.errors import BadMessage
+from lavt.streams import stream
+from lavt.transport.messages import MAX_MESSAGE_BYTES, VERSION, decode, encode
+
+AnyMessage = Command | State | SessionRequest | SessionReply
+
+COMMAND = Command(
+    epoch=7,
+    sequence=8,
+    sent_wall_ns=9,
+    stamp_ns=10,
+    stamp_received_wall_ns=11,
+    steering_rad=0.1,
+    throttle=0.2,
+    brake=0.0,
+    path_curvature_per_m=(0.01,) * PATH_POINTS,
+    mode="drive",
+    emergency_stop=0,
+)
+STATE = State(
+    sent_wall_ns=1,
+    state_mono_ns=2,
+    speed_mps=8.3,
+    steering_rad=-0.1,
+    gear="drive",
+    safety="driving",
+    because="armed",
+    applied_sequence=-1,
+    refused="",
+)
+REQUEST = SessionRequest(operation="hold", who="operator-1", instance=2**64 - 1, number=0)
+REPLY = SessionReply(
+    granted=True, because="", epoch=3, token=bytes(16), video_port=5600, host="a-b-c", emergency_stop=0
+)
+MESSAGES: dict[type, AnyMessage] = {type(each): each for each in (COMMAND, STATE, REQUEST, REPLY)}
+
+U64 = st.integers(0, 2**64 - 1)
+TIME = st.integers(0, 2**63 - 1)
+ROAD_WHEEL = st.floats(-1, 1)
+UNIT = st.floats(0, 1)
+
+
+def text(longest: int) -> st.SearchStrategy[str]:
+    return st.text(st.characters(exclude_categories=["Cs"])).filter(lambda value: len(value.encode()) <= longest)
+
+
+NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", fullmatch=True)
+COMMANDS = st.builds(
+    Command,
+    epoch=U64,
+    sequence=TIME,
+    sent_wall_ns=TIME,
+    stamp_ns=TIME,
+    stamp_received_wall_ns=TIME,
+    steering_rad=ROAD_WHEEL,
+    throttle=UNIT,
+    brake=UNIT,
+    path_curvature_per_m=st.tuples(*[ROAD_WHEEL] * PATH_POINTS),
+    mode=st.sampled_from(["arm", "drive", "stop"]),
+    emergency_stop=TIME,
+)
+STATES = st.builds(
+    State,
+    sent_wall_ns=TIME,
+    state_mono_ns=TIME,
+    speed_mps=st.floats(-100, 100),
+    steering_rad=ROAD_WHEEL,
+    gear=st.sampled_from(["park", "reverse", "neutral", "drive"]),
+    safety=st.sampled_from(["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]),
+    because=text(200),
+    applied_sequence=st.integers(-1, 2**63 - 1),
+    refused=text(200),
+)
+REQUESTS = st.builds(
+    SessionRequest,
+    operation=st.sampled_from(["hold", "release", "emergency_stop", "clear_emergency_stop"]),
+    who=NAMES,
+    instance=U64,
+    number=TIME,
+)
+REPLIES = st.builds(
+    SessionReply,
+    granted=st.booleans(),
+    because=text(200),
+    epoch=U64,
+    token=st.one_of(st.just(b""), st.binary(min_size=16, max_size=16)),
+    video_port=st.integers(0, 65535),
+    host=text(64),
+    emergency_stop=TIME,
+)
+
+
+@given(st.one_of(COMMANDS, STATES, REQUESTS, REPLIES))
+def test_round_trip(message: AnyMessage) -> None:
+    """Every message whose fields are in range is read back as it was."""
+    kind: Any = type(message)
+    assert decode(kind, encode(message)) == message
+
+
+@pytest.mark.parametrize("letter", ["a", "é", "€", "🚗"])
+def test_longest_texts_fit(letter: str) -> None:
+    """Texts as long as they may be, of letters of any size, still make a message that is read."""
+    longest = letter * (200 // len(letter.encode()))
+    message = replace(STATE, because=longest, refused=longest, sent_wall_ns=2**63 - 1, applied_sequence=2**63 - 1)
+    assert decode(State, encode(message)) == message
+    with pytest.raises(BadMessage, match="because"):
+        decode(State, encode(replace(message, because=longest + letter)))
+
+
+def test_version_comes_first() -> None:
+    """A message is a msgpack array of the version and the fields in the order of the class."""
+    values = msgpack.unpackb(encode(REQUEST))
+    assert values == [VERSION, *(getattr(REQUEST, each.name) for each in fields(REQUEST))]
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_random_bytes(kind: type[Any]) -> None:
+    """Ten thousand random byte strings raise BadMessage, each of them, and nothing else."""
+    generator = stream(1, f"random bytes {kind.__name__}")
+    for _ in range(10_000):
+        with pytest.raises(BadMessage):
+            decode(kind, generator.bytes(int(generator.integers(0, 200))))
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_damaged_messages(kind: type[Any]) -> None:
+    """A message in which a byte was changed, or of which a part is missing, is a message in range or a BadMessage."""
+    whole = encode(MESSAGES[kind])
+    generator = stream(2, f"damaged {kind.__name__}")
+    refused = 0
+    for _ in range(2_000):
+        damaged = bytearray(whole)
+        damaged[int(generator.integers(len(whole)))] = int(generator.integers(256))
+        try:
+            assert isinstance(decode(kind, bytes(damaged)), kind)
+        except BadMessage:
+            refused += 1
+    assert refused > 500
+    for length in range(len(whole)):
+        with pytest.raises(BadMessage):
+            decode(kind, whole[:length])
+
+
+NAN, INF = float("nan"), float("inf")
+NOT_AN_INTEGER: list[Any] = [True, False, 1.0, NAN, "1", b"1", None, [], {}, -(2**63)]
+NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 - 1]
+NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
+NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
+POINTS = [0.0] * PATH_POINTS
+OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
+    Command: {
+        "epoch": [*NOT_AN_INTEGER, -1],
+        "sequence": NOT_A_TIME,
+        "sent_wall_ns": NOT_A_TIME,
+        "stamp_ns": NOT_A_TIME,
+        "stamp_received_wall_ns": NOT_A_TIME,
+        "emergency_stop": NOT_A_TIME,
+        "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
+        "throttle": [*NOT_A_NUMBER, 1.0001, -0.0001],
+        "brake": [*NOT_A_NUMBER, 1.0001, -0.0001],
+        "path_curvature_per_m": [
+            None, 0.0, "0000000000", bytes(10), {}, POINTS[1:], [*POINTS, 0.0], [],
+            *([*POINTS[1:], bad] for bad in (*NOT_A_NUMBER, 1.0001, -1.0001)),
+        ],
+        "mode": [*NOT_A_TEXT, "", "fly", "Drive", "drive "],
+    },
+    State: {
+        "sent_wall_ns": NOT_A_TIME,
+        "state_mono_ns": NOT_A_TIME,
+        "speed_mps": [*NOT_A_NUMBER, 100.1, -100.1],
+        "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
+        "gear": [*NOT_A_TEXT, "", "sideways"],
+        "safety": [*NOT_A_TEXT, "", "safe"],
+        "because": [*NOT_A_TEXT, "x" * 201],
+        "applied_sequence": [*NOT_AN_INTEGER, -2, 2**63],
+        "refused": [*NOT_A_TEXT, "x" * 201],
+    },
+    SessionRequest: {
+        "operation": [*NOT_A_TEXT, "", "steal"],
+        "who": [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"],
+        "instance": [*NOT_AN_INTEGER, -1],
+        "number": NOT_A_TIME,
+    },
+    SessionReply: {
+        "granted": [0, 1, 1.0, "true", None, []],
+        "because": [*NOT_A_TEXT, "x" * 201],
+        "epoch": [*NOT_AN_INTEGER, -1],
+        "token": ["", "x" * 16, None, 0, bytes(15), bytes(17), [0] * 16],
+        "video_port": [*NOT_AN_INTEGER, -1, 65536],
+        "host": [*NOT_A_TEXT, "x" * 65],
+        "emergency_stop": NOT_A_TIME,
+    },
+}  # fmt: skip
+
+
+def wire(message: AnyMessage, **changed: Any) -> bytes:
+    values = [changed.get(each.name, getattr(message, each.name)) for each in fields(message)]
+    packed: bytes = msgpack.packb([VERSION, *values])
+    return packed
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, each.name) for kind in MESSAGES for each in fields(kind)])
+def test_every_field_is_checked(kind: type[Any], name: str) -> None:
+    """A message is refused for a field of a wrong type, not finite or out of range; true and false are no numbers."""
+    for bad in OUT_OF_RANGE[kind][name]:
+        with pytest.raises(BadMessage, match=f"{kind.__name__}.{name}"):
+            decode(kind, wire(MESSAGES[kind], **{name: bad}))
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+@pytest.mark.parametrize("version", [0, 2, -1, True, 1.0, "1", None, [1]])
+def test_other_versions(kind: type[Any], version: Any) -> None:
+    """A message whose version is not exactly the number of ours is refused."""
+    _, *values = msgpack.unpackb(encode(MESSAGES[kind]))
+    with pytest.raises(BadMessage, match="version"):
+        decode(kind, msgpack.packb([version, *values]))
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_other_shapes(kind: type[Any]) -> None:
+    """A field too many or too few, a message of another class, and what is no array at all are refused."""
+    values = msgpack.unpackb(encode(MESSAGES[kind]))
+    shapes = [[*values, 0], values[:-1], [], {1: values}, values[0], None, "x", [values]]
+    shapes += [msgpack.unpackb(encode(other)) for other_kind, other in MESSAGES.items() if other_kind is not kind]
+    for shape in shapes:
+        with pytest.raises(BadMessage):
+            decode(kind, msgpack.packb(shape))
+    with pytest.raises(BadMessage):
+        decode(kind, encode(MESSAGES[kind]) * 2)
+
+
+def test_too_long() -> None:
+    """More bytes than a message may have are refused unread."""
+    with pytest.raises(BadMessage, match=str(MAX_MESSAGE_BYTES + 1)):
+        decode(Command, encode(COMMAND).ljust(MAX_MESSAGE_BYTES + 1, b"\0"))
+
+
+BOMBS = {
+    "an array of four thousand million": b"\xdd\xff\xff\xff\xff",
+    "a map of four thousand million": b"\xdf\xff\xff\xff\xff",
+    "a text of four gigabytes": b"\xdb\xff\xff\xff\xff",
+    "bytes of four gigabytes": b"\xc6\xff\xff\xff\xff",
+    "an extension of four gigabytes": b"\xc9\xff\xff\xff\xff\x01",
+    "arrays in arrays": b"\x91" * MAX_MESSAGE_BYTES,
+    "maps in maps": b"\x81\x01" * (MAX_MESSAGE_BYTES // 2),
+    "large arrays in large arrays": b"\xdc\xff\xff" * (MAX_MESSAGE_BYTES // 3),
+}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_bombs(bomb: str) -> None:
+    """Bytes that claim to be huge or deep are refused and cost less than a megabyte."""
+    data = BOMBS[bomb].ljust(MAX_MESSAGE_BYTES, b"\x90")
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadMessage):
+            decode(Command, data)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 1_000_000

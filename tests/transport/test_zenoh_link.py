@@ -1,0 +1,340 @@
+from __future__ import annotations
+
+import json
+import queue
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import zenoh
+
+from lavt.clock import MachineClock
+from lavt.config import shipped
+from lavt.domain import Now
+from lavt.errors import UserError
+from lavt.node import Send
+from lavt.transport.zenoh_link import Router, ZenohLink, quiet_logs
+
+ARRIVES_S = 10.0
+CONFIGS = shipped("zenoh-configs")
+SESSION = CONFIGS / "session.json5"
+LOCAL = "tcp/127.0.0.1:0"
+BETWEEN = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
+QUIET = "scouting: { multicast: { enabled: false } }, adminspace: { enabled: true }"
+
+
+class Heard:
+    """What a link delivered, by channel."""
+
+    def __init__(self) -> None:
+        self.messages: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
+        self.payloads: list[Any] = []
+
+    def __call__(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        """Take a message."""
+        self.payloads.append(payload)
+        self.messages.put((channel, payload, arrived, peer))
+
+    def next(self, wanted: tuple[str, bytes], again: Callable[[], None] | None = None) -> tuple[Now, Any]:
+        """Wait for a payload on a channel; `again` repeats what may have been said too early or lost."""
+        for _ in range(100):
+            if again is not None:
+                again()
+            try:
+                channel, payload, arrived, peer = self.messages.get(timeout=ARRIVES_S / 100)
+            except queue.Empty:
+                continue
+            if (channel, payload) == wanted:
+                return arrived, peer
+        raise AssertionError(f"nothing came on {wanted}")
+
+
+def local(router: Router) -> str:
+    return next(each for each in router.locators() if each.startswith("tcp/"))
+
+
+@pytest.fixture(scope="module")
+def routers() -> Iterator[tuple[str, str]]:
+    """The shipped routers on free ports, the client's dialling the server's; gives where each side's session goes."""
+    quiet_logs()
+    with ExitStack() as stack:
+        server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, BETWEEN]})
+        stack.callback(server.close)
+        remote = next(each for each in server.locators() if each.startswith("udp/"))
+        port = remote.partition("?")[0].rpartition(":")[2]
+        client = Router(
+            CONFIGS / "router-client.json5",
+            {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]},
+        )
+        stack.callback(client.close)
+        yield local(server), local(client)
+
+
+def link(
+    side: Literal["server", "client"], heard: Heard, router: str, *, vehicle: str = "vehicle-1", who: str | None = None
+) -> ZenohLink:
+    return ZenohLink(
+        MachineClock(), heard, side=side, path=SESSION, router=router, vehicle=vehicle, who=who or f"{side}-1"
+    )
+
+
+class Pair:
+    """A server and a client of one vehicle, at work."""
+
+    def __init__(self, routers: tuple[str, str], vehicle: str) -> None:
+        self.server_heard, self.client_heard = Heard(), Heard()
+        self.server = link("server", self.server_heard, routers[0], vehicle=vehicle)
+        self.client = link("client", self.client_heard, routers[1], vehicle=vehicle)
+        self.server.start()
+        self.client.start()
+
+    def close(self) -> None:
+        """Close both links."""
+        self.client.close()
+        self.server.close()
+
+
+@pytest.fixture(scope="module")
+def pair(routers: tuple[str, str]) -> Iterator[Pair]:
+    """A server and a client, each at the router of its own side."""
+    with closing(Pair(routers, "vehicle-1")) as opened:
+        yield opened
+
+
+def test_control(pair: Pair) -> None:
+    """A command reaches the server through both routers as it was, with the time it arrived."""
+    before = MachineClock().now()
+    command = Send("control", b"\x00command")
+    arrived, _ = pair.server_heard.next(("control", b"\x00command"), lambda: pair.client.send(command))
+    assert before.mono_ns <= arrived.mono_ns <= MachineClock().now().mono_ns
+
+
+def test_state(pair: Pair) -> None:
+    """A state reaches the client through both routers as it was."""
+    pair.client_heard.next(("state", b"state\xff"), lambda: pair.server.send(Send("state", b"state\xff")))
+
+
+def test_session(pair: Pair) -> None:
+    """A client's question reaches the server, and the server's answer reaches the client who asked."""
+    question = Send("session", b"who holds?")
+    _, peer = pair.server_heard.next(("session", b"who holds?"), lambda: pair.client.send(question))
+    pair.server.send(Send("session_reply", b"you", peer))
+    pair.client_heard.next(("session_reply", b"you"))
+
+
+def test_answer_to_nobody(pair: Pair) -> None:
+    """An answer to a question that is not open any more is dropped."""
+    pair.server.send(Send("session_reply", b"late", 10**9))
+
+
+def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
+    """What is meant for one vehicle is not heard by another at the same router."""
+    with closing(Pair(routers, "vehicle-2")) as other:
+        other.server_heard.next(("control", b"for two"), lambda: other.client.send(Send("control", b"for two")))
+        pair.server_heard.next(("control", b"for one"), lambda: pair.client.send(Send("control", b"for one")))
+        assert b"for two" not in pair.server_heard.payloads
+        assert b"for one" not in other.server_heard.payloads
+
+
+@pytest.mark.usefixtures("pair")
+def test_liveliness(routers: tuple[str, str]) -> None:
+    """Who is there is known at the other side's router while the link is open, and gone when it is closed."""
+    config = zenoh.Config.from_file(str(SESSION))
+    config.insert_json5("connect/endpoints", json.dumps([routers[0]]))
+    changes: queue.Queue[tuple[str, bool]] = queue.Queue()
+    with zenoh.open(config) as session:
+        watch = session.liveliness().declare_subscriber(
+            "lavt/vehicle-1/alive/*",
+            lambda sample: changes.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
+            history=True,
+        )
+        known = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
+        assert known == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
+        visitor = link("client", Heard(), routers[1], who="visitor")
+        visitor.start()
+        assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
+        visitor.close()
+        assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", False)
+        watch.undeclare()
+
+
+def test_question_without_a_server(routers: tuple[str, str]) -> None:
+    """A question that nobody answers is no error: nothing comes back, and the link closes."""
+    heard = Heard()
+    with closing(link("client", heard, routers[1], vehicle="nobody")) as alone:
+        alone.start()
+        alone.send(Send("session", b"anybody?"))
+        alone.send(Send("control", b"into the air"))
+    assert heard.messages.empty()
+
+
+def test_send_after_close(routers: tuple[str, str]) -> None:
+    """What is sent when the session is gone is counted and not raised."""
+    closed = link("client", Heard(), routers[1], vehicle="closed")
+    closed.start()
+    closed.close()
+    for channel in ("session", "control"):
+        closed.send(Send(channel, b"x"))
+    assert closed.counts == {"session_not_sent": 1, "control_not_sent": 1}
+
+
+BAD_NAMES = ["a/b", "**", "*", "", "a" * 33, "-a", "_a", "a b", "a$*", "a#", "a?", "é", "a\n", "@"]
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_names(name: str) -> None:
+    """A vehicle or client whose name could mean something in a key is refused before anything is opened."""
+    for names in ({"vehicle": name, "who": "operator-1"}, {"vehicle": "vehicle-1", "who": name}):
+        with pytest.raises(UserError, match="1 to 32 letters"):
+            ZenohLink(MachineClock(), Heard(), side="client", path=SESSION, router="tcp/127.0.0.1:1", **names)
+
+
+def is_a_sentence(error: pytest.ExceptionInfo[UserError]) -> bool:
+    text = str(error.value)
+    return "\n" not in text and ".rs" not in text and "Location" not in text and len(text) < 1000
+
+
+def free_port() -> int:
+    with socket.socket() as opened:
+        opened.bind(("127.0.0.1", 0))
+        port: int = opened.getsockname()[1]
+    return port
+
+
+def test_no_router() -> None:
+    """Where no router answers, the sentence names the endpoint and the command that starts one."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
+        link("server", Heard(), endpoint)
+    assert is_a_sentence(error)
+
+
+@pytest.mark.parametrize("endpoint", ["nonsense", "foo/127.0.0.1:1", "tcp/127.0.0.1", "tcp/127.0.0.1:99999"])
+def test_bad_endpoint(endpoint: str) -> None:
+    """An endpoint that is none is refused in a sentence that names it."""
+    with pytest.raises(UserError, match=endpoint) as error:
+        link("server", Heard(), endpoint)
+    assert is_a_sentence(error)
+
+
+ROUTER_PROBLEMS = {
+    "unknown key": (f'{{ mode: "router", lisen: {{}}, {QUIET} }}', "unknown field `lisen`"),
+    "wrong mode": ('{ mode: "routr" }', "unknown variant `routr`"),
+    "wrong type": (f'{{ mode: "router", listen: {{ endpoints: 5 }}, {QUIET} }}', "invalid type"),
+    "not JSON5": ('{ mode: "router', "not a Zenoh config"),
+    "empty": ("", "not a Zenoh config"),
+    "mode of a session": (f'{{ mode: "client", {QUIET} }}', 'mode: "router"'),
+    "no mode": (f"{{ {QUIET} }}", 'mode: "router"'),
+    "no listen endpoints": (f'{{ mode: "router", {QUIET} }}', "names no listen endpoints"),
+    "an empty list": (f'{{ mode: "router", listen: {{ endpoints: [] }}, {QUIET} }}', "names no listen endpoints"),
+    "endpoints of a peer": (
+        f'{{ mode: "router", listen: {{ endpoints: {{ peer: ["{LOCAL}"] }} }}, {QUIET} }}', "names no listen endpoints",
+    ),
+    "no admin space": (f'{{ mode: "router", listen: {{ endpoints: ["{LOCAL}"] }} }}', "adminspace"),
+    "unknown protocol": (f'{{ mode: "router", listen: {{ endpoints: ["foo/127.0.0.1:0"] }}, {QUIET} }}', "foo"),
+    "address of nobody": (f'{{ mode: "router", listen: {{ endpoints: ["tcp/192.0.2.1:0"] }}, {QUIET} }}', "192.0.2.1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("problem", ROUTER_PROBLEMS)
+def test_bad_router_config(problem: str, tmp_path: Path) -> None:
+    """A router's config that is wrong is refused in one sentence that names the file and says what is wrong."""
+    text, said = ROUTER_PROBLEMS[problem]
+    path = tmp_path / "router.json5"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"router\.json5") as error:
+        Router(path, {})
+    assert said in str(error.value)
+    assert is_a_sentence(error)
+
+
+def test_bytes_that_are_no_text(tmp_path: Path) -> None:
+    """A file that is no text is refused in a sentence."""
+    path = tmp_path / "router.json5"
+    path.write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(UserError, match=r"router\.json5") as error:
+        Router(path, {})
+    assert is_a_sentence(error)
+
+
+@pytest.mark.parametrize("name", ["nothing.json5", "."])
+def test_missing_file(name: str, tmp_path: Path) -> None:
+    """A file that is not there is named, and so is where the shipped ones are."""
+    with pytest.raises(UserError, match=r"there is no Zenoh config .*zenoh-configs/"):
+        Router(tmp_path / name, {})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("lisen/endpoints", ["x"]),
+        ("listen/endpoints", 5),
+        ("listen/endpoints", {1, 2}),
+        ("transport/unicast/open_timeout", "long"),
+        ("mode", float("nan")),
+    ],
+)
+def test_bad_change(key: str, value: Any) -> None:
+    """A change that the config cannot take is named as the user wrote it, with dots."""
+    with pytest.raises(UserError, match=key.replace("/", r"\.")) as error:
+        Router(CONFIGS / "router-server.json5", {key: value})
+    assert is_a_sentence(error)
+
+
+def test_port_in_use() -> None:
+    """A router whose port another program has is refused in a sentence that names the port."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(UserError, match=endpoint) as error:
+            Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]})
+    assert is_a_sentence(error)
+
+
+OPENED = {
+    "router-server.json5": {"listen/endpoints": [LOCAL, BETWEEN]},
+    "router-client.json5": {"listen/endpoints": [LOCAL]},
+    "session.json5": None,
+}
+"""Changes that put a shipped router on a free port; None: it is a session, opened at the router of the tests."""
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
+def test_shipped_configs(name: str, routers: tuple[str, str]) -> None:
+    """Every file of zenoh-configs/ is one that Zenoh opens."""
+    changes = OPENED[name]
+    if changes is None:
+        link("server", Heard(), routers[0], vehicle="shipped").close()
+        return
+    with closing(Router(CONFIGS / name, changes)) as router:
+        assert len(router.locators()) >= len(changes["listen/endpoints"])
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
+def test_shipped_configs_are_careful(name: str) -> None:
+    """No shipped config looks for others by multicast or gossip, or stamps messages with a clock of its own."""
+    config = zenoh.Config.from_file(str(CONFIGS / name))
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+    assert json.loads(config.get_json("scouting/gossip/enabled")) is False
+    assert json.loads(config.get_json("timestamping/enabled")) is False
+
+
+def test_one_side_dials() -> None:
+    """Of the two shipped routers only the client's dials, and both ends of the link between them say the same of it."""
+    endpoints = {
+        (side, way): json.loads(
+            zenoh.Config.from_file(str(CONFIGS / f"router-{side}.json5")).get_json(f"{way}/endpoints")
+        )
+        for side in ("server", "client")
+        for way in ("listen", "connect")
+    }
+    assert endpoints["server", "connect"] == []
+    (dialled,) = endpoints["client", "connect"]
+    listened = next(each for each in endpoints["server", "listen"] if each.startswith("udp/"))
+    for endpoint in (dialled, listened):
+        assert set(endpoint.partition("?")[2].split(";")) == {"rel=1", "mixed_rel=1"}
+    assert all(each.startswith("tcp/127.0.0.1:") for each in endpoints["client", "listen"])
