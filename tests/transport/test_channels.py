@@ -14,7 +14,7 @@ from lavt.domain import Now
 from lavt.node import WAKE, Node
 from lavt.transport.channels import CHANNELS, QUEUE_LENGTH
 
-OUTSIDE_OF_THE_NODES = {"clock_source", "runtime"}
+OUTSIDE_OF_THE_NODES = {"clock_source", "operator", "runtime"}
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_what_nodes_send(nodes: Sequence[Node]) -> None:
 
 
 def test_table_names_nodes(nodes: Sequence[Node]) -> None:
-    """Senders and receivers in the table are names of nodes, of the runtime or of the host's source of time."""
+    """Senders and receivers in the table are names of nodes, of the runtime, of the source of time or of a person."""
     names = {node.name for node in nodes}
     assert {row.sender for row in CHANNELS.values()} <= names | OUTSIDE_OF_THE_NODES
     assert set(chain.from_iterable(row.receivers for row in CHANNELS.values())) == names
