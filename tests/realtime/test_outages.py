@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +27,9 @@ AGAIN_S = 20.0
 """Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
 MARGIN_S = 0.5
 """For brakes that build up and a machine that is busy."""
+LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
+LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
+"""The client hears 75 ms late that the vehicle has stopped: until then it commands on under the old epoch."""
 OBEYS_EVERYTHING = Path(__file__).with_name("server_that_obeys_everything.py")
 
 
@@ -44,6 +47,7 @@ class Drive:
     clock: MachineClock = field(default_factory=MachineClock)
 
     def start(self) -> None:
+        """Start everything; the client arms again by itself."""
         self.loop = start_loop(
             self.processes, self.planned, self.work, self.work,
             rearm=True, once=False, server_program=self.server_program,
@@ -52,37 +56,45 @@ class Drive:
         self.client_router = self.loop.client_router
 
     def reach(self, speed_mps: float) -> None:
+        """Wait until the vehicle is driven, and this fast."""
+
         def reached() -> bool:
             told = self.loop.server.latest.get("status", {})
             phase = self.client.latest.get("status", {}).get("phase")
-            return told.get("safety") == "driving" and phase == "driving" and told["speed_mps"] >= speed_mps
+            return (told.get("safety"), phase) == ("driving", "driving") and bool(told["speed_mps"] >= speed_mps)
 
         self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, AGAIN_S)
 
     def breaks(self, name: str) -> None:
+        """Note that an outage begins."""
         self.broken[name] = self.clock.now()
 
     def suspend(self, name: str, process: Process, duration_s: float) -> None:
+        """Let a process stand still for a while."""
         self.breaks(name)
         process.popen.send_signal(signal.SIGSTOP)
         pause(round(duration_s * NS_PER_S))
         process.popen.send_signal(signal.SIGCONT)
 
     def kill(self, name: str, process: Process) -> None:
+        """End a process with SIGKILL."""
         self.breaks(name)
         process.popen.kill()
 
     def restart_the_router(self, after_s: float) -> None:
+        """Start the client's router again, on the same port."""
         pause(round(after_s * NS_PER_S))
         self.client_router, _ = start_client_router(self.processes, self.loop.dialled, self.loop.router)
 
     def start_another_client(self) -> None:
+        """Start a new client, as somebody would after a crash."""
         pause(NS_PER_S)
         self.client = self.processes.start(
             "client-2", "client", str(self.work / "client.yaml"), "--out", str(self.work / "client-2")
         )
 
     def end(self) -> None:
+        """Press Ctrl-C on both sides."""
         for name, process in (("client", self.client), ("server", self.loop.server)):
             process.end()
             self.codes[name] = process.popen.returncode
@@ -101,11 +113,11 @@ def everything_but_the_clients_death(drive: Drive, speed_mps: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Iterator[Drive]:
+def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
     """One drive with all outages, one after the other, the server's death last."""
     work = tmp_path_factory.mktemp("outages")
     with Processes(work) as processes:
-        drive = Drive(processes, work, wait_until, planned("vehicle.scenery=none"))
+        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
         drive.start()
         everything_but_the_clients_death(drive, 6.0)
         drive.reach(7.0)
@@ -115,20 +127,20 @@ def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: P
         drive.kill("server killed", drive.loop.server)
         pause(CLIENT_LIMITS.no_picture_stop_ns + NS_PER_S)
         drive.end()
-    yield drive
+    return drive
 
 
 @pytest.fixture(scope="module")
-def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Iterator[Drive]:
+def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
     """The same outages, with a server that obeys whatever it can read."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
-        drive = Drive(processes, work, wait_until, planned("vehicle.scenery=none"), (str(OBEYS_EVERYTHING),))
+        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(OBEYS_EVERYTHING),))
         drive.start()
         everything_but_the_clients_death(drive, 4.0)
         drive.reach(1.0)
         drive.end()
-    yield drive
+    return drive
 
 
 @pytest.fixture(scope="module")
