@@ -30,7 +30,8 @@ class UdpLink:
     """A UDP socket and a thread that receives.
 
     `channel` names what comes in. `peer` of what goes out is an address, or for a client, whose server is known by
-    `remote`, the port (0: the one in `remote`).
+    `remote`, the port (0: the one in `remote`). A client hears its server only: what comes from elsewhere is counted,
+    not delivered. Raises `UserError` for a port that cannot be opened and a host that is not known.
     """
 
     def __init__(
@@ -46,7 +47,8 @@ class UdpLink:
         self._clock = clock
         self._channel = channel
         self._deliver = deliver
-        self._remote = remote
+        self._remote = None if remote is None else (_look_up(remote[0]), remote[1])
+        self._server: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -73,7 +75,7 @@ class UdpLink:
         """Send a datagram; what the network refuses is counted."""
         address = send.peer
         if self._remote is not None:
-            address = (self._remote[0], self._remote[1] or send.peer)
+            address = self._server = (self._remote[0], self._remote[1] or send.peer)
         try:
             self._socket.sendto(send.payload, address)
         except OSError:
@@ -97,6 +99,9 @@ class UdpLink:
             except OSError:  # an ICMP error of an earlier datagram
                 self.counts["datagrams_refused"] += 1
                 continue
+            if self._remote is not None and address != self._server:
+                self.counts["datagrams_from_strangers"] += 1
+                continue
             self._deliver(self._channel, datagram, self._arrival(ancillary), address)
 
     def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> Now:
@@ -109,3 +114,11 @@ class UdpLink:
                 if 0 <= queued_ns < QUEUED_LONGEST_NS:
                     return now.later(-queued_ns)
         return now
+
+
+def _look_up(host: str) -> str:
+    """Look a host up, once: no datagram waits for a name server, and senders are compared by their numbers."""
+    try:
+        return socket.gethostbyname(host)
+    except OSError as error:
+        raise UserError(f"the host {host!r} of the video is not known ({error.strerror}): correct it") from error
