@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from lavt.clock import MachineClock, pause
-from lavt.control.limits import CLIENT_LIMITS, LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import LAVT, Process, Processes
@@ -19,6 +18,13 @@ from lavt.experiment.table import Table
 
 Wait = Callable[[str, Callable[[], bool], float], None]
 Plan = Callable[..., PlannedRun]
+
+STOP_AFTER_NS = 500 * NS_PER_MS
+STOP_MPS2 = 4.0
+STANDSTILL_MPS = 0.05
+BRAKE_AFTER_NS = 300 * NS_PER_MS
+ASK_FOR_STOP_AFTER_NS = 2500 * NS_PER_MS
+"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
 
 OUTAGE_S = 3.0
 STALL_S = 1.2
@@ -125,7 +131,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: P
         drive.start_another_client()
         drive.reach(3.0)
         drive.kill("server killed", drive.loop.server)
-        pause(CLIENT_LIMITS.no_picture_stop_ns + NS_PER_S)
+        pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
         drive.end()
     return drive
 
@@ -200,11 +206,11 @@ def test_the_vehicle_stands_within_the_limits_of_the_design(drive: Drive, server
     at_ns, speed_mps = truth.ints("mono_ns"), truth.floats("speed_mps")
     silence_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
     speed_at_stop_mps = speed_mps[np.searchsorted(at_ns, stop.mono_ns)]
-    stands = (at_ns > stop.mono_ns) & (speed_mps < LIMITS.standstill_mps)
+    stands = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
     stopping_s = (at_ns[stands][0] - stop.mono_ns) / NS_PER_S
 
-    assert LIMITS.stop_after_ns <= silence_ns <= LIMITS.stop_after_ns + 100 * NS_PER_MS
-    assert stopping_s <= speed_at_stop_mps / LIMITS.stop_deceleration_mps2 + MARGIN_S
+    assert STOP_AFTER_NS <= silence_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
+    assert stopping_s <= speed_at_stop_mps / STOP_MPS2 + MARGIN_S
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
@@ -217,7 +223,7 @@ def test_the_vehicle_stays_where_it_stopped_until_it_is_armed_anew(drive: Drive,
     speeds_mps = truth.where((at_ns > stop.mono_ns + 200 * NS_PER_MS) & (at_ns < armed.mono_ns)).floats("speed_mps")
 
     assert np.all(np.diff(speeds_mps) < 0.01)
-    assert speeds_mps[-1] < LIMITS.standstill_mps
+    assert speeds_mps[-1] < STANDSTILL_MPS
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
@@ -257,16 +263,13 @@ def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive)
     commands = record.table("control")
     since_ns = commands.mono_ns - last_ns
     slack_ns = 50 * NS_PER_MS
-    braking = commands.where(
-        (since_ns > CLIENT_LIMITS.no_picture_brake_ns + slack_ns)
-        & (since_ns < CLIENT_LIMITS.no_picture_stop_ns - slack_ns)
-    )
-    stopping = commands.where(since_ns > CLIENT_LIMITS.no_picture_stop_ns + slack_ns)
+    braking = commands.where((since_ns > BRAKE_AFTER_NS + slack_ns) & (since_ns < ASK_FOR_STOP_AFTER_NS - slack_ns))
+    stopping = commands.where(since_ns > ASK_FOR_STOP_AFTER_NS + slack_ns)
 
     assert drive.codes["client"] == 0
     assert record.complete
     assert len(braking) > 50
-    assert np.all(braking.floats("brake") >= CLIENT_LIMITS.brake)
+    assert np.all(braking.floats("brake") >= 0.6)
     assert np.all(braking.floats("throttle") == 0)
     assert set(braking.texts("mode")) == {"drive"}
     assert len(stopping) > 20
