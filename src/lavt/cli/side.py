@@ -120,7 +120,9 @@ class Side:
             self.runtime.stop()
         if self._udp is not None:
             self._udp.close()
+            self.tap.write("counts", {"link": "video", **self._udp.counts}, self.clock.now())
         self._zenoh.close()
+        self.tap.write("counts", {"link": "zenoh", **self._zenoh.counts}, self.clock.now())
         if self._queue is not None and self._writer is not None:
             self._queue.close(self.clock.now())
             self._writer.close()

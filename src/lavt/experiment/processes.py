@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,12 +19,14 @@ from lavt.errors import WorkError
 READY_S = 60.0
 """Importing and preparing takes 1 to 5 s on a quiet machine."""
 END_S = 15.0
+LAVT = ("-m", "lavt")
+"""What Python runs: the installed program. Tests give a program of their own that breaks a part on purpose."""
 
 
 class Process:
     """`lavt ARGUMENTS --json`, its JSON lines on standard output, its messages in a log file."""
 
-    def __init__(self, name: str, arguments: list[str], log_dir: Path) -> None:
+    def __init__(self, name: str, arguments: Sequence[str], log_dir: Path, program: Sequence[str] = LAVT) -> None:
         self.name = name
         self.latest: dict[str, Any] = {}
         """Newest line."""
@@ -31,7 +34,7 @@ class Process:
         self._first: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with self._log.open("wb") as log:
             self.popen = subprocess.Popen(  # noqa: S603 (our own program)
-                [sys.executable, "-m", "lavt", *arguments, "--json"],
+                [sys.executable, *program, *arguments, "--json"],
                 stdout=subprocess.PIPE,
                 stderr=log,
                 stdin=subprocess.DEVNULL,
@@ -99,9 +102,9 @@ class Processes:
         self.started: list[Process] = []
         self._log_dir = log_dir
 
-    def start(self, name: str, *arguments: str) -> Process:
+    def start(self, name: str, *arguments: str, program: Sequence[str] = LAVT) -> Process:
         """Start one."""
-        process = Process(name, list(arguments), self._log_dir)
+        process = Process(name, arguments, self._log_dir, program)
         self.started.append(process)
         return process
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,14 +19,14 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.network import injected_network
 from lavt.experiment.plan import PlannedRun
-from lavt.experiment.processes import Process, Processes
+from lavt.experiment.processes import LAVT, Process, Processes
 from lavt.experiment.sides import client_config, server_config
 from lavt.experiment.validity import injection_reasons
 from lavt.experiment.virtual_run import read_costs
 from lavt.transport.delay import DelayLaw
 
 LOCAL_TCP = "tcp/127.0.0.1:0"
-LOCAL_UDP = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
+SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_S = 40
 """The drive has begun by then, or the run has failed."""
 LONGEST_S = 900
@@ -45,15 +45,31 @@ class Loop:
     relay: Process | None
     client_router: Process
     client: Process
+    router: str
+    """Endpoint of the client's router: for whoever else is on the client's machine."""
+    dialled: str
+    """Endpoint that the client's router dials: the server's router, or the relay in front of it."""
 
 
-def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path, *, rearm: bool = False) -> Loop:
-    """Start everything in order, each part told the ports of those before; records go into `out`."""
+def start_loop(
+    processes: Processes,
+    planned: PlannedRun,
+    out: Path,
+    work: Path,
+    *,
+    rearm: bool = False,
+    once: bool = True,
+    server_program: Sequence[str] = LAVT,
+) -> Loop:
+    """Start everything in order, each part told the ports of those before; records go into `out`.
+
+    Without `once` the server stays after the first drive's end.
+    """
     run = planned.config
-    server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", [])
+    server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
     server = processes.start(
-        "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)), "--once",
-        "--out", str(out / "server"),
+        "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)),
+        *(["--once"] if once else []), "--out", str(out / "server"), program=server_program,
     )  # fmt: skip
     video_port = server.ready()["ready"]["video_port"]
     relay = None
@@ -65,12 +81,18 @@ def start_loop(processes: Processes, planned: PlannedRun, out: Path, work: Path,
         ports = relay.ready()["ports"]
         video_port, control_port = ports["video"], ports["control"]
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
-    client_router, local, _ = _start_router(processes, "client-router", "router-client.json5", [dialled])
+    client_router, local = start_client_router(processes, dialled)
     config = client_config(run, router=local, video_port=video_port)
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
     client.ready()
-    return Loop(server_router, server, relay, client_router, client)
+    return Loop(server_router, server, relay, client_router, client, local, dialled)
+
+
+def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
+    """Start the client's router and tell its endpoint; naming that in `listen` starts it again where it was."""
+    router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
+    return router, local
 
 
 def drive_real(
@@ -121,9 +143,10 @@ def _as_injected(planned: PlannedRun, relay: Process | None) -> list[str]:
     return injection_reasons(asked, {name: None if late[name] is None else asked[name] + late[name] for name in late})
 
 
-def _start_router(processes: Processes, name: str, file: str, dialled: list[str]) -> tuple[Process, str, str]:
-    """Start a router on free ports and tell its local and, for the server's, its remote endpoint."""
-    listen = [LOCAL_TCP] if dialled else [LOCAL_TCP, LOCAL_UDP]
+def _start_router(
+    processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
+) -> tuple[Process, str, str]:
+    """Start a router and tell its local and, for the server's, its remote endpoint."""
     endpoints = {"listen": listen, "connect": dialled}
     changes = [part for key, each in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(each)}")]
     router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)

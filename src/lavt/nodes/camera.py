@@ -60,7 +60,7 @@ class CameraNode:
         start_ns: int,
         send_to: Sequence[tuple[str, int]] = (),
     ) -> None:
-        self.counts: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._camera = camera
         self._encoder = encoder
         self._packetizer = packetizer
@@ -84,6 +84,18 @@ class CameraNode:
             "feedback": (("feedback", self._hear),),
         }
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was counted here, and what the video's path has refused."""
+        path = self._path
+        return {
+            **self._counts,
+            "path_malformed": path.malformed,
+            "path_wrong_token": path.wrong_token,
+            "path_wrong_address": path.wrong_address,
+            "path_stale": path.stale,
+        }
+
     def next_wake_ns(self) -> int:
         """When the next frame is due."""
         return self._due_ns(self._next_frame)
@@ -95,13 +107,13 @@ class CameraNode:
         number = self._next_frame
         while self._due_ns(number + 1) <= now.mono_ns:
             number += 1
-        self.counts["frames_skipped"] += number - self._next_frame
+        self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame = number + 1
         due_ns = self._due_ns(number)
         pose = next((pose for pose in reversed(self._poses) if pose.mono_ns <= due_ns), None)
         frame = self._camera.capture(number, due_ns, pose)
         if frame is None:
-            self.counts["frames_missing"] += 1
+            self._counts["frames_missing"] += 1
         return frame
 
     def _stamp(self, frame: CapturedFrame, now: Now) -> Stamped:
@@ -117,7 +129,7 @@ class CameraNode:
         keyframe = self._keyframe_wanted and now.mono_ns - self._keyframe_ns >= KEYFRAME_PAUSE_NS
         if keyframe:
             self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
-            self.counts["keyframes_on_request"] += 1
+            self._counts["keyframes_on_request"] += 1
         return Encoded(stamped, stamped.stamp_ns, self._encoder.encode(stamped.picture, keyframe=keyframe))
 
     def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:
@@ -125,8 +137,8 @@ class CameraNode:
         packets = self._packetizer.packetize(unit, rtp_timestamp(encoded.stamp_ns))
         proven = self._path.open_address(now.mono_ns)
         addresses = self._send_to if proven is None else (proven, *self._send_to)
-        self.counts["frames_sent"] += 1
-        self.counts["frames_without_receiver"] += not addresses
+        self._counts["frames_sent"] += 1
+        self._counts["frames_without_receiver"] += not addresses
         frame = FrameWritten(
             stamped.frame.number, encoded.stamp_ns, stamped.stamped_mono_ns, stamped.frame.capture_ns,
             stamped.pixel_crc, len(unit),
@@ -147,12 +159,12 @@ class CameraNode:
             answer = self._path.receive(message.payload, message.peer, now.mono_ns)
             return None if answer is None else [Send("rtp", answer, message.peer)]
         if not self._path.rtcp_admitted(message.peer):
-            self.counts["feedback_from_strangers"] += 1
+            self._counts["feedback_from_strangers"] += 1
             return None
         try:
             feedback = parse_feedback(message.payload)
         except BadPacket:
-            self.counts["feedback_unreadable"] += 1
+            self._counts["feedback_unreadable"] += 1
             return None
         self._path.report(message.peer, now.mono_ns)
         self._keyframe_wanted |= feedback.picture_loss

@@ -87,7 +87,7 @@ class Relay:
 
     def __init__(self, clock: Clock, flows: list[Flow]) -> None:
         self._clock = clock
-        self._selector = selectors.DefaultSelector()
+        self._selector = selectors.SelectSelector()  # epoll's timeouts are whole milliseconds, rounded up
         self._heap: list[tuple[int, int, _Way]] = []
         self._number = 0
         self.not_sent = 0

@@ -30,7 +30,8 @@ class UdpLink:
     """A UDP socket and a thread that receives.
 
     `channel` names what comes in. `peer` of what goes out is an address, or for a client, whose server is known by
-    `remote`, the port (0: the one in `remote`).
+    `remote`, the port (0: the one in `remote`). A client hears its server only: what comes from elsewhere is counted,
+    not delivered. Raises `UserError` for a port that cannot be opened and a host that is not known.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class UdpLink:
         self._channel = channel
         self._deliver = deliver
         self._remote = None if remote is None else (_resolved(remote[0]), remote[1])
+        self._server: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -73,7 +75,7 @@ class UdpLink:
         """Send a datagram; what the network refuses is counted."""
         address = send.peer
         if self._remote is not None:
-            address = (self._remote[0], self._remote[1] or send.peer)
+            address = self._server = (self._remote[0], self._remote[1] or send.peer)
         try:
             self._socket.sendto(send.payload, address)
         except OSError:
@@ -96,6 +98,9 @@ class UdpLink:
                 datagram, ancillary, _flags, address = self._socket.recvmsg(LONGEST_DATAGRAM, 64)
             except OSError:  # an ICMP error of an earlier datagram
                 self.counts["datagrams_refused"] += 1
+                continue
+            if self._remote is not None and address != self._server:
+                self.counts["datagrams_from_strangers"] += 1
                 continue
             self._deliver(self._channel, datagram, self._arrival(ancillary), address)
 

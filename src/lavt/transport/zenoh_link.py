@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,6 +27,8 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 ROUTER_READY_S = 5.0
+QUERIES_KEPT = 64
+"""So many queries wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
 CONTROL: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
@@ -139,6 +142,7 @@ class ZenohLink:
         self._base = f"lavt/{check_name('the vehicle', vehicle)}"
         self._who = check_name("the client", who)
         self._queries: dict[int, zenoh.Query] = {}
+        self._queries_lock = threading.Lock()
         self._number = itertools.count()
         config = _load(path, {"connect/endpoints": [router]} if router else {})
         endpoints = json.loads(config.get_json("connect/endpoints"))
@@ -199,13 +203,16 @@ class ZenohLink:
     def _asked(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         number = next(self._number)
-        self._queries[number] = query
-        while len(self._queries) > 64:  # nobody answers what cannot be read: let the oldest go
-            self._queries.pop(next(iter(self._queries))).drop()
+        with self._queries_lock:
+            self._queries[number] = query
+            oldest = self._queries.pop(next(iter(self._queries))) if len(self._queries) > QUERIES_KEPT else None
+        if oldest is not None:
+            oldest.drop()
         self._deliver("session", payload, self._clock.now(), number)
 
     def _reply(self, number: int, payload: bytes) -> None:
-        query = self._queries.pop(number, None)
+        with self._queries_lock:
+            query = self._queries.pop(number, None)
         if query is not None:
             query.reply(f"{self._base}/session", payload)
             query.drop()

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from lavt.clock import MachineClock, pause
+from lavt.config import shipped
+from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Command, SessionRequest
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.processes import Process, Processes
+from lavt.experiment.real_run import start_loop
+from lavt.experiment.record import Record, read_record
+from lavt.experiment.table import MISSING
+from lavt.streams import stream
+from lavt.transport.messages import encode
+
+DATAGRAMS = 10_000
+"""At each of the two video ports."""
+SENT_AT_ONCE = 50
+ROUNDS = DATAGRAMS // SENT_AT_ONCE
+ROUND_NS = 25 * NS_PER_MS
+GARBAGE_PER_ROUND = 5
+"""On each of the two keys: 200 Hz."""
+ENDED_WITHIN_S = 5.0
+
+COMMAND = Command(1, 2**40, 0, 0, 0, 0.1, 1.0, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
+BEGINNINGS = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x01")
+"""Of nothing, of RTP, of a receiver report, of a picture-loss request, of a hello."""
+REQUEST = SessionRequest("hold", "stranger", 7, 0)
+
+
+def udp_port(process: Process) -> int:
+    """Port of the only UDP socket of a process (proc(5))."""
+    files = Path(f"/proc/{process.popen.pid}/fd").iterdir()
+    sockets = {str(file.readlink()).removeprefix("socket:[").rstrip("]") for file in files}
+    lines = (line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:])
+    (port,) = {int(fields[1].rpartition(":")[2], 16) for fields in lines if fields[9] in sockets}
+    return port
+
+
+class Hostile:
+    """Somebody who can reach all ports and the client's router, and who listens to what he may not answer."""
+
+    def __init__(self, router: str, ports: tuple[int, int]) -> None:
+        self._chance = stream(1, "hostile")
+        self._ports = ports
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.received = 0
+        config = zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5")))
+        config.insert_json5("connect/endpoints", f'["{router}"]')
+        self._session = zenoh.open(config)
+        self._heard: list[bytes] = []
+        listener: Any = zenoh.handlers.Callback(
+            lambda sample: self._heard.append(sample.payload.to_bytes()), indirect=False
+        )
+        self._listening = self._session.declare_subscriber("lavt/vehicle-1/control", listener)
+
+    def attack(self) -> None:
+        """Send one round of everything."""
+        for port in self._ports:
+            for _ in range(SENT_AT_ONCE):
+                self.socket.sendto(self._datagram(), ("127.0.0.1", port))
+        for _ in range(GARBAGE_PER_ROUND):
+            self._session.put("lavt/vehicle-1/control", self._garbage(COMMAND))
+            nobody: Any = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
+            self._session.get("lavt/vehicle-1/session", nobody, payload=self._garbage(REQUEST), timeout=1.0)
+        self._count_received()
+
+    def close(self) -> None:
+        """Leave."""
+        pause(NS_PER_S // 2)
+        self._count_received()
+        self.socket.close()
+        self._session.close()
+
+    def _datagram(self) -> bytes:
+        """Random bytes, which begin as RTP, as RTCP, as a hello or as nothing."""
+        begin = BEGINNINGS[self._chance.integers(len(BEGINNINGS))]
+        return begin + self._chance.bytes(int(self._chance.choice([0, 8, 32, 200, 1200])))
+
+    def _garbage(self, message: Command | SessionRequest) -> bytes:
+        """Random bytes, a cut message, one with a flipped bit, or a real command once more.
+
+        A command whose flipped bit is in the last byte would ask for an emergency stop, and get it.
+        """
+        data = bytearray(encode(message))
+        at = int(self._chance.integers(1, len(data) - 1))
+        kind = self._chance.choice(["random", "cut", "flipped", "again"])
+        if kind == "random":
+            return self._chance.bytes(at)
+        if kind == "cut":
+            return bytes(data[:at])
+        if kind == "again" and isinstance(message, Command) and self._heard:
+            return self._heard[-1 - int(self._chance.integers(min(100, len(self._heard))))]
+        data[at] ^= 1 << int(self._chance.integers(8))
+        return bytes(data)
+
+    def _count_received(self) -> None:
+        while True:
+            try:
+                self.socket.recv(65_535)
+            except BlockingIOError:
+                return
+            self.received += 1
+
+
+@pytest.fixture(scope="module")
+def attacked(
+    tmp_path_factory: pytest.TempPathFactory,
+    wait_until: Callable[[str, Callable[[], bool], float], None],
+    planned: Callable[..., PlannedRun],
+) -> SimpleNamespace:
+    """Give a drive that was attacked for some seconds, and then ended by Ctrl-C on both sides."""
+    work = tmp_path_factory.mktemp("attacked")
+    clock = MachineClock()
+    with Processes(work) as processes:
+        loop = start_loop(processes, planned("vehicle.scenery=none"), work, work, once=False)
+        wait_until("somebody drives", lambda: loop.server.latest.get("status", {}).get("safety") == "driving", 20.0)
+        hostile = Hostile(loop.router, (udp_port(loop.server), udp_port(loop.client)))
+        began_ns = clock.now().mono_ns
+        for number in range(ROUNDS):
+            hostile.attack()
+            pause(began_ns + (number + 1) * ROUND_NS - clock.now().mono_ns)
+        ended_ns = clock.now().mono_ns
+        hostile.close()
+        status = loop.server.latest["status"]
+        took_s = {}
+        for process in (loop.client, loop.server):
+            told_ns = clock.now().mono_ns
+            process.end()
+            took_s[process.name] = (clock.now().mono_ns - told_ns) / NS_PER_S
+        return SimpleNamespace(
+            began_ns=began_ns,
+            ended_ns=ended_ns,
+            received=hostile.received,
+            status=status,
+            took_s=took_s,
+            codes=[each.popen.returncode for each in (loop.client, loop.server)],
+            server=read_record(work / "server" / "server.mcap"),
+            client=read_record(work / "client" / "client.mcap"),
+        )
+
+
+def counted(record: Record, name: str) -> int:
+    values = record.table("counts").ints(name)
+    return int(np.sum(values[values != MISSING]))
+
+
+def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace) -> None:
+    """Under 10 000 random datagrams at each video port and garbage at 200 Hz on both keys the vehicle is driven on."""
+    admissions = attacked.server.table("admission")
+    obeyed = admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    at_ns = obeyed.ints("received_mono_ns")
+    meanwhile = obeyed.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
+    age_ms = (meanwhile.ints("received_wall_ns") - meanwhile.ints("stamp_ns")) / NS_PER_MS
+
+    assert attacked.status["safety"] == "driving"
+    assert np.median(age_ms) < 60
+    assert len(np.unique(meanwhile.ints("stamp_ns"))) > 0.8 * 30 * (attacked.ended_ns - attacked.began_ns) / NS_PER_S
+
+
+def test_nothing_of_a_stranger_is_obeyed(attacked: SimpleNamespace) -> None:
+    """No command of another epoch and no command a second time is obeyed, and no stranger gets the vehicle."""
+    admissions = attacked.server.table("admission")
+    obeyed = admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    sessions = [detail for detail in attacked.server.table("event").texts("detail") if "stranger" in detail]
+
+    assert len(set(obeyed.objects("epoch"))) == 1
+    assert np.all(np.diff(obeyed.ints("sequence")) > 0)
+    assert sessions
+    assert all("refused" in detail for detail in sessions)
+
+
+def test_pictures_are_not_spoilt_by_strangers(attacked: SimpleNamespace) -> None:
+    """Nothing that a stranger sends to the client's video port gets into the pictures: none is lost or in doubt."""
+    pictures = attacked.client.table("picture")
+    at_ns = pictures.ints("read_mono_ns")
+    meanwhile = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
+
+    assert np.mean(meanwhile.flags("readable")) > 0.99
+    assert np.mean(meanwhile.flags("in_doubt")) < 0.05
+
+
+def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace) -> None:
+    """The counters of both sides tell of the datagrams and messages that were refused."""
+    server, client = attacked.server, attacked.client
+    at_the_server = sum(
+        counted(server, name) for name in ("feedback_from_strangers", "path_malformed", "path_wrong_token")
+    )
+
+    assert at_the_server > 0.9 * DATAGRAMS
+    assert counted(client, "datagrams_from_strangers") > 0.9 * DATAGRAMS
+    assert counted(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
+    assert counted(server, "session_requests_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
+
+
+def test_no_stranger_gets_video(attacked: SimpleNamespace) -> None:
+    """Whoever knows no token gets not a single datagram back."""
+    assert attacked.received == 0
+
+
+def test_ctrl_c_ends_both_sides_in_order(attacked: SimpleNamespace) -> None:
+    """SIGINT in the middle of a drive ends `lavt server` and `lavt client` soon, with 0 and with complete records."""
+    assert attacked.codes == [0, 0]
+    assert max(attacked.took_s.values()) < ENDED_WITHIN_S
+    assert attacked.server.complete
+    assert attacked.client.complete
+    assert counted(attacked.server, "record_overflow") == 0
+    assert counted(attacked.client, "record_overflow") == 0

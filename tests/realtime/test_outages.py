@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.processes import LAVT, Process, Processes
+from lavt.experiment.real_run import start_client_router, start_loop
+from lavt.experiment.record import Record, read_record
+from lavt.experiment.table import Table
+
+Wait = Callable[[str, Callable[[], bool], float], None]
+Plan = Callable[..., PlannedRun]
+
+STOP_AFTER_NS = 500 * NS_PER_MS
+STOP_MPS2 = 4.0
+STANDSTILL_MPS = 0.05
+BRAKE_AFTER_NS = 300 * NS_PER_MS
+ASK_FOR_STOP_AFTER_NS = 2500 * NS_PER_MS
+"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+
+OUTAGE_S = 3.0
+STALL_S = 1.2
+"""Shorter than the routers' lease of 2 s: what was sent meanwhile is kept and comes all at once."""
+AGAIN_S = 20.0
+"""Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
+MARGIN_S = 0.5
+"""For brakes that build up and a machine that is busy."""
+LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
+LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
+"""The client hears 75 ms late that the vehicle has stopped: until then it commands on under the old epoch."""
+OBEYS_EVERYTHING = Path(__file__).with_name("server_that_obeys_everything.py")
+
+
+@dataclass
+class Drive:
+    """A loop that is driven and broken, and when it was; server and test read the same clocks."""
+
+    processes: Processes
+    work: Path
+    wait_until: Wait
+    planned: PlannedRun
+    server_program: tuple[str, ...] = LAVT
+    broken: dict[str, Now] = field(default_factory=dict)
+    codes: dict[str, int | None] = field(default_factory=dict)
+    clock: MachineClock = field(default_factory=MachineClock)
+
+    def start(self) -> None:
+        """Start everything; the client arms again by itself."""
+        self.loop = start_loop(
+            self.processes, self.planned, self.work, self.work,
+            rearm=True, once=False, server_program=self.server_program,
+        )  # fmt: skip
+        self.client = self.loop.client
+        self.client_router = self.loop.client_router
+
+    def reach(self, speed_mps: float) -> None:
+        """Wait until the vehicle is driven, and this fast."""
+
+        def reached() -> bool:
+            told = self.loop.server.latest.get("status", {})
+            phase = self.client.latest.get("status", {}).get("phase")
+            return (told.get("safety"), phase) == ("driving", "driving") and bool(told["speed_mps"] >= speed_mps)
+
+        self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, AGAIN_S)
+
+    def breaks(self, name: str) -> None:
+        """Note that an outage begins."""
+        self.broken[name] = self.clock.now()
+
+    def suspend(self, name: str, process: Process, duration_s: float) -> None:
+        """Let a process stand still for a while."""
+        self.breaks(name)
+        process.popen.send_signal(signal.SIGSTOP)
+        pause(round(duration_s * NS_PER_S))
+        process.popen.send_signal(signal.SIGCONT)
+
+    def kill(self, name: str, process: Process) -> None:
+        """End a process with SIGKILL."""
+        self.breaks(name)
+        process.popen.kill()
+
+    def restart_the_router(self, after_s: float) -> None:
+        """Start the client's router again, on the same port."""
+        pause(round(after_s * NS_PER_S))
+        self.client_router, _ = start_client_router(self.processes, self.loop.dialled, self.loop.router)
+
+    def start_another_client(self) -> None:
+        """Start a new client, as somebody would after a crash."""
+        pause(NS_PER_S)
+        self.client = self.processes.start(
+            "client-2", "client", str(self.work / "client.yaml"), "--out", str(self.work / "client-2")
+        )
+
+    def end(self) -> None:
+        """Press Ctrl-C on both sides."""
+        for name, process in (("client", self.client), ("server", self.loop.server)):
+            process.end()
+            self.codes[name] = process.popen.returncode
+
+
+def everything_but_the_clients_death(drive: Drive, speed_mps: float) -> None:
+    relay = drive.loop.relay
+    assert relay is not None
+    drive.reach(speed_mps)
+    drive.suspend("client suspended", drive.client, OUTAGE_S)
+    drive.reach(speed_mps)
+    drive.kill("router killed", drive.client_router)
+    drive.restart_the_router(OUTAGE_S)
+    drive.reach(speed_mps)
+    drive.suspend("network stalled", relay, STALL_S)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
+    """One drive with all outages, one after the other, the server's death last."""
+    work = tmp_path_factory.mktemp("outages")
+    with Processes(work) as processes:
+        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
+        drive.start()
+        everything_but_the_clients_death(drive, 6.0)
+        drive.reach(7.0)
+        drive.kill("client killed", drive.client)
+        drive.start_another_client()
+        drive.reach(3.0)
+        drive.kill("server killed", drive.loop.server)
+        pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
+        drive.end()
+    return drive
+
+
+@pytest.fixture(scope="module")
+def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
+    """The same outages, with a server that obeys whatever it can read."""
+    work = tmp_path_factory.mktemp("unguarded")
+    with Processes(work) as processes:
+        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(OBEYS_EVERYTHING),))
+        drive.start()
+        everything_but_the_clients_death(drive, 4.0)
+        drive.reach(1.0)
+        drive.end()
+    return drive
+
+
+@pytest.fixture(scope="module")
+def server(drive: Drive) -> Record:
+    return read_record(drive.work / "server" / "server.mcap")
+
+
+@pytest.fixture(scope="module")
+def unguarded_server(unguarded: Drive) -> Record:
+    return read_record(unguarded.work / "server" / "server.mcap")
+
+
+def obeyed(record: Record) -> Table:
+    admissions = record.table("admission")
+    return admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+
+
+def transition(record: Record, into: str, after_ns: int) -> Now:
+    """First change of the safety state into `into` after a time, on both clocks."""
+    events = record.table("event")
+    for kind, detail, mono_ns, wall_ns in zip(
+        events.texts("kind"), events.texts("detail"), events.ints("mono_ns"), events.wall_ns, strict=True
+    ):
+        if kind == "safety" and f"-> {into}:" in detail and mono_ns > after_ns:
+            return Now(int(mono_ns), int(wall_ns))
+    raise AssertionError(f"the vehicle never came to {into!r} after {after_ns}")
+
+
+def last_fresh_ns(record: Record, before_ns: int) -> int:
+    """When the last command came that was made from a picture newer than those of all before it."""
+    commands = obeyed(record)
+    commands = commands.where(commands.ints("received_mono_ns") < before_ns)
+    stamps_ns = commands.ints("stamp_ns")
+    fresh = np.append(True, stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1])
+    return int(commands.ints("received_mono_ns")[fresh][-1])
+
+
+def stale(record: Record, stop: Now) -> int:
+    """How many commands were obeyed after `stop` that belong before it: by epoch, by send time or by picture."""
+    commands = obeyed(record)
+    before = commands.ints("received_mono_ns") <= stop.mono_ns
+    old_epochs = set(commands.where(before).objects("epoch"))
+    after = commands.where(~before)
+    of_old_epoch = np.array([epoch in old_epochs for epoch in after.objects("epoch")], np.bool_)
+    old = of_old_epoch | (after.ints("sent_wall_ns") <= stop.wall_ns) | (after.ints("stamp_ns") <= stop.wall_ns)
+    return int(np.sum(old))
+
+
+OUTAGES = ("client suspended", "router killed", "network stalled", "client killed")
+
+
+@pytest.mark.parametrize("outage", OUTAGES)
+def test_the_vehicle_stands_within_the_limits_of_the_design(drive: Drive, server: Record, outage: str) -> None:
+    """500 ms after the last fresh command comes the safe stop, and with 4 m/s2 standstill: 2.6 s from 30 km/h."""
+    stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
+    truth = server.table("truth")
+    at_ns, speed_mps = truth.ints("mono_ns"), truth.floats("speed_mps")
+    silence_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
+    speed_at_stop_mps = speed_mps[np.searchsorted(at_ns, stop.mono_ns)]
+    stands = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
+    stopping_s = (at_ns[stands][0] - stop.mono_ns) / NS_PER_S
+
+    assert STOP_AFTER_NS <= silence_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
+    assert stopping_s <= speed_at_stop_mps / STOP_MPS2 + MARGIN_S
+
+
+@pytest.mark.parametrize("outage", OUTAGES)
+def test_the_vehicle_stays_where_it_stopped_until_it_is_armed_anew(drive: Drive, server: Record, outage: str) -> None:
+    """From the stop on the vehicle never gets faster until somebody has armed it again."""
+    stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
+    armed = transition(server, "driving", stop.mono_ns)
+    truth = server.table("truth")
+    at_ns = truth.ints("mono_ns")
+    speeds_mps = truth.where((at_ns > stop.mono_ns + 200 * NS_PER_MS) & (at_ns < armed.mono_ns)).floats("speed_mps")
+
+    assert np.all(np.diff(speeds_mps) < 0.01)
+    assert speeds_mps[-1] < STANDSTILL_MPS
+
+
+@pytest.mark.parametrize("outage", OUTAGES)
+def test_nothing_from_before_a_stop_is_obeyed_after_it(drive: Drive, server: Record, outage: str) -> None:
+    """After a safe stop no command of an old epoch is obeyed, none sent before it, none made from an older picture."""
+    stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
+    armed = transition(server, "driving", stop.mono_ns)
+
+    assert stale(server, stop) == 0
+    assert np.sum(obeyed(server).ints("received_mono_ns") > armed.mono_ns) > 50
+
+
+@pytest.mark.parametrize("outage", ["client suspended", "router killed", "network stalled"])
+def test_a_server_that_obeys_everything_would_obey_what_is_stale(
+    unguarded: Drive, unguarded_server: Record, outage: str
+) -> None:
+    """Without the server's checks each of these outages ends with stale commands obeyed: the tests above can fail."""
+    stop = transition(unguarded_server, "safe_stop", unguarded.broken[outage].mono_ns)
+
+    assert stale(unguarded_server, stop) > 0
+
+
+def test_what_was_recorded_before_a_process_died_can_be_read(drive: Drive, server: Record) -> None:
+    """The record of a side that was killed is not complete, and reaches to within half a second of its end."""
+    first_client = read_record(drive.work / "client" / "client.mcap")
+
+    for record, died in ((server, "server killed"), (first_client, "client killed")):
+        last_ns = max(int(table.mono_ns.max()) for table in record.tables.values())
+        assert not record.complete
+        assert abs(last_ns - drive.broken[died].mono_ns) < NS_PER_S // 2
+
+
+def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive) -> None:
+    """When the server is gone the client brakes after 300 ms, asks for a stop after 2.5 s, and ends on Ctrl-C."""
+    record = read_record(drive.work / "client-2" / "client.mcap")
+    last_ns = int(record.table("lane").mono_ns.max())
+    commands = record.table("control")
+    since_ns = commands.mono_ns - last_ns
+    slack_ns = 50 * NS_PER_MS
+    braking = commands.where((since_ns > BRAKE_AFTER_NS + slack_ns) & (since_ns < ASK_FOR_STOP_AFTER_NS - slack_ns))
+    stopping = commands.where(since_ns > ASK_FOR_STOP_AFTER_NS + slack_ns)
+
+    assert drive.codes["client"] == 0
+    assert record.complete
+    assert len(braking) > 50
+    assert np.all(braking.floats("brake") >= 0.6)
+    assert np.all(braking.floats("throttle") == 0)
+    assert set(braking.texts("mode")) == {"drive"}
+    assert len(stopping) > 20
+    assert set(stopping.texts("mode")) == {"stop"}
+
+
+def test_ctrl_c_leaves_complete_records(unguarded: Drive, unguarded_server: Record) -> None:
+    """After SIGINT in the middle of a drive both sides have ended with 0, and their records are complete."""
+    assert unguarded.codes == {"client": 0, "server": 0}
+    assert unguarded_server.complete
+    assert read_record(unguarded.work / "client" / "client.mcap").complete
