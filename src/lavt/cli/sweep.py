@@ -33,7 +33,6 @@ def sweep(
     """
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
-    console.say(f"{len(planned)} runs into {out}")
     page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=console.say)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
