@@ -10,6 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.config import RunConfig, load_config
+from lavt.experiment.directory import check_directory
 from lavt.experiment.plan import plan_run
 from lavt.experiment.run import run_once
 
@@ -31,6 +32,7 @@ def run(
     """
     planned = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
+    check_directory(out)
     title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)

@@ -83,6 +83,7 @@ def sweep(
         raise UserError(f"there is nothing to resume in {out}: leave --resume away to begin")
     if not resume:
         prepare_directory(out)
+    tell(f"{len(planned)} runs into {out}")
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     _remove_unfinished(planned, runs_dir)

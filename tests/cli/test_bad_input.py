@@ -1,0 +1,326 @@
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import lavt
+from lavt.cli import console
+from lavt.cli.main import app
+from lavt.config import shipped
+from lavt.transport.zenoh_link import Router, quiet_logs
+
+DEMO = str(shipped("configs/demo.yaml"))
+SWEEP = str(shipped("configs/sweep.yaml"))
+SERVER = str(shipped("configs/server.yaml"))
+CLIENT = str(shipped("configs/client.yaml"))
+RELAY = str(shipped("configs/relay.yaml"))
+ROUTER = str(shipped("zenoh-configs/router-server.json5"))
+ENDS_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """What a command left: exit code, standard output, standard error."""
+
+    code: int
+    out: str
+    err: str
+
+    def refused(self) -> str:
+        """Check that the input was refused as it must be, and give the sentence."""
+        assert self.code == 2, self
+        assert self.out == ""
+        assert self.err.startswith("lavt: ")
+        assert self.err.count("\n") == 1, self.err
+        assert "Traceback" not in self.err
+        return self.err
+
+
+Run = Callable[..., Ended]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Give a function that runs a command in this process, from an empty working directory."""
+    monkeypatch.setattr(console, "keep_stdout_for_results", lambda: None)  # it would take pytest's output away
+    monkeypatch.chdir(tmp_path)
+
+    def run_here(*arguments: str) -> Ended:
+        with pytest.raises(SystemExit) as ended:
+            console.run_command(lambda: app(list(arguments)))
+        said = capsys.readouterr()
+        code = ended.value.code
+        return Ended(code if isinstance(code, int) else 0, said.out, said.err)
+
+    return run_here
+
+
+def files(directory: Path) -> Mapping[str, bytes | None]:
+    """Give everything in a directory: path to content, None for directories."""
+    return {
+        str(path.relative_to(directory)): path.read_bytes() if path.is_file() else None for path in directory.rglob("*")
+    }
+
+
+BAD_RUNS = {
+    "unknown key": (["--set", "vehicle.rute=a_key"], "did you mean 'route'?"),
+    "wrong type": (["--set", "seed=one"], "'seed'"),
+    "out of range": (["--set", "camera.rate_hz=0"], "'camera.rate_hz'"),
+    "not a change": (["--set", "seed"], "a.b=value"),
+    "not YAML": (["--set", "seed=["], "not YAML"),
+    "unknown condition": (["--set", "network.condition=L9"], "L0, L1, L2, L3, L4, L5"),
+    "unknown route": (["--set", "vehicle.route=nowhere"], "a_key"),
+    "unknown route in real time": (["--set", "vehicle.route=nowhere", "--set", "time=real"], "a_key"),
+    "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
+    "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
+    "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
+    "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
+}
+
+
+@pytest.mark.parametrize("command", ["run", "sweep"])
+@pytest.mark.parametrize("case", BAD_RUNS)
+def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
+    """A run or sweep that cannot be driven is refused in one sentence, and no directory is made for it."""
+    changes, said = BAD_RUNS[case]
+    if command == "sweep":
+        changes = [each.replace("network.condition=L9", "conditions=[L9]") for each in changes]
+        changes = [each.replace("vehicle.route=nowhere", "routes=[nowhere]") for each in changes]
+    ended = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
+    assert said in ended.refused()
+    assert files(tmp_path) == {}
+
+
+def test_codec_that_cannot_be(run: Run, tmp_path: Path) -> None:
+    """A run that only the encoder can refuse, when the car is built already, leaves no directory behind either."""
+    ended = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err.splitlines()[-1].startswith("lavt: a decoder buffer of 0.0005 s")
+    assert files(tmp_path) == {}
+
+
+MISSING = {
+    "run": ["run", "nothing.yaml"],
+    "sweep": ["sweep", "nothing.yaml"],
+    "server": ["server", "nothing.yaml"],
+    "client": ["client", "nothing.yaml"],
+    "relay": ["relay", "nothing.yaml"],
+    "router": ["router", "nothing.json5"],
+    "report": ["report", "nothing"],
+}
+
+
+@pytest.mark.parametrize("command", MISSING)
+def test_missing_file(command: str, run: Run, tmp_path: Path) -> None:
+    """A file or directory that is not there is named in one sentence, and nothing is made."""
+    assert "nothing" in run(*MISSING[command]).refused()
+    assert files(tmp_path) == {}
+
+
+WRONG_CONFIG = {
+    "run": ["run", SERVER],
+    "server": ["server", DEMO],
+    "client": ["client", DEMO],
+    "relay": ["relay", DEMO],
+    "router": ["router", DEMO],
+}
+
+
+@pytest.mark.parametrize("command", WRONG_CONFIG)
+def test_config_of_another_command(command: str, run: Run) -> None:
+    """A config that is another command's is refused in one sentence."""
+    run(*WRONG_CONFIG[command]).refused()
+
+
+OUT = {
+    "run": ["run", DEMO, "--out"],
+    "sweep": ["sweep", SWEEP, "--out"],
+    "demo": ["demo", "--out"],
+    "server": ["server", SERVER, "--out"],
+    "client": ["client", CLIENT, "--out"],
+}
+
+
+@pytest.mark.parametrize("occupied", ["directory", "file"])
+@pytest.mark.parametrize("command", OUT)
+def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path: Path) -> None:
+    """What lies where --out points is never touched: the command refuses, and every byte is as it was."""
+    mine = tmp_path / "mine"
+    if occupied == "directory":
+        (mine / "runs" / "a_key_L0_00").mkdir(parents=True)
+        for name in ("server.mcap", "config.yaml", "runs/a_key_L0_00/result.json"):
+            (mine / name).write_bytes(b"weeks of work")
+    else:
+        mine.write_bytes(b"weeks of work")
+    before = files(tmp_path)
+    assert "mine is not an empty directory" in run(*OUT[command], "mine").refused()
+    assert files(tmp_path) == before
+
+
+def test_out_that_cannot_be_made(run: Run, tmp_path: Path) -> None:
+    """A directory that cannot be made is refused in one sentence."""
+    (tmp_path / "file").write_bytes(b"")
+    for arguments in (["demo"], ["sweep", SWEEP]):
+        assert "cannot be made" in run(*arguments, "--out", "file/inside").refused()
+
+
+def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
+    """A report of a directory without runs is refused, and nothing is written into it."""
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no finished run" in run("report", "empty").refused()
+    assert "empty holds no finished run" in run("report", "empty", "--out", "elsewhere").refused()
+    (tmp_path / "file").write_bytes(b"x")
+    assert "file is not a directory" in run("report", "empty", "--out", "file").refused()
+    assert files(tmp_path) == {"empty": None, "file": b"x"}
+
+
+def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
+    """A sweep that was never begun cannot be resumed."""
+    assert "nothing to resume in never" in run("sweep", SWEEP, "--resume", "--out", "never").refused()
+    assert files(tmp_path) == {}
+
+
+SIDES = {
+    "vehicle with a slash": (["server", SERVER, "--set", "vehicle_id=a/b"], "the vehicle 'a/b'"),
+    "vehicle of stars": (["client", CLIENT, "--set", "vehicle_id='**'"], "the vehicle '**'"),
+    "client without a name": (["client", CLIENT, "--set", "who=''"], "the client ''"),
+    "unknown key": (["server", SERVER, "--set", "vehicl_id=a"], "did you mean 'vehicle_id'?"),
+    "missing session file": (["client", CLIENT, "--set", "zenoh.session=no.json5"], "no.json5"),
+    "TCP through the relay": (["relay", RELAY, "--set", "control_server=tcp/127.0.0.1:1"], "carries UDP only"),
+    "no address": (["relay", RELAY, "--set", "video_listen=here"], "write it as host:port"),
+    "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
+    "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], "no listen endpoints"),
+    "router's change without a value": (["router", ROUTER, "--set", "listen"], "a.b=value"),
+    "router's change that is not YAML": (["router", ROUTER, "--set", "listen.endpoints=["], "not YAML"),
+    "router's change that is a date": (["router", ROUTER, "--set", "mode=2026-01-01"], "mode"),
+}
+
+
+@pytest.mark.parametrize("case", SIDES)
+def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
+    """A server, client, router or relay whose config cannot work is refused in one sentence, and nothing is made."""
+    arguments, said = SIDES[case]
+    out = ["--out", "mine"] if arguments[0] in {"server", "client"} else []
+    assert said in run(*arguments, *out).refused()
+    assert files(tmp_path) == {}
+
+
+COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "router", "relay"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(command: str, run: Run) -> None:
+    """The help of every command goes to standard output and has an example."""
+    ended = run(command, "--help")
+    assert ended.code == 0
+    assert f"Example: lavt {command}" in " ".join(ended.out.split())
+    assert ended.err == ""
+
+
+def test_list_of_commands(run: Run) -> None:
+    """The help of lavt names every command, and this test knows them all."""
+    ended = run("--help")
+    assert ended.code == 0
+    assert sorted(each.name or "" for each in app.registered_commands) == sorted(COMMANDS)
+    assert all(command in ended.out for command in COMMANDS)
+
+
+def test_unknown_command(run: Run) -> None:
+    """A command or option that does not exist ends with 2 and is named on standard error."""
+    for arguments in (["fly"], ["run", DEMO, "--fast"], ["run"]):
+        ended = run(*arguments)
+        assert (ended.code, ended.out) == (2, "")
+        assert "Error: " in ended.err
+
+
+def lavt_process(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "lavt", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "OPENCV_FOR_THREADS_NUM": "1"},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """A router on this machine; gives its endpoint."""
+    quiet_logs()
+    with closing(Router(Path(ROUTER), {"listen/endpoints": ["tcp/127.0.0.1:0"]})) as opened:
+        yield opened.locators()[0]
+
+
+@pytest.fixture(scope="module")
+def taken() -> Iterator[int]:
+    """A port of 127.0.0.1, of UDP and of TCP, that somebody else has."""
+    with socket.socket() as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        tcp.bind(("127.0.0.1", 0))
+        tcp.listen()
+        udp.bind(tcp.getsockname())
+        yield tcp.getsockname()[1]
+
+
+def test_relay_port_in_use(taken: int, run: Run) -> None:
+    """A relay whose port somebody else has is refused in one sentence."""
+    said = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{taken}").refused()
+    assert f"the relay's video port 127.0.0.1:{taken} cannot be opened" in said
+
+
+def test_server_of_an_unknown_route(router: str, run: Run, tmp_path: Path) -> None:
+    """A server whose road does not exist is refused in one sentence though its links are open, and nothing is made."""
+    changes = ("--set", "vehicle.route=nowhere", "--set", "video.port=0", "--set", f"zenoh.router={router}")
+    assert "there is no road 'nowhere'" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert files(tmp_path) == {}
+
+
+def test_client_of_an_unknown_server(router: str, run: Run, tmp_path: Path) -> None:
+    """A client whose server no one can look up is refused in one sentence, and nothing is made."""
+    changes = ("--set", f"video.server={'a' * 64}", "--set", f"zenoh.router={router}")
+    assert "is not known" in run("client", CLIENT, *changes, "--out", "mine").refused()
+    assert files(tmp_path) == {}
+
+
+def test_processes(router: str, taken: int, tmp_path: Path) -> None:
+    """A process whose input is bad ends by itself with 2, one sentence, a silent standard output and nothing made."""
+    out = ("--out", str(tmp_path / "mine"))
+    cases = {
+        f"the video port 127.0.0.1:{taken} cannot be opened": [
+            "server", SERVER, "--json", "--set", f"video.port={taken}", "--set", "video.bind=127.0.0.1",
+            "--set", f"zenoh.router={router}", *out,
+        ],
+        "start one with `lavt router": ["client", CLIENT, "--json", "--set", "zenoh.router=tcp/127.0.0.1:1", *out],
+        f"tcp/127.0.0.1:{taken}": ["router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{taken}]"],
+    }  # fmt: skip
+    started = {said: lavt_process(*arguments) for said, arguments in cases.items()}
+    for said, process in started.items():
+        printed, err = process.communicate(timeout=ENDS_S)
+        assert said in Ended(process.returncode, printed, err).refused()
+    assert files(tmp_path) == {}
+
+
+def test_version(run: Run) -> None:
+    """The version goes to standard output."""
+    assert run("--version") == Ended(0, f"lavt {lavt.__version__}\n", "")
+
+
+def test_end_by_ctrl_c() -> None:
+    """A router and a relay say on one line where they are, and end with 0 on Ctrl-C."""
+    arguments = {
+        "locators": ["router", ROUTER, "--json", "--set", "listen.endpoints=[tcp/127.0.0.1:0]"],
+        "ports": ["relay", RELAY, "--json", "--set", "video_listen=127.0.0.1:0", "--set", "control_listen=127.0.0.1:0"],
+    }
+    started = {said: lavt_process(*each) for said, each in arguments.items()}
+    for said, process in started.items():
+        assert process.stdout is not None
+        assert f'"{said}"' in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+    for process in started.values():
+        _, err = process.communicate(timeout=ENDS_S)
+        assert (process.returncode, err) == (0, "")
