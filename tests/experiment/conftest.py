@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, Now
-from lavt.experiment.record import RecordWriter, VideoUnit
+from lavt.experiment.record import RecordWriter
+from lavt.nodes.reports import VideoUnit
 
 WALL_NS = 1_700_000_000_000_000_000
 SERVER_MONO_NS = 1_000 * NS_PER_S

@@ -14,8 +14,9 @@ from mcap.reader import make_reader
 from lavt.domain import Lane, Now
 from lavt.errors import WorkError
 from lavt.experiment.payload_json import json_schema, to_json
-from lavt.experiment.record import RecordWriter, VideoUnit, read_record
+from lavt.experiment.record import RecordWriter, read_record
 from lavt.experiment.table import MISSING
+from lavt.nodes.reports import VideoUnit
 
 WALL_NS = 1_700_000_000_000_000_123
 

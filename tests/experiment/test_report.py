@@ -14,9 +14,10 @@ from lavt.errors import WorkError
 from lavt.experiment import page
 from lavt.experiment.breakdown import breakdown
 from lavt.experiment.figures import condition_colours
-from lavt.experiment.record import RecordWriter, VideoUnit, read_record
+from lavt.experiment.record import RecordWriter, read_record
 from lavt.experiment.report import received_pictures, write_report
 from lavt.experiment.results import run_result, write_json
+from lavt.nodes.reports import VideoUnit
 
 MakeRun = Callable[..., Path]
 

@@ -12,6 +12,7 @@ import pytest
 from lavt.clock import pause
 from lavt.config import SweepConfig, load_config, shipped
 from lavt.domain import NS_PER_MS
+from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_sweep
 from lavt.experiment.sweep import sweep
 
@@ -54,6 +55,13 @@ def test_resuming_drives_only_what_is_missing(swept: Path) -> None:
     assert (second / "result.json").stat().st_mtime_ns == kept
     assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
     assert after["conditions"] == before["conditions"]
+
+
+def test_resuming_with_another_config_is_refused(swept: Path) -> None:
+    """A sweep that was driven with another config is not resumed: its runs would not belong together."""
+    changed = plan_sweep(load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, "seed=2"]))
+    with pytest.raises(UserError, match="another config"):
+        sweep(changed, swept, jobs=1, resume=True, tell=lambda _: None)
 
 
 @pytest.mark.realtime

@@ -10,6 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import SweepConfig, load_config
+from lavt.experiment.directory import check_directory
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
 from lavt.experiment.sweep import sweep as drive_sweep
@@ -34,6 +35,8 @@ def sweep(
     """
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
+    if not resume:
+        check_directory(out)
     with console.interruptible(), progress(f"sweep into {out}", len(planned)) as tell:
         page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=tell)
     for name, why in driven.failed:

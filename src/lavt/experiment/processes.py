@@ -14,11 +14,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from lavt.errors import WorkError
+from lavt.errors import UserError, WorkError
 
 READY_S = 60.0
 """Importing and preparing takes 1 to 5 s on a quiet machine."""
 END_S = 15.0
+USER_ERROR = 2
+"""Exit code of a program whose input was wrong."""
 LAVT = ("-m", "lavt")
 """What Python runs: the installed program. Tests give a program of their own that breaks a part on purpose."""
 
@@ -45,12 +47,16 @@ class Process:
         self._reader.start()
 
     def ready(self) -> dict[str, Any]:
-        """Wait for the first line; raises `WorkError` where the process ends or says nothing."""
+        """Wait for the first line; raises `WorkError` where the process ends or says nothing, `UserError`
+        where it ends because its input was wrong.
+        """
         try:
             line = self._first.get(timeout=READY_S)
         except queue.Empty:
             raise WorkError(f"{self.name} did not get ready within {READY_S:.0f} s") from None
         if line is None:
+            if self.popen.wait() == USER_ERROR:
+                raise UserError(self.said().removeprefix("lavt: "))
             raise WorkError(f"{self.name} did not start: {self.said()}")
         return line
 

@@ -64,14 +64,6 @@ class Digest(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class VideoUnit:
-    """One access unit of the video (H.264, Annex B) and the stamp of its frame: the payload of the channel `VIDEO`."""
-
-    stamp_ns: int
-    data: bytes
-
-
 class RecordWriter:
     """Writes the record of one side.
 

@@ -17,6 +17,7 @@ from lavt.experiment.record import read_record
 from lavt.experiment.results import run_result, write_json
 from lavt.experiment.virtual_run import build_loop, drive
 
+CONFIG = "config.yaml"
 RESULT = "result.json"
 
 
@@ -39,8 +40,13 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
     return compute_result(out, planned.identity, digest, reasons)
 
 
+def config_text(planned: PlannedRun) -> str:
+    """Write the whole config of a run as YAML."""
+    return yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False)
+
+
 def _write_config(planned: PlannedRun, out: Path) -> None:
-    (out / "config.yaml").write_text(yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False))
+    (out / CONFIG).write_text(config_text(planned))
 
 
 def compute_result(

@@ -18,7 +18,7 @@ from lavt.experiment.directory import prepare_directory
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
-from lavt.experiment.run import RESULT, run_once
+from lavt.experiment.run import CONFIG, RESULT, config_text, run_once
 
 Tell = Callable[[str], None]
 
@@ -46,6 +46,7 @@ def run_all(
     for each in planned:
         finished = runs_dir / each.name / RESULT
         if finished.is_file():
+            _check_config(each, finished.parent)
             results.append(read_json(finished))
         else:
             todo.append(each)
@@ -83,7 +84,6 @@ def sweep(
         raise UserError(f"there is nothing to resume in {out}: leave --resume away to begin")
     if not resume:
         prepare_directory(out)
-    tell(f"{len(planned)} runs into {out}")
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     _remove_unfinished(planned, runs_dir)
@@ -96,6 +96,12 @@ def sweep(
 def base_of(planned: Sequence[PlannedRun]) -> dict[str, Any]:
     """Tell what the runs of the base config have in common: the first value of each further axis."""
     return dict(planned[0].identity.get("axes", {}))
+
+
+def _check_config(planned: PlannedRun, directory: Path) -> None:
+    """Raise `UserError` where a finished run was driven with another config than the sweep now asks for."""
+    if (directory / CONFIG).read_text() != config_text(planned):
+        raise UserError(f"{directory} was driven with another config: resume with that one, or name another --out")
 
 
 def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
