@@ -143,5 +143,5 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     # 13. The vehicle obeys: it stood until now, and moves from now on.
     assert car.state().speed_mps == 0.0
     car.apply(gate.actuation(car.state(), now_ns), now_ns)
-    car.advance(now_ns + NS_PER_S // 4)
+    car.advance(now_ns + NS_PER_S)
     assert car.state().speed_mps > 0.0
