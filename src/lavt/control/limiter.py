@@ -53,15 +53,21 @@ class Limiter:
         if reached_rad != steering_rad:
             changed.append("steering rate")
         throttle = asked.throttle
-        if throttle > 0 and vehicle.speed_mps > self.limits.speed_limit_mps:
+        known = math.isfinite(vehicle.speed_mps)
+        if throttle > 0 and not (known and vehicle.speed_mps <= self.limits.speed_limit_mps):
             throttle = 0.0
             changed.append("speed")
-        self._steering_rad, self._at_ns = reached_rad, now_ns
+        self._steering_rad, self._at_ns = reached_rad, max(now_ns, self._at_ns)
         self.changed = tuple(changed)
         return Actuation(reached_rad, throttle, asked.brake)
 
     def _lateral_limit_rad(self, speed_mps: float) -> float:
-        """Road wheel angle at which the kinematic car has the lateral acceleration limit: v^2 tan(angle) / L."""
+        """Road wheel angle at which the kinematic car has the lateral acceleration limit: v^2 tan(angle) / L.
+
+        A speed that is no number counts as the highest.
+        """
+        if not math.isfinite(speed_mps):
+            speed_mps = self.limits.speed_limit_mps
         if abs(speed_mps) < 0.1:
             return math.pi / 2
         return math.atan(self._wheelbase_m * self.limits.lateral_acceleration_mps2 / speed_mps**2)

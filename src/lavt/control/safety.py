@@ -27,14 +27,14 @@ ACTIVE: tuple[SafetyState, ...] = ("arming", "driving", "degraded")
 TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
     ("disarmed", "arming begins"): "arming",
     ("safe_stop", "arming begins"): "arming",
-    ("arming", "arming broken"): "disarmed",
-    ("arming", "camera fault"): "disarmed",
-    ("arming", "released"): "disarmed",
+    **{("arming", trigger): "disarmed"
+       for trigger in ("arming broken", "stop asked", "camera fault", "released")},
     ("arming", "arming held"): "driving",
     ("driving", "silence"): "degraded",
     ("degraded", "fresh command"): "driving",
     ("degraded", "long silence"): "safe_stop",
-    **{(state, trigger): "safe_stop" for state in ("driving", "degraded")
+    **{(state, trigger): "safe_stop"
+       for state in ("driving", "degraded")
        for trigger in ("stop asked", "camera fault", "released")},
     **{(state, "emergency stop"): "emergency_stop"
        for state in ("disarmed", "arming", "driving", "degraded", "safe_stop")},
@@ -66,6 +66,11 @@ class Verdict:
 
 
 OBEYED = Verdict(True, "")
+
+NOT_ARMED = "the vehicle is not armed"
+NOT_STANDING = "arming needs standstill"
+BREAKS_ARMING = (NOT_ARMED, NOT_STANDING)
+"""Refused for these reasons, a command of the holder also ends an arming second: input or vehicle were not at rest."""
 
 
 class SafetyGate:
@@ -111,24 +116,27 @@ class SafetyGate:
         refusal = self._OPERATIONS[request.operation](self, request, vehicle)
         granted = refusal == ""
         self.counts[f"session {request.operation} {'granted' if granted else 'refused'}"] += 1
+        holds = granted and self._holds(request)  # whoever stops the vehicle must not thereby get to drive it
         return SessionReply(
-            granted, refusal, self._epoch if granted else 0, self.token if granted else b"", self._video_port,
+            granted, refusal, self._epoch if holds else 0, self.token if holds else b"", self._video_port,
             self._host, self._emergency_number,
         )  # fmt: skip
 
+    def _holds(self, request: SessionRequest) -> bool:
+        return (request.who, request.instance) == self.holder
+
     def _hold(self, request: SessionRequest, vehicle: VehicleState) -> str:
-        asker = (request.who, request.instance)
-        if asker == self.holder:
+        if self._holds(request):
             return ""
         if self.holder is not None and (self.state in ACTIVE or not self.stands(vehicle)):
             return f"held by {self.holder[0]}, and the vehicle is not disarmed at standstill"
-        self.holder = asker
+        self.holder = (request.who, request.instance)
         self.token = self._new_token()
         self._renew_epoch()
         return ""
 
     def _release(self, request: SessionRequest, _vehicle: VehicleState) -> str:
-        if (request.who, request.instance) != self.holder:
+        if not self._holds(request):
             return "only who holds the vehicle can release it"
         self._trigger("released")
         self.holder = None
@@ -140,8 +148,12 @@ class SafetyGate:
         return "" if self._stop_at_once(request.number) else "the number of this emergency stop is not a new one"
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState) -> str:
-        if (request.who, request.instance) != self.holder:
+        if not self._holds(request):
             return "only who holds the vehicle can clear its emergency stop"
+        if (
+            request.number != self._emergency_number
+        ):  # a late or repeated request must not clear one it knows nothing of
+            return "this is not the number of the last emergency stop"
         if not self.stands(vehicle):
             return "the vehicle does not stand yet"
         self._trigger("cleared")
@@ -158,15 +170,18 @@ class SafetyGate:
 
     def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> Verdict:
         """Obey `command` or refuse it, at `now_ns`, when it was received."""
+        self.watch(now_ns)  # a command that comes with the end of a silence comes too late
         if command.emergency_stop:
             self._stop_at_once(command.emergency_stop)
         reason = self._objection(command, vehicle, now_ns)
         if reason:
+            if reason in BREAKS_ARMING:
+                self._trigger("arming broken")
             self.refused = reason
             self.counts[f"refused: {reason}"] += 1
             return Verdict(False, reason)
         self._sequence = self.applied_sequence = command.sequence
-        newer = self.written.number(command.stamp_ns) > self._newest_frame
+        newer = self._newer(command)
         if newer:
             self._newest_frame = self.written.number(command.stamp_ns)
             self._fresh_ns = now_ns
@@ -186,24 +201,33 @@ class SafetyGate:
             return "not the epoch in force"
         if command.sequence <= self._sequence:
             return "not newer than the last command"
+        if command.emergency_stop:
+            return "it carries an emergency stop"
         written_ns = self.written.mono_ns(command.stamp_ns, now_ns)
         if written_ns is None:
             return "a stamp that this server did not write lately"
         if now_ns - written_ns > self.limits.picture_age_limit_ns:
             return "made from a picture that is too old"
         if command.mode == "drive" and self.state not in ("driving", "degraded"):
-            return "the vehicle is not armed"
+            return NOT_ARMED
+        if command.mode == "drive" and self.state == "degraded" and not self._newer(command):
+            return "not made from a newer picture"
         if command.mode == "arm" and self.state in ("driving", "degraded"):
             return "the vehicle is armed already"
         if command.mode == "arm" and self.state == "emergency_stop":
             return "the emergency stop must be cleared first"
         if command.mode == "arm" and not self.stands(vehicle):
-            return "arming needs standstill"
+            return NOT_STANDING
         return ""
+
+    def _newer(self, command: Command) -> bool:
+        """Whether a command was made from a newer picture than any before; its stamp must be known."""
+        return self.written.number(command.stamp_ns) > self._newest_frame
 
     def _arm(self, command: Command, vehicle: VehicleState, now_ns: int) -> None:
         neutral = command.throttle == 0 and abs(command.steering_rad) <= self.limits.arming_steering_rad
-        if not neutral or command.brake < self.limits.arming_brake or self.written.frozen:
+        fresh = now_ns - self._fresh_ns < self.limits.degraded_after_ns
+        if not (neutral and fresh) or command.brake < self.limits.arming_brake or self.written.frozen:
             self._trigger("arming broken")
         elif self.state != "arming":
             self._arming_since_ns = now_ns
@@ -244,9 +268,10 @@ class SafetyGate:
     def actuation(self, vehicle: VehicleState, now_ns: int) -> Actuation:
         """Say what the vehicle shall do now: the command in force within all limits, or what its state asks for."""
         asked = self._command if self.state in ("driving", "degraded") else None
+        throttle, brake = (asked.throttle, asked.brake) if asked else (0.0, self.limits.arming_brake)
         pedals = {
-            "driving": (asked.throttle, asked.brake) if asked else (0.0, self.limits.arming_brake),
-            "degraded": (0.0, self._pedal(self.limits.degraded_deceleration_mps2)),
+            "driving": (throttle, brake),
+            "degraded": (0.0, max(brake, self._pedal(self.limits.degraded_deceleration_mps2))),  # never eases a brake
             "safe_stop": (0.0, self._pedal(self.limits.stop_deceleration_mps2)),
         }.get(self.state, (0.0, 1.0))
         target_rad = asked.steering_rad if asked else self.limiter.target_rad(vehicle)

@@ -141,9 +141,10 @@ class ActuatorNode:
         sends.append(Send("event", Event(now.mono_ns, "session", f"{request.operation} by {request.who} {said}")))
         return sends
 
-    def _note_frame(self, message: Message, _now: Now) -> None:
+    def _note_frame(self, message: Message, now: Now) -> None:
         frame: FrameWritten = message.payload
         self.gate.written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+        self.gate.watch(now.mono_ns)  # before the next frame, which may hide that these were all equal
 
     # Time goes on.
 

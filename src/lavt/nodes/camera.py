@@ -7,6 +7,8 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from lavt.domain import NS_PER_S, Now, Picture, Pose
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
@@ -14,12 +16,14 @@ from lavt.nodes.reports import FrameWritten, VideoUnit
 from lavt.transport.h264 import Encoder
 from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp import Packetizer
-from lavt.transport.stamp import rtp_timestamp, write_stamp
+from lavt.transport.stamp import STAMP_PX, rtp_timestamp, write_stamp
 from lavt.transport.video_path import PathServer
 from lavt.vehicle.camera import Camera, CapturedFrame
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
 """No more than one keyframe on request in this time, so that requests cannot fill the link."""
+REMEMBERED_STAMPS = 512
+"""No stamp is one of so many before: at 60 Hz more than the 5 s for which the safety of the vehicle knows them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +75,7 @@ class CameraNode:
         self._poses: deque[Pose] = deque(maxlen=32)
         self._keyframe_wanted = False
         self._keyframe_ns = 0
-        self._last_stamp_ns = 0
+        self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
         self.chains: Mapping[str, Sequence[Hop]] = {
             WAKE: (
                 ("capture", self._capture),
@@ -117,11 +121,12 @@ class CameraNode:
         return frame
 
     def _stamp(self, frame: CapturedFrame, now: Now) -> Stamped:
-        pixel_crc = zlib.crc32(frame.picture.data)
+        # Below the stamp: a camera that gives the same buffer again gives it with the stamp that was written into it.
+        pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[STAMP_PX:]).data)
         stamp_ns = now.wall_ns
-        if stamp_ns == self._last_stamp_ns:  # a clock that stands still or was stepped back must not write one twice
+        while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
             stamp_ns += 1
-        self._last_stamp_ns = stamp_ns
+        self._stamps.append(stamp_ns)
         write_stamp(frame.picture, stamp_ns)
         return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, frame.picture)
 

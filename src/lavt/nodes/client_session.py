@@ -57,7 +57,10 @@ class ClientSession:
         """Take over what the server granted, or why it did not."""
         self.because = reply.because
         self._highest_emergency_stop = max(self._highest_emergency_stop, reply.emergency_stop)
-        if reply.granted:
+        if self.emergency_stop and reply.emergency_stop > self.emergency_stop:
+            # The vehicle takes ours for an old one, as with a wall clock that is behind: raise it with a newer number.
+            self.emergency_stop = self._highest_emergency_stop = reply.emergency_stop + 1
+        if reply.granted and reply.token:
             self.host = reply.host
             self.epoch = reply.epoch
             if self.phase == "seeking":

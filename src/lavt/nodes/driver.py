@@ -190,6 +190,8 @@ class DriverNode:
         return [Send("control", encode(command))]
 
     def _intention(self, decision: Decision, now_ns: int) -> tuple[Mode, Decision]:
+        if self.session.emergency_stop:
+            return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
         if self.session.phase != "driving":
             return "arm", Decision(0.0, 0.0, 1.0, decision.path_curvature_per_m)
         blind_ns = now_ns - self._view_ns
@@ -222,4 +224,4 @@ class DriverNode:
             self.counts["session_replies_unreadable"] += 1
             return []
         self.session.note_reply(reply, now.mono_ns)
-        return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted else []
+        return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted and reply.token else []

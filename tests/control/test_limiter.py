@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.control.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
+
+from lavt.control.limits import LIMITS
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
+
+AGES_NS = 3600 * NS_PER_S
+SPEED_MPS = 30 / 3.6
+LATERAL_RAD = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / SPEED_MPS**2)
+
+
+def limited(asked: Actuation, speed_mps: float, *, after_ns: int = AGES_NS) -> tuple[Actuation, tuple[str, ...]]:
+    """Give what becomes of `asked`, so long after the wheel stood straight."""
+    limiter = new_limiter()
+    limiter.start(0.0, 0)
+    return limiter.limit(asked, vehicle_at(speed_mps), after_ns), limiter.changed
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_lateral_acceleration_is_limited(sign: int) -> None:
+    """At 30 km/h no wheel angle beyond that of 3 m/s2 on the kinematic car gets through, to either side."""
+    actuation, changed = limited(Actuation(sign * 0.4, 0.0, 0.0), SPEED_MPS)
+    assert actuation.steering_rad == pytest.approx(sign * LATERAL_RAD)
+    assert SPEED_MPS**2 * math.tan(abs(actuation.steering_rad)) / WHEELBASE_M == pytest.approx(3.0)
+    assert changed == ("lateral acceleration",)
+
+
+def test_the_wheel_turns_no_further_than_the_cars() -> None:
+    """At standstill the limit is the vehicle's own largest angle."""
+    actuation, changed = limited(Actuation(1.0, 0.0, 0.0), 0.0)
+    assert (actuation.steering_rad, changed) == (MAX_STEERING_RAD, ("steering angle",))
+
+
+def test_the_wheel_turns_no_faster_than_the_rate() -> None:
+    """In 10 ms the target moves by 8 mrad at most, and the rest follows as time goes on."""
+    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=10 * NS_PER_MS)
+    assert actuation.steering_rad == pytest.approx(0.008)
+    assert changed == ("steering rate",)
+    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=125 * NS_PER_MS)
+    assert actuation.steering_rad == pytest.approx(0.1)
+    assert changed == ()
+
+
+def test_a_time_that_goes_back_gives_no_extra_turn() -> None:
+    """Asked at times that jump back and forth the wheel turns no further than in the time that really passed."""
+    limiter = new_limiter()
+    limiter.start(0.0, 0)
+    for _ in range(20):
+        for at_ns in (0, 10 * NS_PER_MS):
+            reached = limiter.limit(Actuation(0.4, 0.0, 0.0), vehicle_at(), at_ns)
+    assert reached.steering_rad <= 0.008 + 1e-12
+
+
+def test_no_throttle_above_the_speed_limit() -> None:
+    """Above 40 km/h the throttle is taken away; at it and below it stays, and the brake always does."""
+    limit_mps = LIMITS.speed_limit_mps
+    assert limited(Actuation(0.0, 1.0, 0.0), limit_mps) == (Actuation(0.0, 1.0, 0.0), ())
+    assert limited(Actuation(0.0, 1.0, 0.0), limit_mps + 0.01) == (Actuation(0.0, 0.0, 0.0), ("speed",))
+    assert limited(Actuation(0.0, 0.0, 0.7), limit_mps + 9) == (Actuation(0.0, 0.0, 0.7), ())
+
+
+@pytest.mark.parametrize("speed_mps", [math.nan, math.inf, -math.inf])
+def test_a_speed_that_is_no_number_lifts_no_limit(speed_mps: float) -> None:
+    """With a speed that is not finite the wheel is limited as at the highest speed, and there is no throttle."""
+    actuation, changed = limited(Actuation(0.5, 0.0, 0.0), speed_mps)
+    top_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / LIMITS.speed_limit_mps**2)
+    assert actuation.steering_rad == pytest.approx(top_rad)
+    assert "lateral acceleration" in changed
+    assert limited(Actuation(0.0, 1.0, 0.0), speed_mps)[0].throttle == 0.0
+
+
+def test_before_it_begins_the_wheel_stays_where_it_is() -> None:
+    """Until a first target is set, the wheel is asked to stay where the vehicle reports it."""
+    limiter = new_limiter()
+    assert limiter.limit(Actuation(0.4, 0.0, 1.0), vehicle_at(0.0, 0.15), AGES_NS).steering_rad == 0.15
+
+
+def test_all_limits_that_changed_something_are_named() -> None:
+    """Several limits at once are all named, and none when nothing was changed."""
+    _, changed = limited(Actuation(1.0, 1.0, 0.0), 20.0, after_ns=1)
+    assert changed == ("steering angle", "lateral acceleration", "steering rate", "speed")
+    assert limited(Actuation(0.01, 0.5, 0.0), SPEED_MPS)[1] == ()
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.floats(-20, 60), st.integers(0, NS_PER_S)),
+        max_size=20,
+    )
+)
+def test_whatever_is_asked_the_limits_hold(asked: list[tuple[float, float, float, float, int]]) -> None:
+    """Any series of commands at any speeds: rate and angle hold at once, lateral acceleration as fast as the rate."""
+    limiter = new_limiter()
+    limiter.start(0.0, 0)
+    before_rad, now_ns = 0.0, 0
+    for steering_rad, throttle, brake, speed_mps, passed_ns in asked:
+        now_ns += passed_ns
+        actuation = limiter.limit(Actuation(steering_rad, throttle, brake), vehicle_at(speed_mps), now_ns)
+        step_rad = LIMITS.steering_rate_radps * passed_ns / NS_PER_S
+        bound_rad = math.pi / 2
+        if abs(speed_mps) >= 0.1:
+            bound_rad = math.atan(WHEELBASE_M * LIMITS.lateral_acceleration_mps2 / speed_mps**2)
+        assert abs(actuation.steering_rad) <= MAX_STEERING_RAD
+        assert abs(actuation.steering_rad - before_rad) <= step_rad + 1e-12
+        assert abs(actuation.steering_rad) <= max(bound_rad, abs(before_rad) - step_rad) + 1e-12
+        assert actuation.throttle in (0.0, throttle)
+        assert actuation.brake == brake
+        before_rad = actuation.steering_rad

@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.control.limiter import Limiter
+from lavt.control.limits import LIMITS
+from lavt.control.safety import SafetyGate
+from lavt.domain import NS_PER_MS, NS_PER_S, Command, SessionReply, SessionRequest, State, VehicleEvent
+from lavt.node import WAKE, Send
+from lavt.nodes.actuator import ActuatorNode
+from lavt.nodes.reports import Admission, FrameWritten, Route
+from lavt.transport.messages import decode, encode
+from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
+
+TICK_NS = 20 * NS_PER_MS
+
+
+class Bench:
+    """An actuator node with a vehicle that stands, and a client that commands it."""
+
+    def __init__(self, route: Route | None = None) -> None:
+        numbers = count(1)
+        limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
+        self.vehicle = StandingVehicle()
+        self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
+        self.node = ActuatorNode(self.vehicle, self.gate, start_ns=MONO_NS, route=route)
+        self.mono_ns = 0
+        self.sequence = 0
+        self.epoch = 0
+        self.sends: list[Send] = []
+
+    def take(self, channel: str, payload: Any, **where: Any) -> list[Send]:
+        sends = give(self.node, channel, payload, at(self.mono_ns), **where)
+        self.sends += sends
+        return sends
+
+    def go(self, duration_ns: int) -> list[Send]:
+        """Wake the node whenever it asked to, for so long."""
+        end_ns, sends = self.mono_ns + duration_ns, []
+        while (wake_ns := self.node.next_wake_ns() - MONO_NS) <= end_ns:
+            self.mono_ns = max(self.mono_ns, wake_ns)
+            sends += self.take(WAKE, None)
+        self.mono_ns = end_ns
+        return sends
+
+    def ask(self, operation: Any, number: int = 0) -> SessionReply:
+        sends = self.take("session", encode(SessionRequest(operation, "alice", 1, number)), peer="query")
+        (reply,) = [decode(SessionReply, send.payload) for send in sends if send.peer == "query"]
+        self.epoch = reply.epoch or self.epoch
+        return reply
+
+    def picture(self) -> int:
+        stamp_ns = at(self.mono_ns).wall_ns
+        number = self.mono_ns // NS_PER_MS
+        self.take("frame", FrameWritten(number, stamp_ns, at(self.mono_ns).mono_ns, None, number, 1))
+        return stamp_ns
+
+    def command(self, **changes: Any) -> Admission:
+        self.sequence += 1
+        stamp_ns = self.picture()
+        command = Command(self.epoch, self.sequence, 11, stamp_ns, 22, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0)
+        (admission,) = of(self.take("control", encode(replace(command, **changes))), "admission")
+        return admission
+
+    def drive(self, **changes: Any) -> Admission:
+        return self.command(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
+
+    def armed(self) -> Bench:
+        self.ask("hold")
+        for _ in range(51):
+            self.go(TICK_NS)
+            self.command()
+        assert self.gate.state == "driving"
+        return self
+
+    def events(self, kind: str) -> list[str]:
+        return [event.detail for event in of(self.sends, "event") if event.kind == kind]
+
+
+def test_the_state_is_told_50_times_a_second() -> None:
+    """In one second there are 50 states, each with the vehicle's own time and the safety state."""
+    bench = Bench()
+    states = [decode(State, payload) for payload in of(bench.go(NS_PER_S - 1), "state")]
+    assert len(states) == 50
+    assert {state.safety for state in states} == {"disarmed"}
+    assert [state.state_mono_ns for state in states] == sorted(state.state_mono_ns for state in states)
+
+
+def test_a_late_node_tells_one_state_and_says_that_the_physics_was_late() -> None:
+    """After a second of standstill of the node there is one state, not fifty, and an event tells of the lateness."""
+    bench = Bench()
+    bench.mono_ns = NS_PER_S
+    assert len(of(bench.take(WAKE, None), "state")) == 1
+    assert bench.events("late") == ["the physics was 995 ms late"]
+    assert bench.node.next_wake_ns() > at(NS_PER_S).mono_ns
+
+
+def test_an_admission_says_all_about_a_command() -> None:
+    """The record of an obeyed command holds what was sent, when it was received and applied, and what was asked."""
+    bench = Bench().armed()
+    admission = bench.drive(steering_rad=0.4)
+    now = at(bench.mono_ns)
+    assert admission == Admission(
+        bench.epoch, bench.sequence, now.wall_ns, 11, 22, now.mono_ns, now.wall_ns, now.mono_ns, "obeyed", "",
+        "steering rate", "drive", 0.4, 0.5, 0.0,
+    )  # fmt: skip
+    assert bench.vehicle.obeyed[-1].throttle == 0.5
+    assert bench.node.counts["commands_limited"] == 1
+
+
+def test_a_refused_command_is_recorded_and_not_applied() -> None:
+    """The record of a refused command has its reason and no time of application, and the vehicle is not asked."""
+    bench = Bench().armed()
+    asked = len(bench.vehicle.obeyed)
+    admission = bench.drive(epoch=99)
+    assert (admission.verdict, admission.reason) == ("refused", "not the epoch in force")
+    assert admission.applied_mono_ns is None
+    assert len(bench.vehicle.obeyed) == asked
+    (state,) = [decode(State, payload) for payload in of(bench.go(TICK_NS), "state")]
+    assert state.refused == "not the epoch in force"
+
+
+def test_a_command_is_judged_by_its_arrival() -> None:
+    """Time spent in the node's queue is not held against a command: its arrival on the host counts."""
+    bench = Bench().armed()
+    arrived = at(bench.mono_ns)
+    stamp_ns = bench.picture()
+    bench.mono_ns += 10 * NS_PER_MS
+    command = Command(bench.epoch, 999, 1, stamp_ns, 2, 0.0, 0.0, 1.0, (0.0,) * 10, "drive", 0)
+    (admission,) = of(bench.take("control", encode(command), arrived=arrived), "admission")
+    assert (admission.received_mono_ns, admission.applied_mono_ns) == (arrived.mono_ns, at(bench.mono_ns).mono_ns)
+
+
+def test_nothing_moves_before_the_first_drive_command_and_silence_stops() -> None:
+    """Armed, the vehicle gets no throttle before a drive command; 300 ms later it degrades, after 500 ms it stops."""
+    bench = Bench().armed()
+    bench.go(299 * NS_PER_MS)
+    assert bench.gate.state == "driving"
+    bench.go(NS_PER_MS)
+    assert bench.gate.state == "degraded"
+    bench.go(200 * NS_PER_MS)
+    assert bench.gate.state == "safe_stop"
+    assert all(asked.throttle == 0 and asked.brake > 0 for asked in bench.vehicle.obeyed)
+
+
+def test_a_drive_begins_and_ends_exactly_once() -> None:
+    """A drive begins when armed and has one ending, the first: a stop after `completed` is not another one."""
+    bench = Bench().armed()
+    bench.drive()
+    bench.vehicle.speed_mps = 8.0
+    bench.go(300 * NS_PER_MS)
+    bench.drive()
+    assert bench.gate.state == "driving"
+    bench.vehicle.happens = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
+    bench.go(TICK_NS)
+    assert bench.gate.state == "safe_stop"
+    bench.vehicle.happens = [VehicleEvent(3, "collision", "")]
+    bench.vehicle.speed_mps = 0.0
+    bench.go(NS_PER_S)
+    assert (bench.events("drive_began"), bench.events("ending")) == ([""], ["completed"])
+    assert bench.events("lane_invasion") == ["left"]
+
+
+def test_a_stop_is_the_ending_once_the_vehicle_stands() -> None:
+    """A drive that ends in a safe stop has that ending, told when the vehicle stands; armed anew, a new drive begins."""
+    bench = Bench().armed()
+    bench.vehicle.speed_mps = 8.0
+    bench.go(NS_PER_S)
+    assert bench.events("ending") == []
+    bench.vehicle.speed_mps = 0.0
+    bench.go(NS_PER_S)
+    assert bench.events("ending") == ["safe_stop"]
+    bench.armed()
+    assert len(bench.events("drive_began")) == 2
+
+
+def test_an_end_before_the_drive_is_none() -> None:
+    """What happens to a vehicle that nobody drives is told but ends no drive."""
+    bench = Bench()
+    bench.vehicle.happens = [VehicleEvent(1, "collision", "somebody drove into it")]
+    bench.go(TICK_NS)
+    assert bench.events("collision") == ["somebody drove into it"]
+    assert bench.events("ending") == []
+
+
+def test_the_token_goes_to_the_camera_when_it_changes() -> None:
+    """Held: the camera gets the token, once; released: it is told that there is none."""
+    bench = Bench()
+    bench.ask("hold")
+    bench.ask("hold")
+    assert of(bench.sends, "video_token") == [bytes(16)]
+    bench.ask("release")
+    assert of(bench.sends, "video_token") == [bytes(16), None]
+
+
+def test_transitions_and_requests_are_events() -> None:
+    """Every transition of the safety state and every session request is a line in the record."""
+    bench = Bench().armed()
+    assert bench.ask("emergency_stop", 5).granted
+    assert [detail.split(":")[0] for detail in bench.events("safety")] == [
+        "disarmed -> arming", "arming -> driving", "driving -> emergency_stop",
+    ]  # fmt: skip
+    assert bench.events("session") == ["hold by alice granted", "emergency_stop by alice granted"]
+
+
+def test_frozen_pictures_stop_the_vehicle_though_they_thaw() -> None:
+    """Five equal pictures stop it also when a different one follows before the next wake."""
+    bench = Bench().armed()
+    for number in range(6):
+        stamp_ns = at(bench.mono_ns).wall_ns + number
+        crc = -1 if number < 5 else 7
+        bench.take("frame", FrameWritten(5000 + number, stamp_ns, at(bench.mono_ns).mono_ns, None, crc, 1))
+    assert bench.gate.state == "safe_stop"
+
+
+def test_the_route_is_told_once() -> None:
+    """The road is written down once, at the start."""
+    route = Route("a_key", 1.0, ((0.0, 0.0),))
+    bench = Bench(route)
+    bench.go(NS_PER_S)
+    assert of(bench.sends, "route") == [route]
+
+
+@given(st.binary(max_size=200))
+def test_bytes_from_anybody_are_survived_and_counted(data: bytes) -> None:
+    """Bytes that are no command or request are counted, answered by nothing, and move nothing."""
+    bench = Bench()
+    assert bench.take("control", data) == []
+    assert bench.take("session", data, peer=3) == []
+    counts = bench.node.counts
+    assert (counts["commands_unreadable"], counts["session_requests_unreadable"]) == (1, 1)
+    assert bench.vehicle.obeyed == []

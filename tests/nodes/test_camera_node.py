@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+from itertools import count
+
+import pytest
+
+from lavt.control.written import WrittenStamps
+from lavt.domain import NS_PER_MS, NS_PER_S, Pose
+from lavt.node import WAKE, Send
+from lavt.nodes.camera import CameraNode
+from lavt.transport.h264 import Encoder
+from lavt.transport.rtcp import picture_loss, receiver_report
+from lavt.transport.rtp import Packetizer, parse_packet
+from lavt.transport.stamp import rtp_timestamp
+from lavt.transport.video_path import PathClient, PathServer
+from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
+
+FRAME_NS = NS_PER_S // 30
+TOKEN = bytes(range(16))
+HOME, ELSEWHERE = ("198.51.100.2", 4000), ("203.0.113.9", 4000)
+REPORT = receiver_report(1, 2, highest_sequence=1, lost_fraction=0.0, cumulative_lost=0, jitter=0)
+PLEASE = picture_loss(1, 2)
+
+
+def node_with(camera: NoiseCamera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
+    numbers = count()
+    encoder = Encoder(SMALL.width_px, SMALL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
+    path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
+    return CameraNode(camera or NoiseCamera(), encoder, Packetizer(2, 0), path, start_ns=MONO_NS, send_to=send_to)
+
+
+def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:
+    return give(node, WAKE, None, at(mono_ns, wall_ns))
+
+
+def prove(node: CameraNode, address: tuple[str, int] = HOME, mono_ns: int = 0) -> None:
+    client = PathClient(TOKEN)
+    (challenge,) = of(give(node, "feedback", client.hello(0), at(mono_ns), address), "rtp")
+    assert give(node, "feedback", client.answer(challenge), at(mono_ns), address) == []
+
+
+def test_a_frame_is_told_sent_and_kept() -> None:
+    """A frame leaves as packets that carry its stamp's time, with its stamp and size told to the safety."""
+    node = node_with(send_to=(HOME,))
+    sends = wake(node, 0, wall_ns=123_456_789)
+    (frame,) = of(sends, "frame")
+    (unit,) = of(sends, "video")
+    assert (frame.number, frame.stamped_mono_ns, frame.capture_ns) == (0, MONO_NS, MONO_NS)
+    assert frame.stamp_ns == unit.stamp_ns == at(0, 123_456_789).wall_ns
+    assert frame.size_bytes == len(unit.data)
+    assert {parse_packet(packet).timestamp for packet in of(sends, "rtp")} == {rtp_timestamp(frame.stamp_ns)}
+
+
+def test_a_late_wake_skips_frames_and_counts_them() -> None:
+    """Woken three periods late it takes one picture, the newest due, at the time that was due, and counts the rest."""
+    camera = NoiseCamera(phase_ns=5)
+    node = node_with(camera)
+    assert node.next_wake_ns() == MONO_NS + 5
+    wake(node, 5)
+    wake(node, 4 * FRAME_NS + 10 * NS_PER_MS)
+    assert [(number, at_ns) for number, at_ns, _ in camera.asked] == [
+        (0, MONO_NS + 5),
+        (4, MONO_NS + 5 + round(4 * NS_PER_S / 30)),
+    ]
+    assert node.counts["frames_skipped"] == 3
+    assert node.next_wake_ns() == MONO_NS + 5 + round(5 * NS_PER_S / 30)
+
+
+def test_it_renders_the_newest_pose_at_or_before_the_capture() -> None:
+    """Of the poses told, the newest not after the capture's due time is taken, also when newer ones are there."""
+    camera = NoiseCamera()
+    node = node_with(camera)
+    poses = [Pose(MONO_NS + offset_ns, 0.0, 0.0, 0.0) for offset_ns in (-5, -1, 0, 1, 7)]
+    for pose in poses:
+        give(node, "pose", pose, at(10))
+    wake(node, 10)
+    assert camera.asked[0][2] is poses[2]
+
+
+def test_without_a_pose_in_time_there_is_none() -> None:
+    """Poses that are all later than the capture are not used."""
+    camera = NoiseCamera()
+    node = node_with(camera)
+    give(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
+    wake(node, 2)
+    assert camera.asked[0][2] is None
+
+
+@pytest.mark.parametrize("walls_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])
+def test_no_stamp_is_written_twice(walls_ns: list[int]) -> None:
+    """Whether the wall clock stands still or is stepped back, every frame has a stamp of its own."""
+    node = node_with()
+    stamps = [of(wake(node, i * 2 * FRAME_NS, wall_ns), "frame")[0].stamp_ns for i, wall_ns in enumerate(walls_ns)]
+    assert len(set(stamps)) == len(stamps)
+    assert max(abs(stamp_ns - at(0, wall_ns).wall_ns) for stamp_ns, wall_ns in zip(stamps, walls_ns, strict=True)) < 10
+
+
+@pytest.mark.parametrize(("stuck", "fault"), [(True, True), (False, False)])
+def test_the_same_buffer_again_and_again_is_seen(*, stuck: bool, fault: bool) -> None:
+    """A camera that gives one buffer, stamp of the last frame in it, is frozen at the fifth; a live one is not."""
+    node = node_with(NoiseCamera(stuck=noise(0) if stuck else None))
+    written = WrittenStamps(5 * NS_PER_S, 5)
+    for number in range(5):
+        assert not written.frozen
+        (frame,) = of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
+        written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+    assert written.frozen == fault
+
+
+def test_no_picture_is_counted_and_nothing_sent() -> None:
+    """A camera that gives nothing leaves a counted gap, and the next frame is asked for in time."""
+    node = node_with(NoiseCamera(broken=True), send_to=(HOME,))
+    assert wake(node, 0) == []
+    assert node.counts["frames_missing"] == 1
+    assert node.next_wake_ns() == MONO_NS + round(NS_PER_S / 30)
+
+
+def test_no_video_without_a_proven_path() -> None:
+    """Without a proof, or without a session, no packet leaves; a proven address gets the video, and only while it reports."""
+    node = node_with()
+    assert of(wake(node, 0), "rtp") == []
+    assert give(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
+    give(node, "video_token", TOKEN, at(1))
+    assert of(wake(node, FRAME_NS + 1), "rtp") == []
+    prove(node, mono_ns=FRAME_NS + 2)
+    assert {send.peer for send in wake(node, 2 * FRAME_NS + 1) if send.channel == "rtp"} == {HOME}
+    assert of(wake(node, 3 * NS_PER_S), "rtp") == []
+    assert node.counts["frames_without_receiver"] == 3
+
+
+def test_plain_receivers_named_in_the_config_get_video_unasked() -> None:
+    """`send_to` gets every frame, beside whoever has proven its path."""
+    node = node_with(send_to=(ELSEWHERE,))
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    assert {send.peer for send in wake(node, 0) if send.channel == "rtp"} == {HOME, ELSEWHERE}
+
+
+def test_a_keyframe_on_request_is_rate_limited() -> None:
+    """However often the receiver asks, there is at most one extra keyframe in 100 ms."""
+    node = node_with()
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    sizes = []
+    for number in range(12):
+        give(node, "feedback", PLEASE, at(number * FRAME_NS + NS_PER_MS), HOME)
+        (unit,) = of(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
+        sizes.append(any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data))))
+    assert sizes[0]
+    assert 3 <= node.counts["keyframes_on_request"] <= 4
+    assert sum(sizes) == node.counts["keyframes_on_request"]
+
+
+def test_strangers_move_nothing() -> None:
+    """RTCP and hellos from anywhere else bring no keyframe, keep no path open and take no video away."""
+    node = node_with()
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    wake(node, 0)
+    forged = PathClient(bytes(16)).hello(0)
+    for number in range(1, 90):
+        for datagram in (PLEASE, REPORT, forged, b"LAVT", b"\x80\xc9", b""):
+            assert give(node, "feedback", datagram, at(number * FRAME_NS), ELSEWHERE) == []
+        sends = wake(node, number * FRAME_NS + NS_PER_MS)
+        assert {send.peer for send in sends if send.channel == "rtp"} <= {HOME}
+    assert of(sends, "rtp") == []
+    assert node.counts["keyframes_on_request"] == 0
+    assert node.counts["feedback_from_strangers"] == 2 * 89
+
+
+def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
+    """A receiver that reports keeps its video; RTCP that cannot be read is counted and does no harm."""
+    node = node_with()
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    for number in range(10):
+        give(node, "feedback", REPORT, at(number * NS_PER_S // 2), HOME)
+        give(node, "feedback", REPORT[:-3], at(number * NS_PER_S // 2), HOME)
+        assert of(wake(node, number * NS_PER_S // 2 + 1), "rtp")
+    assert node.counts["feedback_unreadable"] == 10
+    give(node, "video_token", None, at(5 * NS_PER_S))
+    assert of(wake(node, 5 * NS_PER_S + 1), "rtp") == []

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.node import WAKE
+from lavt.nodes.receiver import ReceiverNode
+from lavt.nodes.reports import PathToken
+from lavt.transport.reorder import ReorderBuffer
+from lavt.transport.rtcp import parse_feedback
+from lavt.transport.rtp import Depacketizer, Packetizer
+from lavt.transport.video_path import HELLO_INTERVAL_NS, PathServer, is_path_datagram
+from tests.nodes.stand_ins import at, give, of
+
+TOKEN = bytes(range(16))
+PORT = 5600
+HOME = ("192.0.2.1", 5)
+UNIT = b"\x00\x00\x00\x01\x67\x42\x00\x1e\x00\x00\x00\x01\x68\xce\x00\x00\x00\x01\x65" + bytes([9] * 5000)
+
+
+def new_node(*, token: bool = True) -> ReceiverNode:
+    node = ReceiverNode(ReorderBuffer(), Depacketizer())
+    if token:
+        give(node, "path_token", PathToken(TOKEN, PORT), at(0))
+    return node
+
+
+def packets(number: int = 3) -> list[list[bytes]]:
+    packetizer = Packetizer(77, 100)
+    return [packetizer.packetize(UNIT, 3000 * each) for each in range(number)]
+
+
+def test_it_is_silent_before_it_has_a_token() -> None:
+    """Without a session there is nobody to say hello to, and no wake is asked for."""
+    assert new_node(token=False).next_wake_ns() is None
+
+
+def test_hello_challenge_answer() -> None:
+    """It says hello at once and every 500 ms, answers the challenge, and so proves its path."""
+    node = new_node()
+    server = PathServer(lambda: bytes(32))
+    server.set_token(TOKEN)
+    (hello,) = give(node, WAKE, None, at(0))
+    assert (hello.channel, hello.peer, is_path_datagram(hello.payload)) == ("feedback", PORT, True)
+    assert node.next_wake_ns() == at(HELLO_INTERVAL_NS).mono_ns
+    challenge = server.receive(hello.payload, HOME, at(0).mono_ns)
+    (answer,) = give(node, "rtp", challenge, at(1))
+    assert answer.channel == "feedback"
+    server.receive(answer.payload, HOME, at(2).mono_ns)
+    assert server.open_address(at(2).mono_ns) == HOME
+    assert give(node, WAKE, None, at(HELLO_INTERVAL_NS))
+
+
+def test_the_same_token_again_changes_nothing() -> None:
+    """A session reply that repeats the token starts no new hello; a new token does."""
+    node = new_node()
+    give(node, WAKE, None, at(0))
+    give(node, "path_token", PathToken(TOKEN, PORT), at(1))
+    assert node.next_wake_ns() == at(HELLO_INTERVAL_NS).mono_ns
+    give(node, "path_token", PathToken(bytes(16), PORT), at(1))
+    assert node.next_wake_ns() == 0
+
+
+def test_packets_become_access_units_with_their_arrival() -> None:
+    """Packets in order become access units, each with the arrival of its last packet on the socket."""
+    node = new_node()
+    first, second, _ = packets()
+    for packet in first:
+        give(node, "rtp", packet, at(0))
+    (unit,) = of(give(node, WAKE, None, at(10 * NS_PER_MS)), "access_unit")
+    assert (unit.complete, unit.keyframe, unit.rtp_timestamp) == (True, True, 0)
+    for packet in second:
+        sends = give(node, "rtp", packet, at(12 * NS_PER_MS), arrived=at(11 * NS_PER_MS))
+    (unit,) = of(sends, "access_unit")
+    assert unit.packet_mono_ns == at(11 * NS_PER_MS).mono_ns
+
+
+def test_reports_go_out_every_500_ms() -> None:
+    """From the first packet on there is a receiver report every 500 ms, with the share that was lost."""
+    node = new_node()
+    first, second, third = packets()
+    reports = []
+    for at_ms in range(0, 2001, 5):
+        if at_ms == 0:
+            for packet in first:
+                give(node, "rtp", packet, at(0))
+        if at_ms == 600:
+            for packet in [*second[:1], *second[2:], *third]:
+                give(node, "rtp", packet, at(600 * NS_PER_MS))
+        for send in give(node, WAKE, None, at(at_ms * NS_PER_MS)):
+            if send.channel == "feedback" and not is_path_datagram(send.payload):
+                reports += [(at_ms, report) for report in parse_feedback(send.payload).reports]
+    assert [at_ms for at_ms, _ in reports] == [0, 500, 1000, 1500, 2000]
+    assert [report.cumulative_lost for _, report in reports] == [0, 0, 1, 1, 1]
+    lost_fraction = reports[2][1].lost_fraction
+    assert abs(lost_fraction - 1 / (len(second) + len(third))) < 1 / 256
+    assert reports[3][1].lost_fraction == 0
+
+
+def test_a_loss_asks_for_a_keyframe_at_most_every_100_ms() -> None:
+    """After a loss, and when the decoder has no picture, a keyframe is asked for, but once in 100 ms at most."""
+    node = new_node()
+    assert give(node, "picture_lost", None, at(0)) == []
+    first, second, third = packets()
+    for packet in [*first, *second[1:], *third]:
+        give(node, "rtp", packet, at(0))
+    asked = of(give(node, WAKE, None, at(10 * NS_PER_MS)), "feedback")
+    assert any(not is_path_datagram(each) and parse_feedback(each).picture_loss for each in asked)
+    times = [ms for ms in range(10, 400) if give(node, "picture_lost", None, at(ms * NS_PER_MS))]
+    assert times == [110, 210, 310]
+    assert node.counts["picture_loss_requests"] == 4
+
+
+@given(st.one_of(st.binary(max_size=80), st.binary(max_size=80).map(lambda tail: b"LAVT" + tail)))
+def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
+    """Whatever comes on the video's port is a packet, a challenge, or counted as unreadable."""
+    node = new_node()
+    give(node, "rtp", datagram, at(0))
+    give(node, WAKE, None, at(NS_PER_S))
+    counted = (node.counts[name] for name in ("packets", "packets_unreadable", "challenges_unreadable"))
+    assert sum(counted) <= 1
+    if len(datagram) < 12:
+        assert node.counts["packets"] == 0
+        assert node.counts["packets_unreadable"] + node.counts["challenges_unreadable"] == 1
+
+
+def test_a_challenge_without_a_session_is_counted() -> None:
+    """A challenge that nobody asked for is not answered."""
+    node = new_node(token=False)
+    assert give(node, "rtp", b"LAVT" + bytes(26), at(0)) == []
+    assert node.counts["challenges_unreadable"] == 1

@@ -1,0 +1,147 @@
+"""The first test to read: one frame, by hand, through the thirteen steps of its life."""
+
+from __future__ import annotations
+
+from itertools import count
+
+from lavt.control.drive_controller import make_controller
+from lavt.control.limiter import Limiter
+from lavt.control.limits import LIMITS
+from lavt.control.safety import SafetyGate
+from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, SessionRequest
+from lavt.perception.lane_detector import LaneDetector
+from lavt.transport.delay import DelayLaw, DelayLine
+from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.messages import decode, encode
+from lavt.transport.reorder import HOLD_NS, ReorderBuffer
+from lavt.transport.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
+from lavt.transport.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+from lavt.vehicle.sim.camera import SimCamera
+from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.simulator import Simulator
+
+WALL_NS = 1_790_000_000 * NS_PER_S
+START_NS = 100 * NS_PER_S
+VIDEO_DELAY_MS, CONTROL_DELAY_MS = 75.0, 20.0
+
+
+def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
+    """Hold the car and arm it, which takes a second; tell the gate and the epoch to command under."""
+    able = car.capabilities
+    limiter = Limiter(
+        LIMITS,
+        wheelbase_m=able.wheelbase_m,
+        max_steering_rad=able.max_steering_rad,
+        max_braking_mps2=able.max_braking_mps2,
+    )
+    numbers = count(1)
+    gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
+    epoch = gate.answer(SessionRequest("hold", "newcomer", 1, 0), car.state()).epoch
+    for number in range(51):
+        at_ns = START_NS - (51 - number) * 20 * NS_PER_MS
+        gate.written.note(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
+        neutral = Command(
+            epoch, number, 0, WALL_NS + at_ns, 0, 0.0, throttle=0.0, brake=1.0,
+            path_curvature_per_m=(0.0,) * 10, mode="arm", emergency_stop=0,
+        )  # fmt: skip
+        assert gate.admit(neutral, car.state(), at_ns).obeyed
+    assert gate.state == "driving"
+    return gate, epoch
+
+
+def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
+    """A picture becomes a command that moves the vehicle, and its stamp comes back with it."""
+    # Before: a car on a road, held and armed, with a camera, and somebody far away who drives by its pictures.
+    road, model = load_road("a_key"), CameraModel()
+    car = Simulator(road=road, seed=1, start_mono_ns=START_NS - 2 * NS_PER_S)
+    camera = SimCamera(model=model, rate_hz=30.0, phase_ns=0, road=road, seed=1, scenery="none")
+    gate, epoch = armed_gate(car)
+    now_ns = START_NS
+    car.advance(now_ns)
+
+    # 1. The camera gives a picture and says when it was taken.
+    frame = camera.capture(51, now_ns, car.pose())
+    assert frame is not None
+    assert (frame.capture_ns, frame.picture.shape) == (START_NS, (480, 640, 3))
+
+    # 2. The send time goes into the pixels, and the server remembers that it wrote it.
+    stamp_ns = WALL_NS + now_ns
+    write_stamp(frame.picture, stamp_ns)
+    gate.written.note(stamp_ns, frame.number, now_ns, pixel_crc=51)
+    assert set(frame.picture[:64, :64].ravel().tolist()) == {0, 255}
+
+    # 3. The picture becomes H.264.
+    encoder = Encoder(model.width_px, model.height_px, rate_hz=30.0, bit_rate_bps=4_000_000, gop_frames=30)
+    access_unit = encoder.encode(frame.picture)
+    assert len(access_unit) < frame.picture.nbytes / 10
+
+    # 4. H.264 becomes RTP packets, whose timestamp says the stamp's time again.
+    packets = Packetizer(ssrc=7, first_sequence=65_535).packetize(access_unit, rtp_timestamp(stamp_ns))
+    assert len(packets) > 1
+    assert max(map(len, packets)) <= MAX_PACKET_BYTES
+
+    # 5. The packets travel: all of one frame take the same time, and nothing overtakes.
+    video = DelayLine(DelayLaw(VIDEO_DELAY_MS))
+    for packet in packets:
+        now_ns = video.push(packet, START_NS, index=0)
+    assert now_ns == START_NS + 75 * NS_PER_MS
+    assert video.pop_due(now_ns - 1) == []
+    arrived = video.pop_due(now_ns)
+    assert arrived == packets
+
+    # 6. The packets arrive, are put in order (here the last two changed places), and become H.264 again.
+    arrived[-1], arrived[-2] = arrived[-2], arrived[-1]
+    reorder, depacketizer = ReorderBuffer(), Depacketizer()
+    ordered = [each for packet in arrived for each in reorder.push(parse_packet(packet), now_ns)]
+    now_ns += HOLD_NS  # the first packets of a stream wait for any that were sent before them
+    ordered += reorder.expire(now_ns)
+    units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
+    assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit)]
+    assert (units[0].complete, units[0].keyframe) == (True, True)
+
+    # 7. H.264 becomes a picture, at once.
+    decoded = Decoder().decode(units[0].data)
+    assert decoded is not None
+    assert decoded.picture.shape == frame.picture.shape
+    assert not decoded.corrupt
+
+    # 8. The send time comes out of the pixels, and is believed because the packets say the same.
+    read_ns = read_stamp(decoded.luma)
+    assert read_ns == stamp_ns
+    assert stamp_agrees(read_ns, units[0].timestamp)
+
+    # 9. The picture becomes a lane: 8 m ahead its middle is where the truth has it.
+    lane = LaneDetector(model).detect(decoded.picture)
+    truth = car.ground_truth()
+    seen_y_m = lane.centre[0] + 8 * lane.centre[1] + 64 * lane.centre[2]
+    assert lane.confidence > 0.5
+    assert abs(seen_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
+
+    # 10. The lane becomes a command: go, and steer towards the middle.
+    controller = make_controller("lane_keeper", "designed", car.capabilities.wheelbase_m)
+    decision = controller.decide(lane, car.state().speed_mps, now_ns)
+    assert decision.throttle > 0
+    command = Command(
+        epoch, 100, WALL_NS + now_ns, read_ns, WALL_NS + now_ns, decision.steering_rad, decision.throttle,
+        decision.brake, decision.path_curvature_per_m, mode="drive", emergency_stop=0,
+    )  # fmt: skip
+
+    # 11. The command travels, as bytes, and is checked before anybody looks at it.
+    control = DelayLine(DelayLaw(CONTROL_DELAY_MS))
+    now_ns = control.push(encode(command), now_ns, index=0)
+    (datagram,) = control.pop_due(now_ns)
+    received = decode(Command, datagram)
+    assert received == command
+
+    # 12. The command is admitted: right epoch, newer, and made from a picture that this server took just now.
+    picture_age_ns = now_ns - START_NS
+    assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + HOLD_NS
+    car.advance(now_ns)
+    assert gate.admit(received, car.state(), now_ns).obeyed
+    assert not gate.admit(received, car.state(), now_ns).obeyed, "nothing is obeyed twice"
+
+    # 13. The vehicle obeys: it stood until now, and moves from now on.
+    assert car.state().speed_mps == 0.0
+    car.apply(gate.actuation(car.state(), now_ns), now_ns)
+    car.advance(now_ns + NS_PER_S)
+    assert car.state().speed_mps > 0.0
