@@ -14,7 +14,7 @@ from lavt.config import SweepConfig, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.sweep import sweep
+from lavt.experiment.sweep import open_sweep, sweep
 
 CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
@@ -27,7 +27,8 @@ def two_runs() -> list[PlannedRun]:
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two runs, driven by two processes."""
     out = tmp_path_factory.mktemp("sweep") / "out"
-    sweep(two_runs(), out, jobs=2, resume=False, tell=lambda _: None)
+    open_sweep(out, resume=False)
+    sweep(two_runs(), out, jobs=2, tell=lambda _: None)
     return out
 
 
@@ -50,7 +51,7 @@ def test_resuming_drives_only_what_is_missing(swept: Path) -> None:
     first, second = (swept / "runs" / run.name for run in two_runs())
     kept = (second / "result.json").stat().st_mtime_ns
     (first / "result.json").unlink()  # as if it had been killed while driving
-    sweep(two_runs(), swept, jobs=1, resume=True, tell=lambda _: None)
+    sweep(two_runs(), swept, jobs=1, tell=lambda _: None)
     after = json.loads((swept / "summary.json").read_text())
     assert (second / "result.json").stat().st_mtime_ns == kept
     assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
@@ -61,7 +62,7 @@ def test_resuming_with_another_config_is_refused(swept: Path) -> None:
     """A sweep that was driven with another config is not resumed: its runs would not belong together."""
     changed = plan_sweep(load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, "seed=2"]))
     with pytest.raises(UserError, match="another config"):
-        sweep(changed, swept, jobs=1, resume=True, tell=lambda _: None)
+        sweep(changed, swept, jobs=1, tell=lambda _: None)
 
 
 @pytest.mark.realtime

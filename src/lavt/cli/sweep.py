@@ -10,9 +10,9 @@ import typer
 from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import SweepConfig, load_config
-from lavt.experiment.directory import check_directory
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
+from lavt.experiment.sweep import open_sweep
 from lavt.experiment.sweep import sweep as drive_sweep
 
 
@@ -35,10 +35,9 @@ def sweep(
     """
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
-    if not resume:
-        check_directory(out)
+    open_sweep(out, resume=resume)
     with console.interruptible(), progress(f"sweep into {out}", len(planned)) as tell:
-        page, driven = drive_sweep(planned, out, jobs=jobs, resume=resume, tell=tell)
+        page, driven = drive_sweep(planned, out, jobs=jobs, tell=tell)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
     if as_json:

@@ -47,8 +47,9 @@ class Process:
         self._reader.start()
 
     def ready(self) -> dict[str, Any]:
-        """Wait for the first line; raises `WorkError` where the process ends or says nothing, `UserError`
-        where it ends because its input was wrong.
+        """Wait for the first line.
+
+        Raises `WorkError` where the process says nothing or ends, and `UserError` where it ends for wrong input.
         """
         try:
             line = self._first.get(timeout=READY_S)

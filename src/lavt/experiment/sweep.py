@@ -76,14 +76,16 @@ def run_all(
     return Driven(results, failed), speed
 
 
-def sweep(
-    planned: Sequence[PlannedRun], out: Path, *, jobs: int | None, resume: bool, tell: Tell
-) -> tuple[Path, Driven]:
-    """Drive a sweep into `out`, and write its summary and report; returns the report's page."""
+def open_sweep(out: Path, *, resume: bool) -> None:
+    """Make the directory of a sweep or, to resume one, find it; raises `UserError` where that cannot be."""
     if resume and not out.is_dir():
         raise UserError(f"there is nothing to resume in {out}: leave --resume away to begin")
     if not resume:
         prepare_directory(out)
+
+
+def sweep(planned: Sequence[PlannedRun], out: Path, *, jobs: int | None, tell: Tell) -> tuple[Path, Driven]:
+    """Drive what is missing of a sweep into `out`, and write its summary and report; returns the report's page."""
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     _remove_unfinished(planned, runs_dir)

@@ -121,8 +121,9 @@ class CameraNode:
         return frame
 
     def _stamp(self, frame: CapturedFrame, now: Now) -> Stamped:
-        # Below the stamp: a camera that gives the same buffer again gives it with the stamp that was written into it.
+        # Around the stamp: a camera that gives the same buffer again gives it with the stamp that was written into it.
         pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[STAMP_PX:]).data)
+        pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[:STAMP_PX, STAMP_PX:]).data, pixel_crc)
         stamp_ns = now.wall_ns
         while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
             stamp_ns += 1

@@ -50,7 +50,7 @@ class ClientSession:
             return None
         self._ask_ns = now_ns + ASK_PERIOD_NS
         if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
-            return SessionRequest("clear_emergency_stop", self._who, self._instance, 0)
+            return SessionRequest("clear_emergency_stop", self._who, self._instance, self._highest_emergency_stop)
         return SessionRequest("hold", self._who, self._instance, 0)
 
     def note_reply(self, reply: SessionReply, _now_ns: int) -> None:

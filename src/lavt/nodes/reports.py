@@ -16,7 +16,7 @@ class FrameWritten:
     stamped_mono_ns: int
     capture_ns: int | None
     pixel_crc: int
-    """CRC-32 of the rows below the stamp."""
+    """CRC-32 of the pixels around the stamp."""
     size_bytes: int
 
 
