@@ -13,10 +13,8 @@ from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.config import RunConfig, SweepConfig, load_config, parse_config, shipped
 from lavt.experiment.plan import plan_run, plan_sweep
-from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
 from lavt.experiment.run import prepare_directory, run_once
-from lavt.experiment.sweep import run_all
 
 REAL_CONDITIONS = ("L0", "L5")
 VIRTUAL_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
@@ -32,6 +30,9 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
 
     Example: lavt demo --out out/demo
     """
+    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep import run_all  # noqa: PLC0415
+
     out = out or Path("out") / "demo"
     config = shipped("configs/demo.yaml")
     prepare_directory(out)

@@ -9,7 +9,6 @@ import typer
 
 from lavt.cli import console
 from lavt.errors import UserError
-from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
 from lavt.experiment.run import RESULT, compute_result
 
@@ -27,6 +26,8 @@ def report(
 
     Example: lavt report out/sweep --out out/sweep
     """
+    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+
     runs = [run for directory in directories for run in _runs(directory)]
     for run in runs:
         result = read_json(run / RESULT)

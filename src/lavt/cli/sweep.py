@@ -11,7 +11,6 @@ from lavt.cli import console
 from lavt.config import SweepConfig, load_config
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
-from lavt.experiment.sweep import sweep as drive_sweep
 
 
 def register(app: typer.Typer) -> None:
@@ -31,6 +30,8 @@ def sweep(
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
+    from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
     console.say(f"{len(planned)} runs into {out}")
