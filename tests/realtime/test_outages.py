@@ -29,6 +29,11 @@ ASK_FOR_STOP_AFTER_NS = 2500 * NS_PER_MS
 OUTAGE_S = 3.0
 STALL_S = 1.2
 """Shorter than the routers' lease of 2 s: what was sent meanwhile is kept and comes all at once."""
+SLOW_MPS = 2.5
+"""Stops from here need little of the straight at the beginning of the road."""
+FAST_MPS = 8.0
+"""Nearly the 30 km/h that the controller keeps."""
+AT_ALL_MPS = 0.5
 AGAIN_S = 20.0
 """Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
 MARGIN_S = 0.5
@@ -69,6 +74,7 @@ class Drive:
             phase = self.client.latest.get("status", {}).get("phase")
             return (told.get("safety"), phase) == ("driving", "driving") and bool(told["speed_mps"] >= speed_mps)
 
+        assert self.loop.server.running, self.loop.server.said()
         self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, AGAIN_S)
 
     def breaks(self, name: str) -> None:
@@ -106,15 +112,13 @@ class Drive:
             self.codes[name] = process.popen.returncode
 
 
-def everything_but_the_clients_death(drive: Drive, speed_mps: float) -> None:
+def what_the_network_does(drive: Drive) -> None:
     relay = drive.loop.relay
     assert relay is not None
-    drive.reach(speed_mps)
-    drive.suspend("client suspended", drive.client, OUTAGE_S)
-    drive.reach(speed_mps)
+    drive.reach(SLOW_MPS)
     drive.kill("router killed", drive.client_router)
     drive.restart_the_router(OUTAGE_S)
-    drive.reach(speed_mps)
+    drive.reach(SLOW_MPS)
     drive.suspend("network stalled", relay, STALL_S)
 
 
@@ -125,11 +129,13 @@ def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: P
     with Processes(work) as processes:
         drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
         drive.start()
-        everything_but_the_clients_death(drive, 6.0)
-        drive.reach(7.0)
+        what_the_network_does(drive)
+        drive.reach(FAST_MPS)
         drive.kill("client killed", drive.client)
         drive.start_another_client()
-        drive.reach(3.0)
+        drive.reach(SLOW_MPS)
+        drive.suspend("client suspended", drive.client, OUTAGE_S)
+        drive.reach(AT_ALL_MPS)
         drive.kill("server killed", drive.loop.server)
         pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
         drive.end()
@@ -138,13 +144,15 @@ def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: P
 
 @pytest.fixture(scope="module")
 def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
-    """The same outages, with a server that obeys whatever it can read."""
+    """The same outages of client and network, with a server that obeys whatever it can read."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
         drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(OBEYS_EVERYTHING),))
         drive.start()
-        everything_but_the_clients_death(drive, 4.0)
-        drive.reach(1.0)
+        what_the_network_does(drive)
+        drive.reach(SLOW_MPS)
+        drive.suspend("client suspended", drive.client, OUTAGE_S)
+        drive.reach(AT_ALL_MPS)
         drive.end()
     return drive
 
@@ -195,7 +203,7 @@ def stale(record: Record, stop: Now) -> int:
     return int(np.sum(old))
 
 
-OUTAGES = ("client suspended", "router killed", "network stalled", "client killed")
+OUTAGES = ("router killed", "network stalled", "client killed", "client suspended")
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
@@ -233,10 +241,10 @@ def test_nothing_from_before_a_stop_is_obeyed_after_it(drive: Drive, server: Rec
     armed = transition(server, "driving", stop.mono_ns)
 
     assert stale(server, stop) == 0
-    assert np.sum(obeyed(server).ints("received_mono_ns") > armed.mono_ns) > 50
+    assert np.sum(obeyed(server).ints("received_mono_ns") > armed.mono_ns) > 20
 
 
-@pytest.mark.parametrize("outage", ["client suspended", "router killed", "network stalled"])
+@pytest.mark.parametrize("outage", ["router killed", "network stalled", "client suspended"])
 def test_a_server_that_obeys_everything_would_obey_what_is_stale(
     unguarded: Drive, unguarded_server: Record, outage: str
 ) -> None:

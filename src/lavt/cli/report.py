@@ -10,7 +10,6 @@ import typer
 from lavt.cli import console
 from lavt.errors import UserError
 from lavt.experiment.directory import make_directory
-from lavt.experiment.report import write_report
 from lavt.experiment.results import read_json
 from lavt.experiment.run import RESULT, compute_result
 
@@ -31,6 +30,8 @@ def report(
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
+    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+
     runs = [run for directory in directories for run in _runs(directory)]
     for run in runs:
         result = read_json(run / RESULT)

@@ -12,8 +12,6 @@ from lavt.cli.progress import progress
 from lavt.config import SweepConfig, load_config
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
-from lavt.experiment.sweep import open_sweep
-from lavt.experiment.sweep import sweep as drive_sweep
 
 
 def register(app: typer.Typer) -> None:
@@ -33,6 +31,9 @@ def sweep(
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
+    from lavt.experiment.sweep import open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+
     planned = plan_sweep(load_config(SweepConfig, config, changes or []))
     out = out or Path("out") / "sweep"
     open_sweep(out, resume=resume)
