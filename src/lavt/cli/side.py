@@ -128,6 +128,12 @@ class Side:
             self._writer.close()
 
 
+def _in_words(status: Mapping[str, Any], ending: str | None) -> str:
+    """Say how things are, for a person who reads a line whenever it changes."""
+    state = f"{status.get('safety', 'waiting')}: {status.get('because', '')}"
+    return state if ending is None else f"{state} ({ending})"
+
+
 def run_side(
     side: Side,
     nodes: Sequence[Node],
@@ -149,7 +155,7 @@ def run_side(
                 status |= {"phase": session.phase, "session": session.because}
             if as_json:
                 console.show_json({"status": status, "ending": side.tap.ending})
-            elif (state := f"{status.get('safety', 'waiting')}: {status.get('because', '')}") != told_state:
+            elif (state := _in_words(status, side.tap.ending)) != told_state:
                 console.show(state)
                 told_state = state
             if once and side.tap.ending is not None:

@@ -18,7 +18,7 @@ from lavt.domain import Actuation, Command, Operation, SafetyState, SessionReply
 
 Trigger = Literal[
     "arming begins", "arming broken", "arming held", "silence", "fresh command", "long silence", "stop asked",
-    "camera fault", "emergency stop", "cleared", "released",
+    "camera fault", "emergency stop", "cleared", "released", "drive over",
 ]  # fmt: skip
 
 ACTIVE: tuple[SafetyState, ...] = ("arming", "driving", "degraded")
@@ -35,7 +35,7 @@ TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
     ("degraded", "long silence"): "safe_stop",
     **{(state, trigger): "safe_stop"
        for state in ("driving", "degraded")
-       for trigger in ("stop asked", "camera fault", "released")},
+       for trigger in ("stop asked", "camera fault", "released", "drive over")},
     **{(state, "emergency stop"): "emergency_stop"
        for state in ("disarmed", "arming", "driving", "degraded", "safe_stop")},
     ("emergency_stop", "cleared"): "disarmed",
@@ -54,6 +54,7 @@ BECAUSE: dict[Trigger, str] = {
     "emergency stop": "emergency stop",
     "cleared": "the emergency stop was cleared",
     "released": "the client released the vehicle",
+    "drive over": "the drive is over",
 }
 
 
@@ -279,7 +280,7 @@ class SafetyGate:
 
     def end_drive(self) -> None:
         """The drive is over: stop."""
-        self._trigger("stop asked")
+        self._trigger("drive over")
 
     def take_transitions(self) -> list[tuple[SafetyState, SafetyState, str]]:
         """Take the transitions since the last call: from, to, why."""
