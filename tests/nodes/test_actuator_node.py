@@ -6,6 +6,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
 
 from lavt.control.limiter import Limiter
 from lavt.control.limits import LIMITS
@@ -15,7 +16,6 @@ from lavt.node import WAKE, Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.reports import Admission, FrameWritten, Route
 from lavt.transport.messages import decode, encode
-from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
 
 TICK_NS = 20 * NS_PER_MS
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 from itertools import count
 
 import pytest
+from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
 
 from lavt.control.written import WrittenStamps
 from lavt.domain import NS_PER_MS, NS_PER_S, Pose
@@ -13,7 +14,6 @@ from lavt.transport.rtcp import picture_loss, receiver_report
 from lavt.transport.rtp import Packetizer, parse_packet
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathClient, PathServer
-from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
 
 FRAME_NS = NS_PER_S // 30
 TOKEN = bytes(range(16))

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+from tests.nodes.stand_ins import MONO_NS, at, give
+
 from lavt.domain import NS_PER_S
 from lavt.node import WAKE, Send
 from lavt.nodes.clock_sync import ClockSyncNode
 from lavt.nodes.reports import ClockSample
 from lavt.transport.clock_offset import ClockReport
-from tests.nodes.stand_ins import MONO_NS, at, give
 
 
 def test_it_asks_once_a_second() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.nodes.stand_ins import at, give, of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.node import WAKE
@@ -11,7 +12,6 @@ from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtcp import parse_feedback
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.video_path import HELLO_INTERVAL_NS, PathServer, is_path_datagram
-from tests.nodes.stand_ins import at, give, of
 
 TOKEN = bytes(range(16))
 PORT = 5600
