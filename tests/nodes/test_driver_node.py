@@ -1,3 +1,5 @@
+# ruff: noqa: D102 (a bench for tests: short methods say themselves what they do)
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
