@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,8 +67,12 @@ def test_each_hop_gets_the_time_after_the_one_before() -> None:
     """Hop after hop is called with the value and the end of the hop before, and the timeline lists all ends."""
     seen = []
 
-    def hop(result: object) -> Any:
-        return lambda value, now: (seen.append((value, now.mono_ns)), result)[1]
+    def hop(result: object) -> Callable[[Any, Now], object]:
+        def call(value: object, now: Now) -> object:
+            seen.append((value, now.mono_ns))
+            return result
+
+        return call
 
     first = message("control")
     sends = [Send("event", 1)]

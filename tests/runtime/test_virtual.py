@@ -18,7 +18,7 @@ MS = NS_PER_MS
 
 
 class Talker:
-    """A node that says a numbered message every period and notes what it hears; its name is one of the channel table."""
+    """A node that says a numbered message every period and notes what it hears."""
 
     def __init__(self, name: str, says: str, hears: str, *, start_ns: int, period_ns: int | None) -> None:
         self.name, self.counts = name, Counter[str]()
