@@ -18,6 +18,17 @@ from lavt.vehicle.vehicle import Capabilities
 MONO_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
 SMALL = CameraModel(width_px=128, height_px=96)
+CAPABILITIES = Capabilities(
+    simulated=True,
+    virtual_time=True,
+    ground_truth=False,
+    reset=False,
+    wheelbase_m=2.8448,
+    max_steering_rad=0.513,
+    max_steering_rate_radps=0.534,
+    max_acceleration_mps2=2.0,
+    max_braking_mps2=6.0,
+)
 
 
 def at(mono_ns: int, wall_ns: int | None = None) -> Now:
@@ -25,7 +36,9 @@ def at(mono_ns: int, wall_ns: int | None = None) -> Now:
     return Now(MONO_NS + mono_ns, WALL_NS + (mono_ns if wall_ns is None else wall_ns))
 
 
-def give(node: Node, channel: str, payload: Any, now: Now, peer: Any = None, arrived: Now | None = None) -> list[Send]:
+def give(
+    node: Node, channel: str, payload: Any, now: Now, peer: Any = None, *, arrived: Now | None = None
+) -> list[Send]:
     """Walk one message through a node whose hops take no time."""
     message = Message(channel, payload, arrived or now, peer)
     return walk(node.name, node.chains[channel], message, now, lambda _hop, before: before).sends
@@ -71,7 +84,7 @@ class StandingVehicle:
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities(True, True, False, False, 2.8448, 0.513, 0.534, 2.0, 6.0)
+        return CAPABILITIES
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         self.now_ns = max(self.now_ns, to_ns)

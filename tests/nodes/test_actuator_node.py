@@ -1,3 +1,5 @@
+# ruff: noqa: D102 (a bench for tests: short methods say themselves what they do)
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -65,10 +67,15 @@ class Bench:
         stamp_ns = self.picture()
         command = Command(self.epoch, self.sequence, 11, stamp_ns, 22, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0)
         (admission,) = of(self.take("control", encode(replace(command, **changes))), "admission")
+        assert isinstance(admission, Admission)
         return admission
 
     def drive(self, **changes: Any) -> Admission:
         return self.command(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
+
+    @property
+    def safety(self) -> str:
+        return self.gate.state
 
     def armed(self) -> Bench:
         self.ask("hold")
@@ -140,11 +147,11 @@ def test_nothing_moves_before_the_first_drive_command_and_silence_stops() -> Non
     """Armed, the vehicle gets no throttle before a drive command; 300 ms later it degrades, after 500 ms it stops."""
     bench = Bench().armed()
     bench.go(299 * NS_PER_MS)
-    assert bench.gate.state == "driving"
+    assert bench.safety == "driving"
     bench.go(NS_PER_MS)
-    assert bench.gate.state == "degraded"
+    assert bench.safety == "degraded"
     bench.go(200 * NS_PER_MS)
-    assert bench.gate.state == "safe_stop"
+    assert bench.safety == "safe_stop"
     assert all(asked.throttle == 0 and asked.brake > 0 for asked in bench.vehicle.obeyed)
 
 
@@ -155,10 +162,10 @@ def test_a_drive_begins_and_ends_exactly_once() -> None:
     bench.vehicle.speed_mps = 8.0
     bench.go(300 * NS_PER_MS)
     bench.drive()
-    assert bench.gate.state == "driving"
+    assert bench.safety == "driving"
     bench.vehicle.happens = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
     bench.go(TICK_NS)
-    assert bench.gate.state == "safe_stop"
+    assert bench.safety == "safe_stop"
     bench.vehicle.happens = [VehicleEvent(3, "collision", "")]
     bench.vehicle.speed_mps = 0.0
     bench.go(NS_PER_S)
@@ -167,7 +174,7 @@ def test_a_drive_begins_and_ends_exactly_once() -> None:
 
 
 def test_a_stop_is_the_ending_once_the_vehicle_stands() -> None:
-    """A drive that ends in a safe stop has that ending, told when the vehicle stands; armed anew, a new drive begins."""
+    """A safe stop is an ending, told when the vehicle stands; armed anew, a new drive begins."""
     bench = Bench().armed()
     bench.vehicle.speed_mps = 8.0
     bench.go(NS_PER_S)
@@ -215,7 +222,7 @@ def test_frozen_pictures_stop_the_vehicle_though_they_thaw() -> None:
         stamp_ns = at(bench.mono_ns).wall_ns + number
         crc = -1 if number < 5 else 7
         bench.take("frame", FrameWritten(5000 + number, stamp_ns, at(bench.mono_ns).mono_ns, None, crc, 1))
-    assert bench.gate.state == "safe_stop"
+    assert bench.safety == "safe_stop"
 
 
 def test_the_route_is_told_once() -> None:

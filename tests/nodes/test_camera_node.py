@@ -116,7 +116,7 @@ def test_no_picture_is_counted_and_nothing_sent() -> None:
 
 
 def test_no_video_without_a_proven_path() -> None:
-    """Without a proof, or without a session, no packet leaves; a proven address gets the video, and only while it reports."""
+    """Without a session or a proof no packet leaves; a proven address gets the video, and only while it reports."""
     node = node_with()
     assert of(wake(node, 0), "rtp") == []
     assert give(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []

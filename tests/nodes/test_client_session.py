@@ -78,7 +78,7 @@ def test_with_rearm_it_asks_again_at_standstill() -> None:
     session = driving(rearm=True)
     session.note_state(state("safe_stop", 3.0), 500)
     session.note_state(state("safe_stop", 2.0), 600)
-    assert session.phase == "stopped"
+    assert session.next_wake_ns() is None
     session.note_state(state("safe_stop", 0.0), 700)
     assert session.phase == "seeking"
     assert session.request_due(700) is not None
@@ -95,7 +95,7 @@ def test_an_emergency_stop_has_a_number_beyond_all_seen() -> None:
 
 
 def test_an_emergency_stop_taken_for_an_old_one_is_raised_again() -> None:
-    """A client whose wall clock is behind learns the higher number from the refusal, and its commands carry a new one."""
+    """A client whose wall clock is behind learns the higher number from the refusal, and carries a newer one."""
     session = driving()
     assert session.stop_now(60).number == 60
     session.note_reply(REFUSED, 300)
