@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections import Counter
@@ -12,6 +13,9 @@ from typing import Any, Protocol
 from lavt.domain import Command, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
+
+
+log = logging.getLogger(__name__)
 
 
 class Recorder(Protocol):
@@ -76,11 +80,12 @@ def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
 class QueuedRecorder:
     """A recorder behind a bounded queue and a thread of its own, so that no node ever waits for a disk.
 
-    What does not fit is counted in `overflow`; a run with an overflow is invalid.
+    What does not fit, or cannot be written, is counted in `overflow`; a run with an overflow is invalid.
     """
 
     def __init__(self, recorder: Recorder, capacity: int = 8192) -> None:
         self.overflow = 0
+        self._failed = False
         self._recorder = recorder
         self._queue: queue.Queue[tuple[str, Any, Now] | None] = queue.Queue(capacity)
         self._thread = threading.Thread(target=self._drain, name="recorder", daemon=True)
@@ -97,8 +102,17 @@ class QueuedRecorder:
         """Write what is queued, and how much was lost."""
         self._queue.put(None)
         self._thread.join()
-        self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
+        if not self._failed:
+            self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
 
     def _drain(self) -> None:
         while (entry := self._queue.get()) is not None:
-            self._recorder.write(*entry)
+            if self._failed:
+                self.overflow += 1
+                continue
+            try:
+                self._recorder.write(*entry)
+            except OSError as error:  # a full disk ends the record, not the drive
+                log.error("the record ends here, it cannot be written: %s", error)
+                self._failed = True
+                self.overflow += 1

@@ -1,0 +1,109 @@
+"""The main job, as a person at a terminal sees it."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+RUN_KEYS = {
+    "run", "time", "injection", "inherent", "route", "condition", "controller", "preset", "driver", "participant",
+    "block", "order", "repetition", "seed", "digest", "ending", "valid", "invalid_because", "distance_m", "duration_s",
+    "mae_m", "rms_m", "p95_m", "max_m", "heading_rms_rad", "steering_rms_rad", "steering_reversals_per_s", "collisions",
+    "lane_invasions", "loop_ms", "picture_age_ms", "tau_v_ms", "tau_c_ms", "frames_sent", "frames_decoded",
+    "frames_unreadable",
+}  # fmt: skip
+CONDITION_KEYS = {
+    "runs", "completed", "completion_rate", "completion_interval", "collisions_per_run", "lane_invasions_per_run",
+    "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms",
+}  # fmt: skip
+VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What the demo left and what it said on a terminal."""
+
+    out: Path
+    code: int
+    said: str
+    summary: dict[str, Any]
+
+
+def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
+    """Run a program with a terminal for its standard output and error."""
+    terminal, end = pty.openpty()
+    program = subprocess.Popen(arguments, stdout=end, stderr=end, stdin=subprocess.DEVNULL)
+    os.close(end)
+    said = bytearray()
+    while True:
+        try:
+            piece = os.read(terminal, 65536)
+        except OSError:  # Linux's way to say that the program has closed the terminal
+            break
+        if not piece:
+            break
+        said += piece
+    os.close(terminal)
+    return program.wait(), said.decode(errors="replace")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+    """Give the demo, run once."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
+    assert code == 0, said
+    return Demo(out, code, said, json.loads((out / "summary.json").read_text()))
+
+
+def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
+    """The demo drives at L0 and L5 in real time through a relay, and from L0 to L5 in virtual time."""
+    runs: dict[tuple[str, str], list[str]] = {}
+    for run in demo.summary["runs"]:
+        runs.setdefault((run["time"], run["injection"]), []).append(run["condition"])
+    assert runs == {("real", "relay"): ["L0", "L5"], ("virtual", "model"): VIRTUAL}
+    assert all(run["preset"] == "paper_calibrated" for run in demo.summary["runs"])
+
+
+def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
+    """Every run, condition and group in summary.json has the keys that others rely on."""
+    assert set(demo.summary) == {"schema", "speed", "runs", "conditions", "real", "groups"}
+    assert all(run.keys() >= RUN_KEYS for run in demo.summary["runs"])
+    conditions = [*demo.summary["conditions"].values(), *demo.summary["real"].values()]
+    assert all(set(condition) == CONDITION_KEYS for condition in conditions)
+    assert list(demo.summary["conditions"]) == VIRTUAL
+    assert demo.summary["groups"]
+
+
+def test_the_delay_shows(demo: Demo) -> None:
+    """At L0 the lane is kept within 0.3 m; at L5 it is left, in real as in virtual time."""
+    for run in demo.summary["runs"]:
+        if run["condition"] == "L0":
+            assert (run["ending"], run["lane_invasions"]) == ("completed", 0)
+            assert run["p95_m"] < 0.3
+        if run["condition"] == "L5":
+            assert run["lane_invasions"] > 0
+
+
+def test_the_terminal_shows_the_drive(demo: Demo) -> None:
+    """On a terminal the demo shows speed, tau_v, tau_c and cross-track error, then a table and the report's place."""
+    for text in ("km/h", "tau_v", "tau_c", "cross-track", "225 + 100", "the report is"):
+        assert text in demo.said
+    assert (demo.out / "report" / "index.html").is_file()
+
+
+def test_every_run_can_be_computed_again(demo: Demo) -> None:
+    """`lavt report` makes the same summary again from the records alone."""
+    before = demo.summary
+    subprocess.run([sys.executable, "-m", "lavt", "report", str(demo.out)], check=True, capture_output=True)
+    after = json.loads((demo.out / "summary.json").read_text())
+    assert after["conditions"] == before["conditions"]
+    assert [run["p95_m"] for run in after["runs"]] == [run["p95_m"] for run in before["runs"]]
