@@ -123,7 +123,8 @@ def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: 
         status = loop.server.latest.get("status", {})
         ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
         if ended is not None:
-            raise WorkError(f"{ended.name} ended in the middle of the run: {ended.said()}")
+            code = ended.popen.returncode  # negative: the signal that ended it
+            raise WorkError(f"{ended.name} ended in the middle of the run with {code}: {ended.said()}")
         if gone_s > LONGEST_S or (gone_s > BEGIN_S and status.get("safety") in (None, "disarmed", "arming")):
             raise WorkError(f"the drive did not begin or end within {gone_s:.0f} s: {loop.client.latest} {status}")
         if progress is not None:
