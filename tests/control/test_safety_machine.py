@@ -55,7 +55,7 @@ class GateMachine(RuleBasedStateMachine):
         fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
         neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
         good = lawful and command.mode == "arm" and neutral and fresh and command.brake >= LIMITS.arming_brake
-        kept = good and verdict.obeyed and rig.vehicle.speed_mps == 0
+        kept = good and verdict.obeyed and abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
         if not kept and (verdict.obeyed or verdict.reason in BREAKS_ARMING):
             self.held_since_ns = None
         self.only_the_table_leads_anywhere()
