@@ -47,6 +47,14 @@ def test_the_wheel_turns_no_faster_than_the_rate() -> None:
     assert changed == ()
 
 
+def test_what_is_reached_within_a_command_period_is_not_called_limited() -> None:
+    """A target that the wheel reaches within 20 ms was not changed by the limit, only spread over ticks of 4 ms."""
+    for asked_rad, named in ((0.0159, ()), (0.0161, ("steering rate",))):
+        actuation, changed = limited(Actuation(asked_rad, 0.0, 0.0), SPEED_MPS, after_ns=4 * NS_PER_MS)
+        assert actuation.steering_rad == pytest.approx(0.0032)
+        assert changed == named
+
+
 def test_a_time_that_goes_back_gives_no_extra_turn() -> None:
     """Asked at times that jump back and forth the wheel turns no further than in the time that really passed."""
     limiter = new_limiter()

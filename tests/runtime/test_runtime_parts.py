@@ -120,6 +120,24 @@ def test_every_channel_across_the_network_has_a_way_into_the_record() -> None:
     assert {name for name, row in CHANNELS.items() if row.carrier in ("video", "zenoh")} == set(WIRE)
 
 
+def test_a_full_disk_ends_the_record_and_nothing_else() -> None:
+    """When an entry cannot be written, that and all later ones are counted as lost; nobody is stopped by it."""
+
+    class FullDisk(Kept):
+        def write(self, topic: str, payload: Any, now: Now) -> None:
+            if len(self.entries) == 2:
+                raise OSError("no space left on device")
+            super().write(topic, payload, now)
+
+    disk = FullDisk()
+    recorder = QueuedRecorder(disk)
+    for number in range(5):
+        recorder.write("event", number, NOW)
+    recorder.close(NOW)
+    assert [payload for _, payload, _ in disk.entries] == [0, 1]
+    assert recorder.overflow == 3
+
+
 def test_a_full_record_queue_loses_and_counts() -> None:
     """When the disk cannot follow, entries are lost, counted, and the count is in the record; nobody waits."""
     import threading

@@ -7,7 +7,6 @@ import math
 from lavt.control.limits import CLIENT_LIMITS, Limits
 from lavt.domain import NS_PER_S, Actuation, VehicleState
 
-
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
 """A change of steering that the wheel may reach within this is not called changed by the limit of its rate."""
 
@@ -54,7 +53,7 @@ class Limiter:
                 changed.append(name)
                 steering_rad = bounded_rad
         reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
-        if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
+        if abs(steering_rad - before_rad) > max(step_rad, self.limits.steering_rate_radps * COMMAND_PERIOD_S):
             changed.append("steering rate")
         throttle = asked.throttle
         known = math.isfinite(vehicle.speed_mps)

@@ -14,7 +14,6 @@ from lavt.domain import Command, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
 
-
 log = logging.getLogger(__name__)
 
 
