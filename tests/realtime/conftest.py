@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
+import pty
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,7 +78,51 @@ def real_drive(tmp_path_factory: pytest.TempPathFactory) -> Callable[[PlannedRun
     return drive
 
 
+@dataclass(frozen=True)
+class Demo:
+    """What the demo left and what it said on a terminal."""
+
+    out: Path
+    code: int
+    said: str
+    summary: dict[str, Any]
+
+
+def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
+    """Run a program with a terminal for its standard output and error."""
+    terminal, end = pty.openpty()
+    program = subprocess.Popen(arguments, stdout=end, stderr=end, stdin=subprocess.DEVNULL)
+    os.close(end)
+    said = bytearray()
+    while True:
+        try:
+            piece = os.read(terminal, 65536)
+        except OSError:  # Linux's way to say that the program has closed the terminal
+            break
+        if not piece:
+            break
+        said += piece
+    os.close(terminal)
+    return program.wait(), said.decode(errors="replace")
+
+
 @pytest.fixture(scope="session")
-def injected(planned: Callable[..., PlannedRun], real_drive: Callable[[PlannedRun], RealDrive]) -> dict[str, RealDrive]:
-    """Give a drive under L0 and one under L5."""
-    return {name: real_drive(planned(f"network.condition={name}")) for name in ("L0", "L5")}
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+    """Give the demo, run once."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
+    assert code == 0, said
+    return Demo(out, code, said, json.loads((out / "summary.json").read_text()))
+
+
+@pytest.fixture(scope="session")
+def injected(demo: Demo) -> dict[str, RealDrive]:
+    """Give the demo's drives under L0 and L5."""
+    drives = {}
+    for name in ("L0", "L5"):
+        out = demo.out / "runs" / f"real_a_key_{name}_00"
+        result = json.loads((out / "result.json").read_text())
+        against = [reason for reason in result["invalid_because"] if "delay" in reason]
+        server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+        drives[name] = RealDrive(out, result, against, measure(server, client).closure_p95_ms)
+    return drives

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
 import subprocess
 import sys
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import pytest
+from tests.realtime.conftest import Demo
 
 RUN_KEYS = {
     "run", "time", "injection", "inherent", "route", "condition", "controller", "preset", "driver", "participant",
@@ -25,43 +20,6 @@ CONDITION_KEYS = {
     "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms",
 }  # fmt: skip
 VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
-
-
-@dataclass(frozen=True)
-class Demo:
-    """What the demo left and what it said on a terminal."""
-
-    out: Path
-    code: int
-    said: str
-    summary: dict[str, Any]
-
-
-def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
-    """Run a program with a terminal for its standard output and error."""
-    terminal, end = pty.openpty()
-    program = subprocess.Popen(arguments, stdout=end, stderr=end, stdin=subprocess.DEVNULL)
-    os.close(end)
-    said = bytearray()
-    while True:
-        try:
-            piece = os.read(terminal, 65536)
-        except OSError:  # Linux's way to say that the program has closed the terminal
-            break
-        if not piece:
-            break
-        said += piece
-    os.close(terminal)
-    return program.wait(), said.decode(errors="replace")
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Give the demo, run once."""
-    out = tmp_path_factory.mktemp("demo") / "out"
-    code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
-    assert code == 0, said
-    return Demo(out, code, said, json.loads((out / "summary.json").read_text()))
 
 
 def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
