@@ -124,3 +124,13 @@ def test_a_small_camera_sees_the_lane_too() -> None:
     model = CameraModel(320, 240)
     lane = LaneDetector(model).detect(Scene(model).picture(FOUR_LANES, 1 / 87))
     assert at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
+
+
+def test_a_detector_that_forgets_takes_the_nearest_lane(scene: Scene) -> None:
+    """A car that has slid into the next lane is told of its old one, until the detector is made to forget it."""
+    detector = LaneDetector(MODEL)
+    for offset_m in np.arange(0.0, 3.51, 0.25):
+        lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
+    assert lane.centre[0] == pytest.approx(-3.5, abs=0.3)
+    detector.forget()
+    assert detector.detect(scene.picture(FOUR_LANES, offset_m=3.5)).centre[0] == pytest.approx(0.0, abs=0.1)

@@ -144,6 +144,8 @@ class DriverNode:
 
     def _perceive(self, message: Message, _now: Now) -> Seen:
         view: View = message.payload
+        if self.session.phase != "driving":  # what was tracked before a stop may be another lane by now
+            self._detector.forget()
         return Seen(view, view.stamp_ns, self._detector.detect(view.picture))
 
     def _decide(self, seen: Seen, now: Now) -> Seen:

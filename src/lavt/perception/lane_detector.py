@@ -36,6 +36,10 @@ class LaneDetector:
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER
 
+    def forget(self) -> None:
+        """Take the next picture as the first one: the lane is where it is nearest, not where it was last seen."""
+        self._misses = FORGET_AFTER
+
     def detect(self, picture_bgr: Picture) -> Lane:
         """Give the lane in the next picture, (height, width, 3) as the camera's model says; else ValueError."""
         if picture_bgr.shape != self._shape:
