@@ -32,6 +32,11 @@ class SeesALane:
 
     confidence: float = 1.0
     seen: list[Picture] = field(default_factory=list)
+    forgot: int = 0
+
+    def forget(self) -> None:
+        """Forget what was seen."""
+        self.forgot += 1
 
     def detect(self, picture_bgr: Picture) -> Lane:
         """Look at a picture."""
@@ -170,6 +175,18 @@ def test_it_asks_arms_and_drives() -> None:
     assert (drive.mode, drive.throttle, drive.brake, drive.steering_rad) == ("drive", 0.5, 0.0, 0.125)
     assert drive.sequence > arm.sequence
     assert drive.stamp_ns == WALL_NS
+
+
+def test_perception_has_a_memory_only_while_it_drives() -> None:
+    """Each picture before the drive is looked at as if it were the first: what was tracked before may be wrong."""
+    bench = Bench()
+    bench.view()
+    bench.view()
+    assert bench.detector.forgot == 2
+    bench.driving()
+    before = bench.detector.forgot
+    bench.view()
+    assert bench.detector.forgot == before
 
 
 def test_a_command_leaves_every_20_ms_between_pictures() -> None:
