@@ -79,6 +79,7 @@ class CameraNode:
         self.chains: Mapping[str, Sequence[Hop]] = {
             WAKE: (
                 ("capture", self._capture),
+                ("check", self._check),
                 ("stamp", self._stamp),
                 ("encode", self._encode),
                 ("packetize", self._packetize),
@@ -120,10 +121,16 @@ class CameraNode:
             self._counts["frames_missing"] += 1
         return frame
 
-    def _stamp(self, frame: CapturedFrame, now: Now) -> Stamped:
-        # Around the stamp: a camera that gives the same buffer again gives it with the stamp that was written into it.
+    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, int]:
+        """Take a checksum of the pixels around the stamp, before the time of the stamp begins.
+
+        A camera that gives the same buffer again gives it with the stamp that was written into it.
+        """
         pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[STAMP_PX:]).data)
-        pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[:STAMP_PX, STAMP_PX:]).data, pixel_crc)
+        return frame, zlib.crc32(np.ascontiguousarray(frame.picture[:STAMP_PX, STAMP_PX:]).data, pixel_crc)
+
+    def _stamp(self, checked: tuple[CapturedFrame, int], now: Now) -> Stamped:
+        frame, pixel_crc = checked
         stamp_ns = now.wall_ns
         while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
             stamp_ns += 1
