@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import secrets
+import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -241,7 +242,7 @@ def build_server(
             Packetizer(entropy.number(32), entropy.number(16)),
             PathServer(lambda: entropy.token(32)),
             start_ns=start.mono_ns,
-            send_to=[parse_address("video.send_to", each) for each in video.send_to],
+            send_to=[resolved_address("video.send_to", each) for each in video.send_to],
         ),
         ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route),
         ClockSyncNode(start.mono_ns),
@@ -284,6 +285,19 @@ def parse_address(key: str, text: str) -> tuple[str, int]:
     return host, int(port)
 
 
+def resolved_address(key: str, text: str) -> tuple[str, int]:
+    """Read `host:port` and look the host up, once: no datagram waits for a name server, and numbers can be compared."""
+    host, port = parse_address(key, text)
+    try:
+        return socket.gethostbyname(host), port
+    except (OSError, ValueError) as error:  # ValueError: what cannot be a name at all
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{key}: the host {host!r} is not known ({why})") from error
+
+
 def run_seed(seed: int, route: str, repetition: int) -> int:
-    """Seed of one repetition on a route: the same under every condition, so that conditions are paired."""
-    return stream_key(seed, f"run {route} {repetition}") & (2**63 - 1)
+    """Seed of one repetition on a route: the same under every condition, so that conditions are paired.
+
+    53 bits, because that is as far as JSON's readers agree on numbers.
+    """
+    return stream_key(seed, f"run {route} {repetition}") & (2**53 - 1)

@@ -135,6 +135,8 @@ class RunConfig(Section):
     study: StudyConfig = StudyConfig()
     time: Literal["real", "virtual"] = "virtual"
     seed: int = Field(1, ge=0, lt=2**63)
+    repetition: int = Field(0, ge=0)
+    """Which of several runs with one seed: each has its own start and noise, the same under every condition."""
 
 
 class SweepConfig(RunConfig):
@@ -202,8 +204,8 @@ class DelayConfig(Section):
     """One direction of a relayed flow: a constant delay and, on top, a lognormal one."""
 
     constant_ms: float = Field(0.0, ge=0, le=60_000)
-    jitter_median_ms: float = Field(0.0, ge=0)
-    jitter_sigma: float = Field(0.0, ge=0)
+    jitter_median_ms: float = Field(0.0, ge=0, le=60_000)
+    jitter_sigma: float = Field(0.0, ge=0, le=3)
 
 
 class RelayConfig(Section):

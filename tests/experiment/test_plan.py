@@ -139,10 +139,11 @@ def test_identity(time: str) -> None:
             "network": {"condition": "L4", "inherent": "paper_wifi5"},
             "controller": {"preset": "paper_calibrated"},
             "study": {"participant": "p7", "block": 2, "order": 3},
+            "repetition": 4,
         },
         "test",
     )
-    identity = plan_run(config, name="this", repetition=4).identity
+    identity = plan_run(config, name="this").identity
     assert set(IDENTITY) <= identity.keys()
     assert {name: identity[name] for name in IDENTITY if name != "seed"} == {
         "run": "this",

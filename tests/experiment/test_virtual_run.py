@@ -255,6 +255,19 @@ def test_mirrored_pictures_lead_off_the_lane(tmp_path: Path) -> None:
     assert entry["lane_invasions"] > 0
 
 
+def test_a_car_whose_state_is_not_heard_is_stopped(tmp_path: Path) -> None:
+    """When the vehicle's state no longer arrives, the client does not drive on by an old speed: it brakes and stops."""
+
+    def lose_the_state(loop: VirtualLoop) -> None:
+        loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
+
+    out = tmp_path / "run"
+    run(out, planned(BARE), change=lose_the_state, seconds=60)
+    entry = measure(*records(out)).entry
+    assert entry["ending"] == "safe_stop"
+    assert entry["duration_s"] < 11
+
+
 # Clocks may do what they like.
 
 

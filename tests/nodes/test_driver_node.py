@@ -211,6 +211,20 @@ def test_without_pictures_it_brakes_after_300_ms_and_stops_after_2500_ms() -> No
 
 
 @pytest.mark.parametrize(
+    ("lost_ns", "mode", "brakes"), [(280, "drive", False), (300, "drive", True), (2500, "stop", True)]
+)
+def test_without_the_vehicles_state_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: bool) -> None:
+    """Pictures come but no state of the vehicle: after 300 ms it brakes, after 2.5 s it asks for a stop."""
+    bench = Bench().driving()
+    for _ in range(lost_ns // 20):
+        bench.mono_ns += 20 * NS_PER_MS
+        (command,) = bench.view()
+    assert command.mode == mode
+    assert (command.brake >= CLIENT_LIMITS.brake) == brakes
+    assert (command.throttle == 0.0) == brakes
+
+
+@pytest.mark.parametrize(
     ("lost_ns", "mode", "brakes"), [(480, "drive", False), (520, "drive", True), (2520, "stop", True)]
 )
 def test_without_a_lane_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: bool) -> None:
@@ -219,6 +233,7 @@ def test_without_a_lane_it_brakes_and_stops(lost_ns: int, mode: str, *, brakes: 
     bench.detector.confidence = 0.0
     for _ in range(lost_ns // 20):
         bench.mono_ns += 20 * NS_PER_MS
+        bench.state("driving")
         (command,) = bench.view()
     assert command.mode == mode
     assert (command.brake >= CLIENT_LIMITS.brake) == brakes

@@ -19,9 +19,9 @@ from lavt.config import RunConfig, load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.metrics import measure
 from lavt.experiment.plan import PlannedRun, plan_run
-from lavt.experiment.real_run import drive_real
+from lavt.experiment.real_run import relay_reasons
 from lavt.experiment.record import read_record
-from lavt.experiment.results import run_result
+from lavt.experiment.run import run_once
 
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS
@@ -50,8 +50,8 @@ def planned() -> Callable[..., PlannedRun]:
     """Plan a real run as `lavt demo` drives it, with changes of its config."""
 
     def plan(*changes: str, repetition: int = 0) -> PlannedRun:
-        config = load_config(RunConfig, shipped("configs/demo.yaml"), ["time=real", *changes])
-        return plan_run(config, repetition=repetition)
+        sets = ["time=real", f"repetition={repetition}", *changes]
+        return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), sets))
 
     return plan
 
@@ -66,14 +66,17 @@ class RealDrive:
     closure_p95_ms: float | None
 
 
+def real_drive_in(out: Path, result: dict[str, Any]) -> RealDrive:
+    relay_says = relay_reasons(json.loads((out / "relay.json").read_text()))
+    server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+    return RealDrive(out, result, relay_says, measure(server, client).closure_p95_ms)
+
+
 @pytest.fixture(scope="session")
 def real_drive(tmp_path_factory: pytest.TempPathFactory) -> Callable[[PlannedRun], RealDrive]:
     def drive(planned: PlannedRun) -> RealDrive:
         out = tmp_path_factory.mktemp("real")
-        relay_says = drive_real(planned, out)
-        server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-        closure_p95_ms = measure(server, client).closure_p95_ms
-        return RealDrive(out, run_result(planned.identity, server, client), relay_says, closure_p95_ms)
+        return real_drive_in(out, run_once(planned, out))
 
     return drive
 
@@ -121,8 +124,5 @@ def injected(demo: Demo) -> dict[str, RealDrive]:
     drives = {}
     for name in ("L0", "L5"):
         out = demo.out / "runs" / f"real_a_key_{name}_00"
-        result = json.loads((out / "result.json").read_text())
-        against = [reason for reason in result["invalid_because"] if "delay" in reason]
-        server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-        drives[name] = RealDrive(out, result, against, measure(server, client).closure_p95_ms)
+        drives[name] = real_drive_in(out, json.loads((out / "result.json").read_text()))
     return drives

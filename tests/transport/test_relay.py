@@ -253,17 +253,17 @@ def test_garbage(net: Net) -> None:
         assert client.receive()[0] == datagram
 
 
-def test_lateness(net: Net) -> None:
-    """The relay tells by how much later than due it sent, for each flow and direction; null where it sent nothing."""
-    assert set(net.relay.lateness_ms().values()) == {None}
+def test_held(net: Net) -> None:
+    """The relay tells for how long it really held, for each flow and direction; null where nothing came."""
+    assert set(net.relay.held_ms().values()) == {None}
     client, seen_at = net.connect("video")
     for late_ms in (2.0, 7.0, 30.0):
         net.server["video"].send(rtp(1), seen_at)
         net.step()
         net.later(VIDEO_MS + late_ms)
         client.receive()
-    assert net.relay.lateness_ms() == {
-        "video upstream": 0.0, "video downstream": 7.0, "control upstream": None, "control downstream": None,
+    assert net.relay.held_ms() == {
+        "video upstream": 0.0, "video downstream": VIDEO_MS + 7.0, "control upstream": None, "control downstream": None,
     }  # fmt: skip
 
 

@@ -53,15 +53,26 @@ def run_command(command: Callable[[], None]) -> None:
     except LavtError as error:
         say(f"lavt: {error}")
         raise SystemExit(1) from None
+    except OSError as error:  # a disk or a right that no check has foreseen
+        say(f"lavt: {error}")
+        raise SystemExit(1) from None
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C in the middle of long work be an end that says so."""
+    """Let Ctrl-C, SIGTERM or a closed terminal in the middle of long work be an end that says so."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     except KeyboardInterrupt:
         raise WorkError("stopped; what was finished is kept") from None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lavt.build import parse_address
+from lavt.build import resolved_address
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import DelayConfig, RelayConfig, load_config
@@ -44,7 +43,7 @@ def relay(
         while not told.is_set():
             opened.step()
     if as_json:
-        console.show_json({"lateness_ms": opened.lateness_ms()})
+        console.show_json({"held_ms": opened.held_ms()})
     opened.close()
 
 
@@ -72,14 +71,9 @@ def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
 
 
 def _resolved(key: str, text: str) -> tuple[str, int]:
-    """Read an address and look its host up, once: datagrams are compared with the numeric address."""
+    """Read an address of a UDP flow and look its host up."""
     if text.startswith(("tcp/", "tls/", "quic/")):
         raise UserError(
             f"{key}: the relay carries UDP only, not {text!r}: let the routers talk by udp/...?rel=1;mixed_rel=1"
         )
-    host, port = parse_address(key, text)
-    try:
-        return socket.gethostbyname(host), port
-    except (OSError, ValueError) as error:  # ValueError: what cannot be a name at all
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UserError(f"{key}: the host {host!r} is not known ({why})") from error
+    return resolved_address(key, text)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import yaml
 
-import lavt
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -20,17 +17,17 @@ from lavt.domain import Now
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
 from lavt.experiment.live import LiveTap
+from lavt.experiment.provenance import provenance
 from lavt.experiment.record import RecordWriter
 from lavt.node import Node
 from lavt.nodes.client_session import ClientSession
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.recording import QueuedRecorder, Recorder
+from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.clock_offset import read_clock
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 STATUS_PERIOD_S = 0.2
-LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
 class NoRecorder:
@@ -85,8 +82,10 @@ class Side:
         """Begin the record, start the runtime, then let messages in."""
         assert self._udp is not None, "the video is opened before the nodes are built"  # noqa: S101
         if self._out is not None:
-            self.tap = LiveTap(self._open_record(self._out))
-        self.runtime = RealRuntime(self.clock, nodes, self.tap, read_clock)
+            self._writer = self._open_record(self._out)
+            self.tap = LiveTap(self._writer)
+        self._queue = QueuedRecorder(self.tap)
+        self.runtime = RealRuntime(self.clock, nodes, self._queue, read_clock)
         self._zenoh.start()
         self.runtime.start({"video": self._udp, "zenoh": self._zenoh})
         self._udp.start()
@@ -96,15 +95,14 @@ class Side:
         """Hand a message to a node of this side."""
         self._deliver(channel, payload, self.clock.now(), None)
 
-    def _open_record(self, out: Path) -> Recorder:
+    def _open_record(self, out: Path) -> RecordWriter:
         """Begin the record only now that nothing can be wrong with the input any more."""
         prepare_directory(out)
         (out / "config.yaml").write_text(yaml.safe_dump(self._config.model_dump(mode="json"), sort_keys=False))
-        self._writer = RecordWriter(out / f"{self._name}.mcap", self._name, left_out=self._config.record.left_out)
-        self._writer.annotate("versions", {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}})
-        self._writer.annotate("machine", {"system": platform.platform(), "python": platform.python_version()})
-        self._queue = QueuedRecorder(self._writer)
-        return self._queue
+        writer = RecordWriter(out / f"{self._name}.mcap", self._name, left_out=self._config.record.left_out)
+        for name, entries in provenance().items():
+            writer.annotate(name, entries)
+        return writer
 
     def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         if self.runtime is not None and not self.runtime.stopped.is_set():
@@ -120,12 +118,13 @@ class Side:
             self.runtime.stop()
         if self._udp is not None:
             self._udp.close()
-            self.tap.write("counts", {"link": "video", **self._udp.counts}, self.clock.now())
         self._zenoh.close()
-        self.tap.write("counts", {"link": "zenoh", **self._zenoh.counts}, self.clock.now())
-        if self._queue is not None and self._writer is not None:
+        if self._queue is not None and self._udp is not None:
+            for name, link in (("video", self._udp), ("zenoh", self._zenoh)):
+                self._queue.write("counts", {"link": name, **link.counts}, self.clock.now())
             self._queue.close(self.clock.now())
-            self._writer.close()
+            if self._writer is not None and not self._queue.failed:
+                self._writer.close()
 
 
 def _in_words(status: Mapping[str, Any], ending: str | None) -> str:

@@ -49,6 +49,10 @@ class ClientLimits:
     """Without a new picture: brake. It is the vehicle's own limit, so both sides brake together."""
     no_picture_stop_ns: int = 2500 * NS_PER_MS
     """Without a new picture: ask for a safe stop."""
+    no_state_brake_ns: int = 300 * NS_PER_MS
+    """Without a newer state of the vehicle: brake. The speed it was driven by is as old; 15 states are missing."""
+    no_state_stop_ns: int = 2500 * NS_PER_MS
+    """Without a newer state of the vehicle: ask for a safe stop."""
     no_lane_brake_ns: int = 500 * NS_PER_MS
     """Without a lane: brake. At 30 km/h 4 m have gone by, of the 16 m that were seen; a gap of broken marks is over."""
     no_lane_stop_ns: int = 2500 * NS_PER_MS

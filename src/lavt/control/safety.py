@@ -74,6 +74,10 @@ BREAKS_ARMING = (NOT_ARMED, NOT_STANDING)
 """Refused for these reasons, a command of the holder also ends an arming second: input or vehicle were not at rest."""
 
 
+LARGEST_STORED_NUMBER = 2**62
+"""Numbers of emergency stops are times in nanoseconds: this one is in the year 2116."""
+
+
 class SafetyGate:
     """Holds the session, admits or refuses commands, and says what the vehicle shall do now."""
 
@@ -242,7 +246,10 @@ class SafetyGate:
         if number <= self._emergency_number:
             self.counts["emergency stop with an old number"] += self.state != "emergency_stop"
             return False
-        self._emergency_number = number
+        if (
+            number <= LARGEST_STORED_NUMBER
+        ):  # one that leaves no room for a next one stops the vehicle, and is forgotten
+            self._emergency_number = number
         self._trigger("emergency stop")
         return True
 

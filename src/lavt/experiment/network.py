@@ -63,7 +63,7 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
         DelayLaw(max(0.0, video_ms) + condition.video_ms, jitter, seed, "video inherent"),
         DelayLaw(max(0.0, control_ms) + condition.control_ms),
         DelayLaw(max(0.0, control_ms) + state_ms),
-        DelayLaw(max(0.0, control_ms)),
+        DelayLaw(0.0),
     )
 
 

@@ -26,13 +26,17 @@ class PlannedRun:
     seed: int
 
 
-def plan_run(
-    config: RunConfig, *, name: str = "run", repetition: int = 0, axes: Mapping[str, Any] | None = None
-) -> PlannedRun:
+def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
     """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
     asked = condition(config.network.condition)
     check_names(config.vehicle, config.controller)
-    seed = run_seed(config.seed, config.vehicle.route, repetition)
+    nothing = (config.network.inherent, asked.video_ms, asked.control_ms) == ("loopback", 0, 0)
+    if config.time == "real" and config.network.injection == "none" and not nothing:
+        raise UserError(
+            "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
+            "inherent loopback"
+        )
+    seed = run_seed(config.seed, config.vehicle.route, config.repetition)
     identity = {
         "run": name,
         "time": config.time,
@@ -46,7 +50,7 @@ def plan_run(
         "participant": config.study.participant,
         "block": config.study.block,
         "order": config.study.order,
-        "repetition": repetition,
+        "repetition": config.repetition,
         "seed": seed,
         "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
         **({"axes": dict(axes)} if axes else {}),
@@ -61,14 +65,14 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
     """
     for key in sweep.axes.keys() & TAKEN:
         raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[key]!r}")
-    base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetitions", "axes"})
+    base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
     runs = []
     for values in itertools.product(*sweep.axes.values()):
         axes = dict(zip(sweep.axes, values, strict=True))
         for route, name, repetition in itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions)):
-            changes = {"vehicle.route": route, "network.condition": name, **axes}
+            changes = {"vehicle.route": route, "network.condition": name, "repetition": repetition, **axes}
             config = parse_config(RunConfig, _changed(base, changes), "the sweep")
-            runs.append(plan_run(config, name=_name(route, name, repetition, axes), repetition=repetition, axes=axes))
+            runs.append(plan_run(config, name=_name(route, name, repetition, axes), axes=axes))
     if not runs:
         raise UserError("the sweep asks for no run: give routes, conditions and axes at least one value each")
     twice = [name for name, count in Counter(run.name for run in runs).items() if count > 1]

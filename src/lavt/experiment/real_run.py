@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,14 +17,17 @@ from lavt.clock import Clock, MachineClock, pause
 from lavt.config import DelayConfig, RelayConfig, condition
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
-from lavt.experiment.network import injected_network
+from lavt.experiment.network import Network, injected_network
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import LAVT, Process, Processes
+from lavt.experiment.results import write_json
 from lavt.experiment.sides import client_config, server_config
 from lavt.experiment.validity import injection_reasons
 from lavt.experiment.virtual_run import read_costs
 from lavt.transport.delay import DelayLaw
 
+RELAY = "relay.json"
+"""In a run directory: the delays asked of the relay, and for how long it held what it carried."""
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_S = 40
@@ -95,25 +98,25 @@ def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_
     return router, local
 
 
-def drive_real(
-    planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None
-) -> list[str]:
-    """Drive once, leaving the two records in `out`; returns what was wrong with the injected delay.
+def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
+    """Drive once, leaving the two records in `out` and, of a relay, what was asked of it and what it did.
 
-    Raises `WorkError` where a part ends or nobody gets to drive.
+    Raises `WorkError` where a part ends or nobody gets to drive; what was recorded by then is left in `out` too.
     """
     clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
-        with Processes(work) as processes:
-            loop = start_loop(processes, planned, work, work)
-            _wait_for_the_end(processes, loop, clock, progress)
-            for process in reversed(processes.started):
-                process.end()
-            injected = _as_injected(planned, loop.relay)
-        for side in ("server", "client"):
-            shutil.move(work / side / f"{side}.mcap", out / f"{side}.mcap")
-    return injected
+        try:
+            with Processes(work) as processes:
+                loop = start_loop(processes, planned, work, work)
+                _wait_for_the_end(processes, loop, clock, progress)
+                for process in reversed(processes.started):
+                    process.end()
+                if loop.relay is not None:
+                    write_json(out / RELAY, {"asked_ms": _asked_ms(planned), **loop.relay.last_line()})
+        finally:
+            for record in work.glob("*/*.mcap"):
+                shutil.move(record, out / record.name)
 
 
 def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: Progress | None) -> None:
@@ -134,14 +137,24 @@ def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: 
         raise WorkError(f"the server failed: {loop.server.said()}")
 
 
-def _as_injected(planned: PlannedRun, relay: Process | None) -> list[str]:
-    """Compare what the relay says it did with what was asked of it."""
-    if relay is None:
-        return []
-    asked = planned.identity["injected_ms"]
-    lateness = relay.last_line().get("lateness_ms", {})
-    late = {"video": lateness.get("video downstream"), "control": lateness.get("control upstream")}
-    return injection_reasons(asked, {name: None if late[name] is None else asked[name] + late[name] for name in late})
+def _asked_ms(planned: PlannedRun) -> dict[str, float]:
+    """Tell the median delay asked of the relay in each direction, that of the inherent profile included."""
+    laws = _injected(planned)
+    return {"video": laws.video.median_ms(), "control": laws.control.median_ms()}
+
+
+def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
+    """Compare for how long the relay held what it carried with what was asked of it (the content of `relay.json`)."""
+    held = relay.get("held_ms", {})
+    measured = {"video": held.get("video downstream"), "control": held.get("control upstream")}
+    return injection_reasons(relay.get("asked_ms", {"video": 0.0, "control": 0.0}), measured)
+
+
+def _injected(planned: PlannedRun) -> Network:
+    network = planned.config.network
+    return injected_network(
+        network.inherent, condition(network.condition), read_costs(), planned.seed, state_delay=network.state_delay
+    )
 
 
 def _start_router(
@@ -157,10 +170,7 @@ def _start_router(
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
-    network = planned.config.network
-    injected = injected_network(
-        network.inherent, condition(network.condition), read_costs(), planned.seed, state_delay=network.state_delay
-    )
+    injected = _injected(planned)
     return RelayConfig(
         video_server=f"127.0.0.1:{video_port}",
         control_server=f"127.0.0.1:{control_port}",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ import yaml
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
 from lavt.experiment.plan import PlannedRun
-from lavt.experiment.real_run import Progress, drive_real
+from lavt.experiment.real_run import RELAY, Progress, drive_real, relay_reasons
 from lavt.experiment.record import read_record
-from lavt.experiment.results import run_result, write_json
+from lavt.experiment.results import read_json, run_result, write_json
 from lavt.experiment.virtual_run import build_loop, drive
 
 CONFIG = "config.yaml"
@@ -25,19 +25,19 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
     """Drive, compute the result, and leave everything in `out`; raises `WorkError` where nobody got to drive."""
     cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
     check_directory(out)
-    digest, reasons = None, []
+    digest = None
     if planned.config.time == "virtual":
         loop = build_loop(planned, out)
         _write_config(planned, out)
-        drive(loop)
+        drive(loop, progress=None if progress is None else lambda _: progress(loop.tap.status(), {}))
         digest = loop.digest.hexdigest()
         if not loop.tap.began:
             raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
     else:
         prepare_directory(out)
         _write_config(planned, out)
-        reasons = drive_real(planned, out, progress=progress)
-    return compute_result(out, planned.identity, digest, reasons)
+        drive_real(planned, out, progress=progress)
+    return compute_result(out, planned.identity, digest)
 
 
 def config_text(planned: PlannedRun) -> str:
@@ -49,11 +49,13 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
     (out / CONFIG).write_text(config_text(planned))
 
 
-def compute_result(
-    out: Path, identity: Mapping[str, Any], digest: str | None, reasons: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Compute `result.json` from the records in `out`; `reasons` are those against the run that records do not show."""
+def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
+    """Compute `result.json` from what the run left in `out`: its records and, where there was a relay, its report."""
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+    reasons = []
+    if identity["injection"] == "relay":
+        relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
+        reasons = relay_reasons(relay)
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
     return result

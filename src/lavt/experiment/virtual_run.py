@@ -14,6 +14,7 @@ from lavt.domain import NS_PER_S, NS_PER_US, Now
 from lavt.experiment.directory import make_directory
 from lavt.experiment.network import Network, injected_network, virtual_network
 from lavt.experiment.plan import PlannedRun
+from lavt.experiment.provenance import provenance
 from lavt.experiment.record import RecordWriter
 from lavt.experiment.sides import client_config, server_config
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
@@ -40,10 +41,17 @@ class EndingTap:
     def __init__(self, writer: RecordWriter) -> None:
         self.began = False
         self.ending: str | None = None
+        self._status: dict[str, Any] = {}
         self._writer = writer
+
+    def status(self) -> dict[str, Any]:
+        """Tell what a person wants to see of a drive while it goes on."""
+        return dict(self._status)
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Write one entry."""
+        if topic == "truth":
+            self._status.update(speed_mps=payload.speed_mps, cross_track_m=payload.cross_track_m)
         if topic == "event":
             self.began |= payload.kind == "drive_began"
             if payload.kind == "ending":
@@ -82,6 +90,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
     """
     config, seed, costs = planned.config, planned.seed, read_costs()
+    asked = condition(config.network.condition)
     server_clock, client_clock = clocks or host_clocks(config)
     server = build_server(
         server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
@@ -95,6 +104,10 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
         RecordWriter(out / "server.mcap", "server", digest, left_out=left_out),
         RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),
     )
+    for writer in writers:
+        for name, entries in provenance().items():
+            writer.annotate(name, entries)
+        writer.annotate("model", {"costs": costs.model_dump_json(), "condition": asked.model_dump_json()})
     tap = EndingTap(writers[0])
     costs_ns = {
         (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()
@@ -112,7 +125,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     ]  # fmt: skip
     injected = injected_network(
         config.network.inherent,
-        condition(config.network.condition),
+        asked,
         costs,
         seed,
         state_delay=config.network.state_delay,
@@ -135,14 +148,19 @@ def virtual_links(network: Network) -> dict[str, VirtualLink]:
         "control": link(network.control),
         "state": link(network.state),
         "feedback": link(network.unheld),
-        "session": link(network.unheld),
+        "session": link(network.control),
         "session_reply": link(network.state),
     }
 
 
-def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS) -> None:
-    """Run until the drive has ended and a little longer, until nobody has armed in time, or to the limit."""
+def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS, progress: Callable[[int], None] | None = None) -> None:
+    """Run until the drive has ended and a little longer, until nobody has armed in time, or to the limit.
+
+    `progress` is told every second of virtual time, in nanoseconds.
+    """
     runtime, tap = loop.runtime, loop.tap
+    if progress is not None:
+        _tell_every_second(runtime, progress)
     try:
         armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: tap.began)
         if armed and runtime.run(limit_ns, lambda: tap.ending is not None):
@@ -151,3 +169,11 @@ def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS) -> None:
     finally:
         for writer in loop.writers:
             writer.close()
+
+
+def _tell_every_second(runtime: VirtualRuntime, progress: Callable[[int], None]) -> None:
+    def tell() -> None:
+        progress(runtime.true_ns)
+        runtime.at(runtime.true_ns + NS_PER_S, tell)
+
+    runtime.at(NS_PER_S, tell)

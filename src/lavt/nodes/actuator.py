@@ -56,7 +56,7 @@ class ActuatorNode:
     name = "actuator"
 
     def __init__(self, vehicle: Vehicle, gate: SafetyGate, *, start_ns: int, route: Route | None = None) -> None:
-        self.counts: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self.gate = gate
         self.vehicle = vehicle
         self._route = route
@@ -76,6 +76,11 @@ class ActuatorNode:
             WAKE: (("advance", self._advance), ("publish", self._publish)),
         }
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was counted here, and what the safety gate has decided."""
+        return {**self._counts, **self.gate.counts}
+
     def next_wake_ns(self) -> int:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
@@ -88,7 +93,7 @@ class ActuatorNode:
         try:
             return Received(decode(Command, message.payload), message.arrived)
         except BadMessage:
-            self.counts["commands_unreadable"] += 1
+            self._counts["commands_unreadable"] += 1
             return None
 
     def _admit(self, received: Received, _now: Now) -> Judged:
@@ -104,7 +109,7 @@ class ActuatorNode:
     def _report(self, judged: Judged, now: Now) -> list[Send]:
         command, arrived = judged.received.command, judged.received.arrived
         obeyed = judged.verdict.obeyed
-        self.counts["commands_limited"] += bool(judged.limited)
+        self._counts["commands_limited"] += bool(judged.limited)
         admission = Admission(
             epoch=command.epoch,
             sequence=command.sequence,
@@ -130,7 +135,7 @@ class ActuatorNode:
         try:
             request = decode(SessionRequest, message.payload)
         except BadMessage:
-            self.counts["session_requests_unreadable"] += 1
+            self._counts["session_requests_unreadable"] += 1
             return []
         token = self.gate.token
         reply = self.gate.answer(request, self.vehicle.state())

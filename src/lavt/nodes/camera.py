@@ -99,6 +99,7 @@ class CameraNode:
             "path_wrong_token": path.wrong_token,
             "path_wrong_address": path.wrong_address,
             "path_stale": path.stale,
+            "path_foreign_reports": path.foreign_reports,
         }
 
     def next_wake_ns(self) -> int:

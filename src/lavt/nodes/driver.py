@@ -81,6 +81,7 @@ class DriverNode:
         self._decision: Decision | None = None
         self._lane_says: LaneState = "ok"
         self._speed_mps = 0.0
+        self._state_ns = 0
         self._command_ns: int | None = None
         self.chains: Mapping[str, Sequence[Hop]] = {
             "access_unit": (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show)),
@@ -196,11 +197,12 @@ class DriverNode:
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
         if self.session.phase != "driving":
             return "arm", Decision(0.0, 0.0, 1.0, decision.path_curvature_per_m)
-        blind_ns = now_ns - self._view_ns
-        if self._lane_says == "stop" or blind_ns >= self._limits.no_picture_stop_ns:
+        blind_ns, deaf_ns = now_ns - self._view_ns, now_ns - self._state_ns
+        limits = self._limits
+        if self._lane_says == "stop" or blind_ns >= limits.no_picture_stop_ns or deaf_ns >= limits.no_state_stop_ns:
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
-        if self._lane_says == "brake" or blind_ns >= self._limits.no_picture_brake_ns:
-            brake = max(decision.brake, self._limits.brake)
+        if self._lane_says == "brake" or blind_ns >= limits.no_picture_brake_ns or deaf_ns >= limits.no_state_brake_ns:
+            brake = max(decision.brake, limits.brake)
             return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
         return "drive", decision
 
@@ -216,7 +218,7 @@ class DriverNode:
         except BadMessage:
             self.counts["states_unreadable"] += 1
             return
-        self._speed_mps = state.speed_mps
+        self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
         self.session.note_state(state, now.mono_ns)
 
     def _note_reply(self, message: Message, now: Now) -> list[Send]:

@@ -27,7 +27,7 @@ class ReceiverNode:
     name = "receiver"
 
     def __init__(self, reorder: ReorderBuffer, depacketizer: Depacketizer) -> None:
-        self.counts: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._reorder = reorder
         self._depacketizer = depacketizer
         self._path: PathClient | None = None
@@ -47,6 +47,16 @@ class ReceiverNode:
             WAKE: (("expire", self._wake), ("depacketize", self._depacketize)),
         }
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was counted here, in the reorder buffer and in the depacketizer."""
+        names = ("late", "duplicate", "lost", "reordered", "stray")
+        return {
+            **self._counts,
+            **{f"packets_{name}": getattr(self._reorder, name) for name in names},
+            "payloads_malformed": self._depacketizer.malformed,
+        }
+
     def next_wake_ns(self) -> int | None:
         """When the reorder buffer gives up waiting, a hello or a report is due."""
         times = [self._reorder.next_wake_ns()]
@@ -64,14 +74,14 @@ class ReceiverNode:
     def _receive(self, message: Message, now: Now) -> tuple[list[tuple[RtpPacket, bool]], Now, list[Send]] | None:
         if is_path_datagram(message.payload):
             answer = None if self._path is None else self._path.answer(message.payload)
-            self.counts["challenges_unreadable"] += answer is None
+            self._counts["challenges_unreadable"] += answer is None
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
         try:
             packet = parse_packet(message.payload)
         except BadPacket:
-            self.counts["packets_unreadable"] += 1
+            self._counts["packets_unreadable"] += 1
             return None
-        self.counts["packets"] += 1
+        self._counts["packets"] += 1
         self._packets_since_report += 1
         self._note_transit(message.arrived.mono_ns, packet.timestamp)
         self._media_ssrc = packet.ssrc
@@ -92,8 +102,8 @@ class ReceiverNode:
         packets, arrived, sends = ordered
         for packet, lost_before in packets:
             for unit in self._depacketizer.push(packet, lost_before=lost_before):
-                self.counts["access_units"] += 1
-                self.counts["access_units_incomplete"] += not unit.complete
+                self._counts["access_units"] += 1
+                self._counts["access_units_incomplete"] += not unit.complete
                 received = ReceivedUnit(unit.data, unit.timestamp, unit.complete, unit.keyframe, arrived.mono_ns)
                 sends.append(Send("access_unit", received))
             if lost_before:
@@ -105,7 +115,7 @@ class ReceiverNode:
         if self._media_ssrc is None or now_ns < self._picture_loss_ns:
             return []
         self._picture_loss_ns = now_ns + PICTURE_LOSS_PAUSE_NS
-        self.counts["picture_loss_requests"] += 1
+        self._counts["picture_loss_requests"] += 1
         return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
 
     def _report(self, media_ssrc: int) -> Send:

@@ -14,7 +14,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import Recorder, record
+from lavt.runtime.recording import Recorder
 from lavt.transport.channels import CHANNELS
 from lavt.transport.clock_offset import ClockReport
 
@@ -35,7 +35,8 @@ class Link(Protocol):
 class RealRuntime:
     """Drives the nodes of one side by the machine's clocks.
 
-    `links` carries what crosses the network, by carrier. A node that fails ends the run: `failed` says why.
+    `links` carries what crosses the network, by carrier; `recorder` gets messages as they are, and must not wait. A
+    node that fails ends the run: `failed` says why.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class RealRuntime:
         """Let a message wait for its receivers; links call this, from threads of their own."""
         row = CHANNELS[channel]
         if row.carrier != "local":
-            record(self._recorder, channel, payload, arrived)
+            self._recorder.write(channel, payload, arrived)
         for receiver in row.receivers:
             self._workers[receiver].put(Message(channel, payload, arrived, peer))
 
@@ -112,7 +113,7 @@ class RealRuntime:
             threading.Thread(target=self._report_clock, name="clock source", daemon=True).start()
         elif carrier != "record":
             self.links[carrier].send(send)
-        record(self._recorder, send.channel, send.payload, now)
+        self._recorder.write(send.channel, send.payload, now)
 
     def _report_clock(self) -> None:
         """Asking chrony takes a process of its own and some milliseconds: no node waits for it."""

@@ -73,18 +73,26 @@ UNRECORDED = ("pose", "view", "video_token", "path_token", "access_unit", "pictu
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
     """Write down a message, if it belongs into the record."""
     if channel not in UNRECORDED:
-        recorder.write(channel, WIRE[channel](payload) if channel in WIRE else payload, now)
+        recorder.write(channel, as_written(channel, payload), now)
+
+
+def as_written(channel: str, payload: Any) -> Any:
+    """Give a message as it is written down: what is bytes on the network in fields."""
+    return WIRE[channel](payload) if channel in WIRE else payload
 
 
 class QueuedRecorder:
     """A recorder behind a bounded queue and a thread of its own, so that no node ever waits for a disk.
+
+    Bytes of the network are taken apart in that thread too: the threads that receive them have better to do.
 
     What does not fit, or cannot be written, is counted in `overflow`; a run with an overflow is invalid.
     """
 
     def __init__(self, recorder: Recorder, capacity: int = 8192) -> None:
         self.overflow = 0
-        self._failed = False
+        self.failed = False
+        """Whether the record has ended because it could not be written."""
         self._recorder = recorder
         self._queue: queue.Queue[tuple[str, Any, Now] | None] = queue.Queue(capacity)
         self._thread = threading.Thread(target=self._drain, name="recorder", daemon=True)
@@ -92,6 +100,8 @@ class QueuedRecorder:
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Queue one entry, or count it as lost."""
+        if topic in UNRECORDED:
+            return
         try:
             self._queue.put_nowait((topic, payload, now))
         except queue.Full:
@@ -101,17 +111,18 @@ class QueuedRecorder:
         """Write what is queued, and how much was lost."""
         self._queue.put(None)
         self._thread.join()
-        if not self._failed:
+        if not self.failed:
             self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
 
     def _drain(self) -> None:
         while (entry := self._queue.get()) is not None:
-            if self._failed:
+            if self.failed:
                 self.overflow += 1
                 continue
             try:
-                self._recorder.write(*entry)
-            except OSError as error:  # a full disk ends the record, not the drive
+                topic, payload, now = entry
+                self._recorder.write(topic, as_written(topic, payload), now)
+            except Exception as error:  # a full disk, or whatever it is, ends the record and not the drive
                 log.error("the record ends here, it cannot be written: %s", error)
-                self._failed = True
+                self.failed = True
                 self.overflow += 1

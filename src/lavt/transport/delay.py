@@ -32,6 +32,10 @@ class DelayLaw:
     seed: int = 0
     name: str = ""
 
+    def median_ms(self) -> float:
+        """Give the median delay."""
+        return max(0.0, self.constant_ms + (0.0 if self.jitter is None else self.jitter.median_ms))
+
     def delay_ns(self, index: int) -> int:
         """Delay of the thing with number `index`, in nanoseconds; never negative."""
         jitter_ms = 0.0 if self.jitter is None else _lognormal_ms(self.seed, self.name, index, self.jitter)

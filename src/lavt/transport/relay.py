@@ -24,11 +24,13 @@ from lavt.transport.delay import DelayLaw, DelayLine
 LONGEST_DATAGRAM = 65_535
 BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_PAUSE_S = 0.05
+MOST_CLIENTS = 64
+"""Of a flow; each has a socket."""
 CLIENT_SILENCE_NS = 30 * NS_PER_S
 """A client that sent nothing for so long loses its socket."""
 
 REMEMBERED = 20_000
-"""So many datagrams count for what the relay says of its own lateness."""
+"""So many datagrams count for what the relay says it did."""
 
 Address = tuple[str, int]
 NONE = DelayLaw(0.0)
@@ -68,8 +70,8 @@ class _Way:
     held: Callable[[bytes], bool]
     count: int = 0
     in_heap: bool = False
-    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """How much later than due the last datagrams were sent."""
+    held_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """For how long the last datagrams were held, from their arrival to their leaving."""
 
 
 @dataclass
@@ -103,14 +105,14 @@ class Relay:
         """Tell the port that was opened for each flow."""
         return {each.flow.name: each.port for each in self._flows}
 
-    def lateness_ms(self) -> dict[str, float | None]:
-        """Tell for each flow and direction the median of how much later than due its datagrams were sent."""
-        late = {
-            f"{each.flow.name} {direction}": [late_ns for way in ways for late_ns in way.late_ns]
+    def held_ms(self) -> dict[str, float | None]:
+        """Tell for each flow and direction the median of how long its datagrams were held; None where none came."""
+        held = {
+            f"{each.flow.name} {direction}": [held_ns for way in ways for held_ns in way.held_ns]
             for each in self._flows
             for direction, ways in each.ways().items()
         }
-        return {name: median(values) / NS_PER_MS if values else None for name, values in late.items()}
+        return {name: median(values) / NS_PER_MS if values else None for name, values in held.items()}
 
     def step(self, longest_pause_s: float = LONGEST_PAUSE_S) -> None:
         """Wait for what comes first, a datagram, one that is due or the longest pause, and deal with it."""
@@ -150,7 +152,7 @@ class Relay:
         way.count += 1
         index = way.count if way.index is None else way.index(datagram)
         now_ns = self.now_ns()
-        way.line.push((datagram, now_ns + way.line.law.delay_ns(index)), now_ns, index)
+        way.line.push((datagram, now_ns), now_ns, index)
         self._schedule(way)
 
     def _schedule(self, way: _Way) -> None:
@@ -164,9 +166,9 @@ class Relay:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
             _, _, way = heapq.heappop(self._heap)
             way.in_heap = False
-            for datagram, due_ns in way.line.pop_due(now_ns):
+            for datagram, arrived_ns in way.line.pop_due(now_ns):
                 self._send(way, datagram)
-                way.late_ns.append(self.now_ns() - due_ns)
+                way.held_ns.append(self.now_ns() - arrived_ns)
             self._schedule(way)
 
     def _send(self, way: _Way, datagram: bytes) -> None:
@@ -225,7 +227,11 @@ class _OpenFlow:
                 self._relay.pass_on(client.down, datagram)
 
     def _forget_silent(self) -> None:
+        """Let clients go that are silent and, where there are too many, the one that has been silent for longest."""
         now_ns = self._relay.now_ns()
+        if len(self._clients) >= MOST_CLIENTS:
+            longest = min(self._clients, key=lambda address: self._clients[address].heard_ns)
+            self._relay.unwatch(self._clients.pop(longest).upstream_socket)
         for address, client in list(self._clients.items()):
             if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
                 self._relay.unwatch(self._clients.pop(address).upstream_socket)
