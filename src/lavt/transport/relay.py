@@ -19,6 +19,7 @@ from statistics import median
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
+from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
 from lavt.transport.delay import DelayLaw, DelayLine
 
 LONGEST_DATAGRAM = 65_535
@@ -144,15 +145,18 @@ class Relay:
         """Read the monotonic clock."""
         return self._clock.now().mono_ns
 
-    def pass_on(self, way: _Way, datagram: bytes) -> None:
-        """Send a datagram its way, at once or when it is due."""
+    def arrived_ns(self, ancillary: Ancillary) -> int:
+        """Tell when a datagram arrived, on the monotonic clock."""
+        return arrival(ancillary, self._clock.now()).mono_ns
+
+    def pass_on(self, way: _Way, datagram: bytes, arrived_ns: int) -> None:
+        """Send a datagram its way, at once or when it is due: its delay counts from its arrival."""
         if not way.held(datagram):
             self._send(way, datagram)
             return
         way.count += 1
         index = way.count if way.index is None else way.index(datagram)
-        now_ns = self.now_ns()
-        way.line.push((datagram, now_ns), now_ns, index)
+        way.line.push((datagram, arrived_ns), arrived_ns, index)
         self._schedule(way)
 
     def _schedule(self, way: _Way) -> None:
@@ -199,10 +203,10 @@ class _OpenFlow:
         self._relay.unwatch(self._socket)
 
     def _from_clients(self) -> None:
-        for datagram, address in _drain(self._socket):
+        for datagram, ancillary, address in _drain(self._socket):
             client = self._clients.get(address) or self._new_client(address)
             client.heard_ns = self._relay.now_ns()
-            self._relay.pass_on(client.up, datagram)
+            self._relay.pass_on(client.up, datagram, self._relay.arrived_ns(ancillary))
 
     def _new_client(self, address: Address) -> _Client:
         self._forget_silent()
@@ -222,9 +226,9 @@ class _OpenFlow:
         return client
 
     def _from_server(self, client: _Client) -> None:
-        for datagram, address in _drain(client.upstream_socket):
+        for datagram, ancillary, address in _drain(client.upstream_socket):
             if address == self.flow.server:
-                self._relay.pass_on(client.down, datagram)
+                self._relay.pass_on(client.down, datagram, self._relay.arrived_ns(ancillary))
 
     def _forget_silent(self) -> None:
         """Let clients go that are silent and, where there are too many, the one that has been silent for longest."""
@@ -243,6 +247,7 @@ def _always(_datagram: bytes) -> bool:
 
 def _bound_socket(address: Address, name: str) -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    want_arrival_times(opened)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
         opened.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
     try:
@@ -255,14 +260,15 @@ def _bound_socket(address: Address, name: str) -> socket.socket:
     return opened
 
 
-def _drain(opened: socket.socket) -> list[tuple[bytes, Address]]:
+def _drain(opened: socket.socket) -> list[tuple[bytes, Ancillary, Address]]:
     """Take all datagrams that wait, up to a number that lets the other sockets have their turn."""
     datagrams = []
     for _ in range(64):
         try:
-            datagrams.append(opened.recvfrom(LONGEST_DATAGRAM))
+            datagram, ancillary, _flags, address = opened.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
         except BlockingIOError:
             break
         except OSError:  # an ICMP error of an earlier datagram
             continue
+        datagrams.append((datagram, ancillary, address))
     return datagrams

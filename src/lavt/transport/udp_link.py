@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import select
 import socket
-import struct
 import threading
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from lavt.clock import Clock
-from lavt.domain import NS_PER_S, Now
+from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """(channel, payload, arrived, peer): what a link does with what comes in."""
 
-SO_TIMESTAMPNS = 35
-"""Linux: time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; not named in `socket`."""
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_DATAGRAM = 65_535
-QUEUED_LONGEST_NS = 10 * NS_PER_S
-"""A kernel's stamp further back than this is not believed: the wall clock was stepped in between."""
 
 
 class UdpLink:
@@ -51,7 +47,7 @@ class UdpLink:
         self._server: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        want_arrival_times(self._socket)
         try:
             self._socket.bind(bind)
         except (OSError, ValueError) as error:
@@ -95,25 +91,14 @@ class UdpLink:
             if self._wake_reader in ready:
                 return
             try:
-                datagram, ancillary, _flags, address = self._socket.recvmsg(LONGEST_DATAGRAM, 64)
+                datagram, ancillary, _flags, address = self._socket.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
             except OSError:  # an ICMP error of an earlier datagram
                 self.counts["datagrams_refused"] += 1
                 continue
             if self._remote is not None and address != self._server:
                 self.counts["datagrams_from_strangers"] += 1
                 continue
-            self._deliver(self._channel, datagram, self._arrival(ancillary), address)
-
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> Now:
-        """Bring the kernel's stamp, which is wall time, to both clocks; without one it is now."""
-        now = self._clock.now()
-        for level, kind, data in ancillary:
-            if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= 16:
-                seconds, nanoseconds = struct.unpack_from("qq", data)
-                queued_ns = now.wall_ns - (seconds * NS_PER_S + nanoseconds)
-                if 0 <= queued_ns < QUEUED_LONGEST_NS:
-                    return now.later(-queued_ns)
-        return now
+            self._deliver(self._channel, datagram, arrival(ancillary, self._clock.now()), address)
 
 
 def _resolved(host: str) -> str:
