@@ -44,6 +44,8 @@ class Drive:
     server_counts: tuple[tuple[str, int], ...] = ()
     skipped: int = 0
     """Frames that the camera missed in the middle of the drive."""
+    undecoded: int | None = 0
+    """For so many frames from number 60 on the decoder gave no picture; None: the record says of none whether it did."""
     late: int = 0
     """So often the physics was late."""
 
@@ -179,11 +181,13 @@ def write_client(drive: Drive, path: Path) -> None:
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
         read = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
-        readable = number % 50 != 49
-        picture = {
+        decoded = not 60 <= number < 60 + (drive.undecoded or 0)
+        readable = decoded and number % 50 != 49
+        picture: dict[str, Any] = {
             "stamp_ns": stamp_ns if readable else None,
             "readable": readable,
-            "reason": "" if readable else "checksum",
+            "reason": "" if readable else "checksum" if decoded else "no picture",
+            **({} if drive.undecoded is None else {"decoded": decoded}),
             "rtp_timestamp": stamp_ns * 9 // 100_000 % 2**32,
             "packet_mono_ns": read.mono_ns - 4 * NS_PER_MS,
             "decoded_mono_ns": read.mono_ns - 1 * NS_PER_MS,
