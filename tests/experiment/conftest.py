@@ -45,7 +45,10 @@ class Drive:
     skipped: int = 0
     """Frames that the camera missed in the middle of the drive."""
     undecoded: int | None = 0
-    """For so many frames from number 60 on the decoder gave no picture; None: the record says of none whether it did."""
+    """For so many frames from number 60 on the decoder gave no picture; None: the record says of none if it did."""
+    server_unpolled_s: tuple[int, int] = (0, 0)
+    """From and until when, not included, the server took no sample of its clocks."""
+    client_unpolled_s: tuple[int, int] = (0, 0)
     late: int = 0
     """So often the physics was late."""
 
@@ -84,6 +87,8 @@ def write_server(drive: Drive, path: Path) -> None:
     writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
     end_ns = round(drive.seconds * NS_PER_S)
     for second in range(-1, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.server_unpolled_s):
+            continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
         writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
@@ -173,6 +178,8 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
 def write_client(drive: Drive, path: Path) -> None:
     writer = RecordWriter(path, "client")
     for second in range(-1, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.client_unpolled_s):
+            continue
         at_ns = second * NS_PER_S
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
