@@ -80,7 +80,7 @@ def _poll_reasons(server: Record, client: Record) -> list[str]:
     longest_ns = {
         "server": max(
             *(
-                int(np.min(np.abs(server_ns - edge_ns), initial=ended_ns - began_ns))
+                min(np.abs(server_ns - edge_ns).tolist(), default=ended_ns - began_ns)
                 for edge_ns in (began_ns, ended_ns)
             ),
             int(np.max(np.diff(server_ns)[in_drive], initial=0)),
