@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from lavt.config import SweepConfig, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.sweep import open_sweep, sweep
+from lavt.experiment.sweep import open_sweep, run_all, sweep
 
 CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
@@ -56,6 +57,30 @@ def test_resuming_drives_only_what_is_missing(swept: Path) -> None:
     assert (second / "result.json").stat().st_mtime_ns == kept
     assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
     assert after["conditions"] == before["conditions"]
+
+
+def test_the_speed_is_that_of_what_was_driven(swept: Path) -> None:
+    """Runs that were driven before do not make a resumed sweep faster; where nothing is driven the speed is kept."""
+    first = swept / "runs" / two_runs()[0].name
+    (first / "result.json").unlink()
+    sweep(two_runs(), swept, jobs=1, tell=lambda _: None)
+    speed = json.loads((swept / "summary.json").read_text())["speed"]
+    assert speed["simulated_s"] == json.loads((first / "result.json").read_text())["duration_s"]
+    sweep(two_runs(), swept, jobs=2, tell=lambda _: None)
+    assert json.loads((swept / "summary.json").read_text())["speed"] == speed
+
+
+def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
+    """A run that ends with an error that nobody foresaw is told by its kind and text, and the others are driven."""
+    good, bad = two_runs()
+    told: list[str] = []
+    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, tell=told.append)
+    ((name, why),) = driven.failed
+    assert name == bad.name
+    assert why.startswith("ValidationError: ")
+    assert f"{name} failed: {why}" in told
+    assert [result["run"] for result in driven.results] == [good.name]
+    assert speed is not None
 
 
 def test_resuming_with_another_config_is_refused(swept: Path) -> None:

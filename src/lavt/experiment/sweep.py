@@ -33,23 +33,25 @@ class Driven:
 
 def run_all(
     planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell
-) -> tuple[Driven, dict[str, Any]]:
+) -> tuple[Driven, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one a core), those in real time one by one.
 
-    Returns what was driven, and the entry `speed` of the summary.
+    Returns the results, those of runs that were driven before among them, and the entry `speed` of the summary: of the
+    virtual runs that were driven now, None where there were none.
     """
     jobs = jobs or os.cpu_count() or 1
     clock = MachineClock()
     start_ns = clock.now().mono_ns
-    results, failed = [], []
+    results: list[dict[str, Any]] = []
+    failed: list[tuple[str, str]] = []
     todo = []
     for each in planned:
         finished = runs_dir / each.name / RESULT
         if finished.is_file():
-            _check_config(each, finished.parent)
             results.append(read_json(finished))
         else:
             todo.append(each)
+    before = len(results)
     jobs = 1 if any(each.config.time == "real" for each in todo) else jobs
     context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
     ignore = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only this one decides
@@ -62,14 +64,18 @@ def run_all(
                     result = future.result()
                     results.append(result)
                     tell(f"{name}: {result['ending']}")
-                except LavtError as error:
-                    failed.append((name, str(error)))
-                    tell(f"{name} failed: {error}")
+                except Exception as error:  # whatever it is, the other runs have nothing to do with it
+                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
+                    failed.append((name, why))
+                    tell(f"{name} failed: {why}")
         except KeyboardInterrupt:
             executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
             raise
+    simulated = [result for result in results[before:] if result["time"] == "virtual"]
+    if not simulated:
+        return Driven(results, failed), None
     speed = {
-        "simulated_s": sum(result["duration_s"] or 0.0 for result in results),
+        "simulated_s": sum(result["duration_s"] or 0.0 for result in simulated),
         "wall_s": (clock.now().mono_ns - start_ns) / NS_PER_S,
         "jobs": jobs,
     }
@@ -88,6 +94,9 @@ def sweep(planned: Sequence[PlannedRun], out: Path, *, jobs: int | None, tell: T
     """Drive what is missing of a sweep into `out`, and write its summary and report; returns the report's page."""
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
+    for each in planned:
+        if (runs_dir / each.name / RESULT).is_file():
+            _check_config(each, runs_dir / each.name)
     _remove_unfinished(planned, runs_dir)
     driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell)
     if not driven.results:
