@@ -31,13 +31,15 @@ def report(
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
     from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     runs = [run for directory in directories for run in _runs(directory)]
     for run in runs:
         result = read_json(run / RESULT)
         compute_result(run, result, result.get("digest"))
+    base = recorded_base(directories[0]) if len(directories) == 1 else None
     make_directory(out)
-    console.show(f"the report is {write_report(out, run_dirs=runs)}")
+    console.show(f"the report is {write_report(out, run_dirs=runs, base=base)}")
 
 
 def _runs(directory: Path) -> list[Path]:
