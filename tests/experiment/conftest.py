@@ -49,6 +49,8 @@ class Drive:
     server_unpolled_s: tuple[int, int] = (0, 0)
     """From and until when, not included, the server took no sample of its clocks."""
     client_unpolled_s: tuple[int, int] = (0, 0)
+    capture_ms: float | None = None
+    """From a frame's exposure to its stamp; None: the camera does not tell."""
     late: int = 0
     """So often the physics was late."""
 
@@ -133,7 +135,7 @@ def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
         "number": number,
         "stamp_ns": now.wall_ns,
         "stamped_mono_ns": now.mono_ns,
-        "capture_ns": None,
+        "capture_ns": None if drive.capture_ms is None else now.mono_ns - round(drive.capture_ms * NS_PER_MS),
         "pixel_crc": number,
         "size_bytes": 4000,
         "keyframe": number % 30 == 0,
@@ -196,7 +198,7 @@ def write_client(drive: Drive, path: Path) -> None:
             "reason": "" if readable else "checksum" if decoded else "no picture",
             **({} if drive.undecoded is None else {"decoded": decoded}),
             "rtp_timestamp": stamp_ns * 9 // 100_000 % 2**32,
-            "packet_mono_ns": read.mono_ns - 4 * NS_PER_MS,
+            "packet_mono_ns": read.mono_ns - 10 * NS_PER_MS,
             "decoded_mono_ns": read.mono_ns - 1 * NS_PER_MS,
             "read_mono_ns": read.mono_ns,
             "read_wall_ns": read.wall_ns,
@@ -205,7 +207,7 @@ def write_client(drive: Drive, path: Path) -> None:
         arrived_ns = read.mono_ns - 4 * NS_PER_MS
         ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
         hops = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
-        timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "video", "arrived_mono_ns": arrived_ns}
+        timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
         writer.write("timeline", {**timeline, "hops": hops}, read)
     writer.close()
 
