@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -16,6 +17,7 @@ import lavt
 from lavt.cli import console
 from lavt.cli.main import app
 from lavt.config import shipped
+from lavt.experiment.results import IDENTITY
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
@@ -181,6 +183,34 @@ def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"x")
     assert "file is not a directory" in run("report", "empty", "--out", "file").refused()
     assert files(tmp_path) == {"empty": None, "file": b"x"}
+
+
+WHOLE = dict.fromkeys(IDENTITY)
+NO_RESULTS = {
+    "nothing": ("", "cannot read"),
+    "half a file": ('{"run": "a', "cannot read"),
+    "list": ("[]", "holds no JSON object"),
+    "number": ("7", "holds no JSON object"),
+    "empty object": ("{}", "it lacks run, time"),
+    "without a seed": (json.dumps({key: None for key in IDENTITY if key != "seed"}), "it lacks seed"),
+    "axes that are none": (json.dumps({**WHOLE, "axes": [1]}), "'axes' is no JSON object"),
+    "injection that is none": (json.dumps({**WHOLE, "injected_ms": 5}), "'injected_ms' is no JSON object"),
+}
+
+
+@pytest.mark.parametrize("case", NO_RESULTS)
+def test_report_of_what_is_no_result(case: str, run: Run, tmp_path: Path) -> None:
+    """A result.json that is none ends the report with 1 and one sentence, and nothing is written, in no run."""
+    content, said = NO_RESULTS[case]
+    for name, text in (("a", json.dumps(WHOLE)), ("b", content)):
+        (tmp_path / "sweep" / "runs" / name).mkdir(parents=True)
+        (tmp_path / "sweep" / "runs" / name / "result.json").write_text(text)
+    before = files(tmp_path)
+    ended = run("report", "sweep")
+    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
+    assert said in ended.err
+    assert "b/result.json" in ended.err
+    assert files(tmp_path) == before
 
 
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:

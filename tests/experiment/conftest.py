@@ -44,6 +44,13 @@ class Drive:
     server_counts: tuple[tuple[str, int], ...] = ()
     skipped: int = 0
     """Frames that the camera missed in the middle of the drive."""
+    undecoded: int | None = 0
+    """For so many frames from number 60 on the decoder gave no picture; None: the record says of none if it did."""
+    server_unpolled_s: tuple[int, int] = (0, 0)
+    """From and until when, not included, the server took no sample of its clocks."""
+    client_unpolled_s: tuple[int, int] = (0, 0)
+    capture_ms: float | None = None
+    """From a frame's exposure to its stamp; None: the camera does not tell."""
     late: int = 0
     """So often the physics was late."""
 
@@ -82,6 +89,8 @@ def write_server(drive: Drive, path: Path) -> None:
     writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
     end_ns = round(drive.seconds * NS_PER_S)
     for second in range(-1, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.server_unpolled_s):
+            continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
         writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
@@ -126,7 +135,7 @@ def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
         "number": number,
         "stamp_ns": now.wall_ns,
         "stamped_mono_ns": now.mono_ns,
-        "capture_ns": None,
+        "capture_ns": None if drive.capture_ms is None else now.mono_ns - round(drive.capture_ms * NS_PER_MS),
         "pixel_crc": number,
         "size_bytes": 4000,
         "keyframe": number % 30 == 0,
@@ -171,6 +180,8 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
 def write_client(drive: Drive, path: Path) -> None:
     writer = RecordWriter(path, "client")
     for second in range(-1, math.ceil(drive.seconds) + 2):
+        if second in range(*drive.client_unpolled_s):
+            continue
         at_ns = second * NS_PER_S
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
@@ -179,13 +190,15 @@ def write_client(drive: Drive, path: Path) -> None:
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
         read = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
-        readable = number % 50 != 49
-        picture = {
+        decoded = not 60 <= number < 60 + (drive.undecoded or 0)
+        readable = decoded and number % 50 != 49
+        picture: dict[str, Any] = {
             "stamp_ns": stamp_ns if readable else None,
             "readable": readable,
-            "reason": "" if readable else "checksum",
+            "reason": "" if readable else "checksum" if decoded else "no picture",
+            **({} if drive.undecoded is None else {"decoded": decoded}),
             "rtp_timestamp": stamp_ns * 9 // 100_000 % 2**32,
-            "packet_mono_ns": read.mono_ns - 4 * NS_PER_MS,
+            "packet_mono_ns": read.mono_ns - 10 * NS_PER_MS,
             "decoded_mono_ns": read.mono_ns - 1 * NS_PER_MS,
             "read_mono_ns": read.mono_ns,
             "read_wall_ns": read.wall_ns,
@@ -194,7 +207,7 @@ def write_client(drive: Drive, path: Path) -> None:
         arrived_ns = read.mono_ns - 4 * NS_PER_MS
         ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
         hops = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
-        timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "video", "arrived_mono_ns": arrived_ns}
+        timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
         writer.write("timeline", {**timeline, "hops": hops}, read)
     writer.close()
 

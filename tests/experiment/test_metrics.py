@@ -91,6 +91,19 @@ def test_only_the_drive_counts(make_run: MakeRun, tmp_path: Path) -> None:
     assert entry["duration_s"] == 12.0
 
 
+def test_what_the_decoder_gave_nothing_for_is_no_picture(make_run: MakeRun, tmp_path: Path) -> None:
+    """An access unit without a picture is neither decoded nor unreadable, and gives no latency."""
+    entry = measured(make_run, tmp_path, undecoded=5).entry
+    assert (entry["frames_sent"], entry["frames_decoded"], entry["frames_unreadable"]) == (361, 356, 7)
+    assert entry["tau_v_ms"]["n"] == 349
+
+
+def test_a_record_that_does_not_say_what_was_decoded(make_run: MakeRun, tmp_path: Path) -> None:
+    """Where a record does not say of a picture whether it was decoded, it counts as decoded."""
+    entry = measured(make_run, tmp_path, undecoded=None).entry
+    assert (entry["frames_decoded"], entry["frames_unreadable"]) == (361, 7)
+
+
 def test_picture_age_is_the_loop_and_half_the_hold(make_run: MakeRun, tmp_path: Path) -> None:
     """With a constant loop of 76 ms and a new picture every 33.3 ms the mean picture age is 92.7 ms."""
     age = measured(make_run, tmp_path, spread_ms=0.0).entry["picture_age_ms"]

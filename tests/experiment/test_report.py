@@ -12,10 +12,11 @@ import pytest
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment import page
-from lavt.experiment.breakdown import breakdown
+from lavt.experiment.breakdown import breakdown, capture_to_stamp_ms
 from lavt.experiment.figures import condition_colours
 from lavt.experiment.record import RecordWriter, read_record
 from lavt.experiment.report import received_pictures, write_report
+from lavt.experiment.report_tables import hop_table
 from lavt.experiment.results import run_result, write_json
 from lavt.nodes.reports import VideoUnit
 
@@ -112,10 +113,27 @@ def test_the_shares_of_the_loop_are_those_recorded(make_run: MakeRun, tmp_path: 
     shares = breakdown(server, client, run_result({}, server, client))
     milliseconds = {(node, hop): duration_ms for node, hop, duration_ms in shares}
     assert milliseconds["driver", "decode"] == pytest.approx(2.0)
+    assert milliseconds["receiver", "reorder and depacketize"] == pytest.approx(6.0)
+    nodes = [node for node, _, _ in shares]
+    assert nodes.index("driver") == nodes.index("receiver") + 1
     assert milliseconds["camera", "encode"] == pytest.approx(4.0)
     assert ("camera", "capture") not in milliseconds
     assert milliseconds["network", "control link"] == pytest.approx(9.0, abs=1e-3)
     assert sum(milliseconds.values()) == pytest.approx(76.0, abs=1e-3)
+
+
+def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
+    """From capture to stamp is a row of the table of hops and no share of the loop; unknown where no camera told."""
+    make_run(tmp_path, seconds=3.0, capture_ms=7.5)
+    server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
+    assert capture_to_stamp_ms(server) == 7.5
+    shares = breakdown(server, client, run_result({}, server, client))
+    assert sum(duration_ms for _, _, duration_ms in shares) == pytest.approx(76.0, abs=1e-3)
+    row = "camera: capture to stamp, before the loop"
+    assert row in hop_table({"L0": shares}, {"L0": 7.5})
+    assert "7.50" in hop_table({"L0": []}, {"L0": 7.5})
+    assert capture_to_stamp_ms(read_record(sweep / "runs" / "0" / "server.mcap")) is None
+    assert re.search(f"{row}.*?unknown", page_of(sweep).replace("\n", " "))
 
 
 def test_received_pictures_are_decoded(tmp_path: Path) -> None:

@@ -5,22 +5,29 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 from lavt.clock import pause
 from lavt.config import SweepConfig, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.sweep import open_sweep, sweep
+from lavt.experiment.sweep import base_of, open_sweep, recorded_base, run_all, sweep
 
 CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
 
+def asked(*changes: str) -> SweepConfig:
+    return load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, *changes])
+
+
 def two_runs() -> list[PlannedRun]:
-    return plan_sweep(load_config(SweepConfig, shipped("configs/sweep.yaml"), CHANGES))
+    return plan_sweep(asked())
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +35,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two runs, driven by two processes."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(two_runs(), out, jobs=2, tell=lambda _: None)
+    sweep(asked(), two_runs(), out, jobs=2, tell=lambda _: None)
     return out
 
 
@@ -37,6 +44,7 @@ def test_a_sweep_leaves_a_whole_directory(swept: Path) -> None:
     for run in two_runs():
         names = {path.name for path in (swept / "runs" / run.name).iterdir()}
         assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
+    assert load_config(SweepConfig, swept / "sweep.yaml") == asked()
     assert (swept / "report" / "index.html").is_file()
     summary = json.loads((swept / "summary.json").read_text())
     assert list(summary["conditions"]) == ["L0", "L3"]
@@ -51,18 +59,68 @@ def test_resuming_drives_only_what_is_missing(swept: Path) -> None:
     first, second = (swept / "runs" / run.name for run in two_runs())
     kept = (second / "result.json").stat().st_mtime_ns
     (first / "result.json").unlink()  # as if it had been killed while driving
-    sweep(two_runs(), swept, jobs=1, tell=lambda _: None)
+    sweep(asked(), two_runs(), swept, jobs=1, tell=lambda _: None)
     after = json.loads((swept / "summary.json").read_text())
     assert (second / "result.json").stat().st_mtime_ns == kept
     assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
     assert after["conditions"] == before["conditions"]
 
 
+def test_the_speed_is_that_of_what_was_driven(swept: Path) -> None:
+    """Runs that were driven before do not make a resumed sweep faster; where nothing is driven the speed is kept."""
+    first = swept / "runs" / two_runs()[0].name
+    (first / "result.json").unlink()
+    sweep(asked(), two_runs(), swept, jobs=1, tell=lambda _: None)
+    speed = json.loads((swept / "summary.json").read_text())["speed"]
+    assert speed["simulated_s"] == json.loads((first / "result.json").read_text())["duration_s"]
+    sweep(asked(), two_runs(), swept, jobs=2, tell=lambda _: None)
+    assert json.loads((swept / "summary.json").read_text())["speed"] == speed
+
+
+def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
+    """A run that ends with an error that nobody foresaw is told by its kind and text, and the others are driven."""
+    good, bad = two_runs()
+    told: list[str] = []
+    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, tell=told.append)
+    ((name, why),) = driven.failed
+    assert name == bad.name
+    assert why.startswith("ValidationError: ")
+    assert f"{name} failed: {why}" in told
+    assert [result["run"] for result in driven.results] == [good.name]
+    assert speed is not None
+
+
 def test_resuming_with_another_config_is_refused(swept: Path) -> None:
     """A sweep that was driven with another config is not resumed: its runs would not belong together."""
-    changed = plan_sweep(load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, "seed=2"]))
+    changed, before = asked("seed=2"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
-        sweep(changed, swept, jobs=1, tell=lambda _: None)
+        sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
+    assert (swept / "sweep.yaml").read_bytes() == before
+
+
+BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
+    ((), {}),
+    (("axes={video.bit_rate_bps: [1000000, 4000000]}",), {"video.bit_rate_bps": 4_000_000}),
+    (
+        ("axes={video.bit_rate_bps: [1000000, 4000000]}", "video.bit_rate_bps=1000000"),
+        {"video.bit_rate_bps": 1_000_000},
+    ),
+    (
+        ("axes={video.bit_rate_bps: [1000000, 4000000]}", "video.bit_rate_bps=2000000"),
+        {"video.bit_rate_bps": 2_000_000},
+    ),
+    (("axes={camera.rate_hz: [20, 30], study.block: [1, null]}",), {"camera.rate_hz": 30, "study.block": None}),
+]
+
+
+@pytest.mark.parametrize(("changes", "base"), BASES, ids=str)
+def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[str, Any], tmp_path: Path) -> None:
+    """The base of a sweep is what its config itself says at each axis, wherever that stands among the axis' values."""
+    config = asked(*changes)
+    assert base_of(config, plan_sweep(config)) == base
+    assert recorded_base(tmp_path) is None
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    assert recorded_base(tmp_path) == base
 
 
 @pytest.mark.realtime

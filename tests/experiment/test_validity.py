@@ -37,6 +37,13 @@ def test_a_good_run_is_valid(make_run: MakeRun, tmp_path: Path) -> None:
         ({"late": 2}, "the physics was late 2 times"),
         ({"skipped": 10}, "the camera missed 10 of 361 ticks"),
         ({"ending": None}, "the record has no ending"),
+        ({"server_unpolled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unpolled_s": (-1, 3)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unpolled_s": (10, 15)}, "the clock of the server was not sampled for 3.0 s"),
+        ({"server_unpolled_s": (-1, 15)}, "the clock of the server was not sampled for 12.0 s"),
+        ({"client_unpolled_s": (4, 6)}, "the clock of the client was not sampled for 3.0 s"),
+        ({"client_unpolled_s": (6, 15)}, "the clock samples of the client reach over 6.0 s of a drive of 12.0 s"),
+        ({"client_unpolled_s": (-1, 15)}, "the clock samples of the client reach over 0.0 s of a drive of 12.0 s"),
     ],
 )
 def test_each_fault_of_the_infrastructure_is_told(
@@ -48,10 +55,16 @@ def test_each_fault_of_the_infrastructure_is_told(
 
 @pytest.mark.parametrize(
     "settings",
-    [{"skipped": 3, "server_counts": (("record_overflow", 0),)}, {"step_s": 0.004}],
+    [
+        {"skipped": 3, "server_counts": (("record_overflow", 0),)},
+        {"step_s": 0.004},
+        {"server_unpolled_s": (4, 5), "client_unpolled_s": (7, 8)},
+        {"server_unpolled_s": (-1, 2)},
+        {"server_unpolled_s": (11, 15)},
+    ],
 )
 def test_small_faults_are_borne(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
-    """Fewer than 1 % of the ticks missed, or a clock that moved by less than 5 ms, leave the run valid."""
+    """Fewer than 1 % of the ticks missed, a clock that moved by less than 5 ms, or one missed poll leave it valid."""
     assert reasons(make_run, tmp_path, **settings) == []
 
 

@@ -123,6 +123,7 @@ def test_a_picture_is_read_and_shown() -> None:
     assert (read(sends).stamp_ns, read(sends).readable, read(sends).in_doubt) == (WALL_NS + 17, True, False)
     (view,) = of(sends, "view")
     assert view.stamp_ns == WALL_NS + 17
+    assert read(sends).decoded
     assert bench.node.counts["frames_decoded"] == 1
 
 
@@ -137,6 +138,7 @@ def test_a_stamp_that_disagrees_with_its_packets_is_never_used() -> None:
     bench = Bench()
     sends = bench.take("access_unit", unit_of(noise(1), WALL_NS, rtp_ns=WALL_NS + NS_PER_MS))
     assert (read(sends).stamp_ns, read(sends).readable) == (None, False)
+    assert read(sends).decoded
     assert read(sends).reason == "stamp and RTP timestamp disagree"
     assert of(sends, "view") == []
     assert bench.node.counts["frames_unreadable"] == 1
@@ -157,6 +159,7 @@ def test_what_gives_no_picture_asks_for_a_keyframe() -> None:
     sends = bench.take("access_unit", unit)
     assert of(sends, "picture_lost") == [None]
     assert read(sends).in_doubt
+    assert not read(sends).decoded
     assert not read(bench.take("access_unit", unit_of(noise(1), WALL_NS))).in_doubt
 
 

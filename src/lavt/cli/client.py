@@ -31,6 +31,7 @@ def client(
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
+    console.take_precedence()
     settings = load_config(ClientConfig, config, changes or [])
     clock = MachineClock()
     with Side(

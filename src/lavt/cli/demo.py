@@ -60,7 +60,7 @@ def _drive_real(config: Path, out: Path) -> None:
         console.say(f"real time, {name}: {result['ending']}")
 
 
-def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any]]:
+def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None]:
     """Drive the same under all conditions; tell whether any run failed, and the speed."""
     base = load_config(RunConfig, config, ["time=virtual"])
     axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}

@@ -30,6 +30,7 @@ def relay(
 
     Example: lavt relay configs/relay.yaml --set video.constant_ms=75
     """
+    console.take_precedence()
     settings = load_config(RelayConfig, config, changes or [])
     opened = Relay(MachineClock(), flows(settings))
     with console.until_told() as told:

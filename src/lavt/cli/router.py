@@ -26,6 +26,7 @@ def router(
     Example: lavt router zenoh-configs/router-server.json5 --set 'listen.endpoints=[tcp/127.0.0.1:7447]'
     """
     console.keep_stdout_for_results()
+    console.take_precedence()
     from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (nobody else should wait for Zenoh)
 
     quiet_logs()

@@ -32,6 +32,7 @@ def server(
     Example: lavt server configs/server.yaml --out out/server
     """
     console.keep_stdout_for_results()
+    console.take_precedence()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
     with Side("server", settings, out, clock, vehicle=settings.vehicle_id, who="server", zenoh=settings.zenoh) as side:

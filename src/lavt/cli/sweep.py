@@ -34,11 +34,12 @@ def sweep(
     from lavt.experiment.sweep import open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    planned = plan_sweep(load_config(SweepConfig, config, changes or []))
+    asked = load_config(SweepConfig, config, changes or [])
+    planned = plan_sweep(asked)
     out = out or Path("out") / "sweep"
     open_sweep(out, resume=resume)
     with console.interruptible(), progress(f"sweep into {out}", len(planned)) as tell:
-        page, driven = drive_sweep(planned, out, jobs=jobs, tell=tell)
+        page, driven = drive_sweep(asked, planned, out, jobs=jobs, tell=tell)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
     if as_json:

@@ -11,9 +11,9 @@ from lavt.domain import NS_PER_MS
 from lavt.experiment.latency import frames_within, look_up
 from lavt.experiment.metrics import driving_interval
 from lavt.experiment.record import Record
-from lavt.experiment.table import MISSING, Table
+from lavt.experiment.table import MISSING, IntArray, Table
 
-BEFORE_VIDEO, AFTER_VIDEO, AFTER_CONTROL = ("camera",), ("receiver", "driver"), ("actuator",)
+BEFORE_VIDEO, AFTER_VIDEO, AFTER_CONTROL = ("camera",), ("driver",), ("actuator",)
 """The nodes on the way of a frame, and between which of them it is on the network."""
 
 Share = tuple[str, str, float]
@@ -33,12 +33,40 @@ def breakdown(server: Record, client: Record, result: Mapping[str, Any]) -> list
     began_ns, ended_ns, _ = driving_interval(server)
     frames = frames_within(server.table("frame"), began_ns, ended_ns)
     camera = _hops(server.table("timeline"), BEFORE_VIDEO, frames, from_stamp=True)
-    client_hops = _hops(client.table("timeline"), AFTER_VIDEO, frames)
+    client_hops = [*_receiver(client, frames), *_hops(client.table("timeline"), AFTER_VIDEO, frames)]
     actuator = _hops(server.table("timeline"), AFTER_CONTROL, frames)
     control_link: list[Share] = [] if tau_c_ms is None else [("network", "control link", max(tau_c_ms, 0.0))]
     known_ms = sum(share[2] for share in [*camera, *client_hops, *control_link, *actuator])
     rest: list[Share] = [("network", "video link and waiting", max(loop_ms - known_ms, 0.0))]
     return [*camera, *rest, *client_hops, *control_link, *actuator]
+
+
+def capture_to_stamp_ms(server: Record) -> float | None:
+    """Median time from a frame's exposure to its stamp, which is before the loop; None where no camera told of it."""
+    began_ns, ended_ns, _ = driving_interval(server)
+    frames = frames_within(server.table("frame"), began_ns, ended_ns)
+    capture_ns = frames.ints("capture_ns")
+    known = capture_ns != MISSING
+    return _median_ms((frames.ints("stamped_mono_ns") - capture_ns)[known])
+
+
+def _receiver(client: Record, frames: Table) -> list[Share]:
+    """Give the receiver's share: its timelines know no stamp, but the pictures and the driver's timelines do.
+
+    It reaches from the arrival of the packet that made the access unit whole to the access unit's at the driver.
+    """
+    timelines, pictures = client.table("timeline"), client.table("picture")
+    chains = zip(timelines.texts("node"), timelines.texts("channel"), strict=True)
+    units = timelines.where(np.array([chain == ("driver", "access_unit") for chain in chains], np.bool_))
+    stamps = frames.ints("stamp_ns")
+    packet_ns = look_up(pictures.ints("stamp_ns"), pictures.ints("packet_mono_ns"), stamps)
+    unit_ns = look_up(units.ints("stamp_ns"), units.ints("arrived_mono_ns"), stamps)
+    share_ms = _median_ms((unit_ns - packet_ns)[(packet_ns != MISSING) & (unit_ns != MISSING)])
+    return [] if share_ms is None else [("receiver", "reorder and depacketize", share_ms)]
+
+
+def _median_ms(times_ns: IntArray) -> float | None:
+    return float(np.median(times_ns)) / NS_PER_MS if len(times_ns) else None
 
 
 def _hops(timelines: Table, nodes: Sequence[str], frames: Table, *, from_stamp: bool = False) -> list[Share]:

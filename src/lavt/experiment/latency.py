@@ -48,6 +48,11 @@ def pictures_of(pictures: Table, frames: Table) -> Table:
     return pictures.where(np.where(pictures.flags("readable"), by_stamp, by_packet))
 
 
+def decoded_pictures(pictures: Table) -> Table:
+    """Those for which the decoder gave a picture; a record that does not say of one counts it."""
+    return pictures.where(np.array([decoded is not False for decoded in pictures.objects("decoded")], np.bool_))
+
+
 def video_latency_ns(pictures: Table, clocks: Clocks) -> IntArray:
     """tau_v of every readable picture: stamp written on the server to stamp read on the client, in reference time."""
     readable = pictures.where(pictures.flags("readable") & (pictures.ints("read_wall_ns") != MISSING))

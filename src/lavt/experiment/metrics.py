@@ -13,6 +13,7 @@ from lavt.experiment.clocks import clocks
 from lavt.experiment.latency import (
     closure_ns,
     control_latency_ns,
+    decoded_pictures,
     frames_within,
     loops,
     percentiles_ms,
@@ -94,7 +95,7 @@ def _latencies(
 ) -> tuple[dict[str, Any], float | None, float | None]:
     all_frames, admissions = server.table("frame"), server.table("admission")
     frames = frames_within(all_frames, began_ns, ended_ns)
-    pictures = pictures_of(client.table("picture"), frames)
+    pictures = decoded_pictures(pictures_of(client.table("picture"), frames))
     paired = loops(frames, admissions, ended_ns)
     age = picture_age(all_frames, admissions, began_ns, ended_ns)
     on_one_scale = clocks(server.table("clock"), client.table("clock"))

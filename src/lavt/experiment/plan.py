@@ -63,8 +63,9 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
 
     Raises `UserError` for what `plan_run` refuses, for a sweep of nothing, and for one that asks for a run twice.
     """
-    for key in sweep.axes.keys() & TAKEN:
-        raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[key]!r}")
+    for key, taken in itertools.product(sweep.axes, TAKEN):
+        if f"{taken}.".startswith(f"{key}."):  # a whole section would change what it holds, too
+            raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[taken]!r} for {taken!r}")
     base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
     runs = []
     for values in itertools.product(*sweep.axes.values()):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lavt.domain import Picture
 from lavt.errors import WorkError
 from lavt.experiment import page
-from lavt.experiment.breakdown import Share, breakdown
+from lavt.experiment.breakdown import Share, breakdown, capture_to_stamp_ms
 from lavt.experiment.drives import Drive, one_of_each_condition, read_drive
 from lavt.experiment.figures import (
     Colours,
@@ -184,16 +184,18 @@ def _of_one_kind(kind: str, all_drives: Sequence[Drive], report_dir: Path, colou
 
 def _breakdown_parts(kind: str, chosen: Sequence[Drive], report_dir: Path) -> list[str]:
     shares: dict[str, list[Share]] = {}
+    captured_ms: dict[str, float | None] = {}
     for drive in chosen:
         if (drive.directory / "client.mcap").is_file():
             server, client = (read_record(drive.directory / f"{side}.mcap") for side in ("server", "client"))
             shares[drive.condition] = breakdown(server, client, drive.result)
+            captured_ms[drive.condition] = capture_to_stamp_ms(server)
     shares = {name: every for name, every in shares.items() if every}
     if not shares:
         return []
     caption = "Where the median loop goes, one run of each condition, in the order of a frame's life."
     figure = _save(breakdown_figure(shares), report_dir, f"hops_{kind}.png", "latency of each hop", caption)
-    return [figure, hop_table(shares)]
+    return [figure, hop_table(shares, captured_ms)]
 
 
 def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:

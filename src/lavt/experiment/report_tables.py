@@ -76,12 +76,16 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> str:
     return table(headers, rows, text_columns=[8])
 
 
-def hop_table(shares: Mapping[str, Sequence[Share]]) -> str:
-    """One row a hop in the order of a frame's life, one column a condition: medians in ms."""
+def hop_table(shares: Mapping[str, Sequence[Share]], captured_ms: Mapping[str, float | None]) -> str:
+    """One row a hop in the order of a frame's life, one column a condition: medians in ms.
+
+    `captured_ms` is how long a frame's stamp came after its exposure: the first row, though the loop begins after it.
+    """
     hops = list(dict.fromkeys((node, hop) for every in shares.values() for node, hop, _ in every))
     durations = {name: {(node, hop): ms for node, hop, ms in every} for name, every in shares.items()}
+    before = ["unknown" if captured_ms[name] is None else number(captured_ms[name], 2) for name in shares]
     rows = [[f"{node}: {hop}", *(number(of.get((node, hop)), 2) for of in durations.values())] for node, hop in hops]
-    return table(["hop, median ms", *durations], rows)
+    return table(["hop, median ms", *durations], [["camera: capture to stamp, before the loop", *before], *rows])
 
 
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> str:

@@ -31,7 +31,8 @@ class ClockSyncNode:
         return self._next_ns
 
     def _ask(self, _message: Message, now: Now) -> list[Send]:
-        self._next_ns = now.mono_ns + PERIOD_NS
+        late_ns = now.mono_ns - self._next_ns
+        self._next_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS  # by the grid: being late must not add up
         return [Send("clock_query", None)]
 
     def _sample(self, message: Message, now: Now) -> list[Send]:

@@ -128,6 +128,7 @@ class DriverNode:
             readable,
             read.reason,
             self._in_doubt,
+            decoded.picture is not None,
             unit.rtp_timestamp,
             unit.packet_mono_ns,
             decoded.decoded_mono_ns,

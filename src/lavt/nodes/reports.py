@@ -59,6 +59,8 @@ class PictureRead:
     reason: str
     in_doubt: bool
     """Something of it, or of a picture it refers to, was lost since the last clean keyframe."""
+    decoded: bool
+    """The decoder gave a picture for it."""
     rtp_timestamp: int
     packet_mono_ns: int
     decoded_mono_ns: int
