@@ -6,7 +6,7 @@ LavtError
 ├── PeerError            what the peer or the network did wrong: counted and dropped, never fatal
 │   ├── BadMessage       bytes that are not a message of ours, or hold a value out of range
 │   └── BadPacket        a datagram that is not RTP, or whose payload cannot be H.264
-└── VehicleError         what the vehicle did wrong: leads to a stop
+└── VehicleError         what the vehicle did wrong: ends the server, as nobody can drive by it
 """
 
 from __future__ import annotations
