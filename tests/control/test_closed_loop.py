@@ -10,6 +10,7 @@ import pytest
 
 from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.control.lane_watch import LaneState, LaneWatch
+from lavt.control.limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, CameraModel, Picture
 from lavt.perception.lane_detector import LaneDetector
 from lavt.vehicle.sim.renderer import Renderer
@@ -70,8 +71,8 @@ def drive(
         lane = detector.detect(picture if now_ns < blind_after_s * NS_PER_S else seen(picture))
         done.lane_state = watch.check(lane.confidence, now_ns)
         decision = controller.decide(lane, truth.speed_mps, now_ns)
-        command = Actuation(decision.steering_rad, decision.throttle, decision.brake)
-        car.apply(command, now_ns + delay_ns)
+        brake = decision.brake if done.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
+        car.apply(Actuation(decision.steering_rad, decision.throttle, brake), now_ns + delay_ns)
         if done.lane_state == "stop":
             break
     return done

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Protocol
 
-from lavt.control.lane_watch import LANE_CONFIDENCE, LaneState, LaneWatch
+from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.control.pure_pursuit import (
     SEEN_FROM,
     curvature_per_m,
@@ -21,10 +21,6 @@ from lavt.control.speed_pi import SpeedPi, confident_speed_mps
 from lavt.domain import NS_PER_S, Decision, Lane
 from lavt.errors import UserError
 
-LOST_BRAKING_MPS2 = 3.0
-"""Without a lane: firm, but a passenger keeps the coffee; from 30 km/h it takes 2.8 s."""
-STOP_BRAKING_MPS2 = 4.0
-"""As the vehicle's own safe stop."""
 WHEEL_LIMIT_RAD = 0.5
 """What a car's road wheel can do at most."""
 
@@ -68,7 +64,9 @@ PRESETS = {preset.name: preset for preset in (DESIGNED, PAPER_CALIBRATED)}
 
 
 class LaneKeeper:
-    """Keeps to the lane by pure pursuit and to a speed by PI; without a lane it follows the last one, then brakes.
+    """Keeps to the lane by pure pursuit and to a speed by PI; without a lane it follows the last one without throttle.
+
+    When to brake and to stop for want of a lane is decided for every controller alike, by the driver node.
 
     It does not look ahead in time: what the picture shows is taken as if it were now, as in the paper.
     """
@@ -79,7 +77,6 @@ class LaneKeeper:
         self._preset = preset
         self._wheelbase_m = wheelbase_m
         self._speed_pi = SpeedPi(max_acceleration_mps2, max_braking_mps2)
-        self._watch = LaneWatch()
         self._lane = Lane((0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0)
         self._place = SEEN_FROM
         self._curvature_per_m = 0.0
@@ -97,8 +94,7 @@ class LaneKeeper:
         limit_per_m = self._curvature_limit_per_m(speed_mps)
         distance_m = lookahead_m(self._preset.lookahead_s, speed_mps)
         self._curvature_per_m = limited(pursuit_curvature_per_m(self._lane, distance_m, self._place), limit_per_m)
-        state = self._watch.check(lane.confidence, now_ns)
-        throttle, brake = self._speed_pi.pedals(self._acceleration_mps2(state, lane.confidence, speed_mps, step_s))
+        throttle, brake = self._speed_pi.pedals(self._acceleration_mps2(lane.confidence, speed_mps, step_s))
         return Decision(
             steering_rad=steering_rad(self._curvature_per_m, self._wheelbase_m),
             throttle=throttle,
@@ -106,11 +102,7 @@ class LaneKeeper:
             path_curvature_per_m=pursued_path(self._lane, distance_m, limit_per_m, self._place),
         )
 
-    def _acceleration_mps2(self, state: LaneState, confidence: float, speed_mps: float, step_s: float) -> float:
-        if state == "stop":
-            return -STOP_BRAKING_MPS2
-        if state == "brake":
-            return -LOST_BRAKING_MPS2
+    def _acceleration_mps2(self, confidence: float, speed_mps: float, step_s: float) -> float:
         if confidence < LANE_CONFIDENCE:
             return 0.0  # neither faster into the unseen nor a jolt for every picture that failed
         target_mps = confident_speed_mps(self._preset.speed_mps, confidence)

@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 
 from lavt.node import Message
-from lavt.transport.channels import CHANNELS, QUEUE_LENGTH
+from lavt.transport.channels import CHANNELS
 
 
 class Inbox:
-    """Messages in the order in which a node shall see them: all that queues first, then the newest of the rest."""
+    """Messages in the order in which a node shall see them: all that queues first, then the newest of the rest.
+
+    Each channel has a queue of its own length, so that a flood on one loses nothing of another.
+    """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._queue: deque[Message] = deque()
+        self._number = 0
+        self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
         self._newest: dict[str, Message] = {}
 
     def put(self, message: Message) -> None:
         """Let a message wait."""
-        if CHANNELS[message.channel].waiting == "newest":
+        row = CHANNELS[message.channel]
+        if row.waiting == "newest":
             if message.channel in self._newest:
                 self.counts[f"{message.channel}_replaced"] += 1
             self._newest[message.channel] = message
             return
-        if len(self._queue) >= QUEUE_LENGTH:
-            self.counts[f"{self._queue.popleft().channel}_dropped"] += 1
-        self._queue.append(message)
+        queue = self._queues[message.channel]
+        if len(queue) >= row.length:
+            queue.popleft()
+            self.counts[f"{message.channel}_dropped"] += 1
+        self._number += 1
+        queue.append((self._number, message))
 
     def take(self) -> Message | None:
         """Take the next message; None when nothing waits."""
-        if self._queue:
-            return self._queue.popleft()
+        waiting = [queue for queue in self._queues.values() if queue]
+        if waiting:
+            return min(waiting, key=lambda queue: queue[0][0]).popleft()[1]
         if self._newest:
             return self._newest.pop(next(iter(self._newest)))
         return None

@@ -13,6 +13,9 @@ Waiting = Literal["queue", "newest"]
 """queue: kept in order, the oldest dropped when full. newest: a new one replaces the one that waits."""
 
 QUEUE_LENGTH = 4096
+"""More than a second of packets."""
+COMMANDS = 64
+"""A second of commands: older ones would be refused anyway."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +26,8 @@ class Channel:
     sender: str
     receivers: tuple[str, ...] = ()
     waiting: Waiting = "queue"
+    length: int = QUEUE_LENGTH
+    """How many may wait in the queue."""
 
 
 CHANNELS: dict[str, Channel] = {
@@ -39,9 +44,9 @@ CHANNELS: dict[str, Channel] = {
     # across the network
     "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
     "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
-    "control": Channel("zenoh", "driver", ("actuator",)),
+    "control": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
     "state": Channel("zenoh", "actuator", ("driver",), "newest"),
-    "session": Channel("zenoh", "driver", ("actuator",)),
+    "session": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
     # each host and its own clock
     "clock_query": Channel("clock", "clock_sync"),
