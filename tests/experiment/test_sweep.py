@@ -13,10 +13,11 @@ import pytest
 import yaml
 
 from lavt.clock import pause
-from lavt.config import SweepConfig, load_config, shipped
+from lavt.config import RunConfig, SweepConfig, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
-from lavt.experiment.plan import PlannedRun, plan_sweep
+from lavt.experiment.plan import PlannedRun, plan_run, plan_sweep
+from lavt.experiment.run import run_once
 from lavt.experiment.sweep import base_of, open_sweep, recorded_base, run_all, sweep
 
 CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
@@ -88,6 +89,13 @@ def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
     assert f"{name} failed: {why}" in told
     assert [result["run"] for result in driven.results] == [good.name]
     assert speed is not None
+
+
+def test_a_run_directory_repeats_its_run(swept: Path, tmp_path: Path) -> None:
+    """The config in a run directory, driven by itself, gives the same digest as the run of the sweep."""
+    directory = swept / "runs" / two_runs()[0].name
+    again = run_once(plan_run(load_config(RunConfig, directory / "config.yaml")), tmp_path / "again")
+    assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
 
 
 def test_resuming_with_another_config_is_refused(swept: Path) -> None:

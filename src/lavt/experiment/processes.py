@@ -1,4 +1,7 @@
-"""Processes of LAVT started by LAVT: each prints JSON lines, is told to end with SIGINT, and never outlives its run."""
+"""Processes of LAVT started by LAVT: each prints JSON lines, and is told to end with SIGINT when its run ends.
+
+Only a run that is killed outright (SIGKILL) leaves its processes behind.
+"""
 
 from __future__ import annotations
 
