@@ -34,7 +34,7 @@ def test_a_good_run_is_valid(make_run: MakeRun, tmp_path: Path) -> None:
         ({"step_s": 0.02}, "the wall clock of the client stepped by +20.0 ms"),
         ({"bound_s": None}, "the offset between the clocks has no bound"),
         ({"bound_s": 0.0011}, "only known to 2.20 ms"),
-        ({"late": 2}, "the physics was late 2 times"),
+        ({"late": 3}, "the physics was 180 ms late in all"),
         ({"skipped": 10}, "the camera missed 10 of 361 ticks"),
         ({"ending": None}, "the record has no ending"),
         ({"server_unpolled_s": (4, 6)}, "the clock of the server was not sampled for 3.0 s"),
@@ -56,6 +56,7 @@ def test_each_fault_of_the_infrastructure_is_told(
 @pytest.mark.parametrize(
     "settings",
     [
+        {"late": 1},
         {"skipped": 3, "server_counts": (("record_overflow", 0),)},
         {"step_s": 0.004},
         {"server_unpolled_s": (4, 5), "client_unpolled_s": (7, 8)},

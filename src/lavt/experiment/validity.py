@@ -19,6 +19,8 @@ POLL_LIMIT_S = 2.5
 CLOCK_BOUND_LIMIT_MS = 2.0
 """Beyond this the split of the loop into tau_v and tau_c says too little."""
 CLOSURE_LIMIT_MS = 1.0
+LATE_LIMIT = 0.01
+"""Share of the drive for which the physics may lag behind, hitches of over 50 ms counted."""
 SKIPPED_LIMIT = 0.01
 """Share of camera ticks that may be missed."""
 INJECTION_LIMIT_MS = 1.0
@@ -116,10 +118,14 @@ def _tick_reasons(server: Record) -> list[str]:
     began_ns, ended_ns, ending = driving_interval(server)
     reasons = [] if ending is not None else ["the record has no ending"]
     events = server.table("event")
-    driving = (events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns)
-    late = events.where(driving).texts("kind").count("late")
-    if late > 0:
-        reasons.append(f"the physics was late {late} times")
+    events = events.where((events.ints("mono_ns") >= began_ns) & (events.ints("mono_ns") <= ended_ns))
+    late_ms = [
+        int(detail.removesuffix(" ms"))
+        for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True)
+        if kind == "late"
+    ]
+    if sum(late_ms) * NS_PER_MS > LATE_LIMIT * (ended_ns - began_ns):
+        reasons.append(f"the physics was {sum(late_ms)} ms late in all (limit {LATE_LIMIT:.0%} of the drive)")
     numbers = frames_within(server.table("frame"), began_ns, ended_ns).ints("number")
     ticks = int(numbers[-1] - numbers[0]) + 1 if len(numbers) else 0
     skipped = ticks - len(numbers)

@@ -158,7 +158,7 @@ class ActuatorNode:
         events = self.vehicle.advance(now.mono_ns)
         if now.mono_ns - due_ns > LATE_NS:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS
-            events.append(VehicleEvent(now.mono_ns, "late", f"the physics was {late_ms} ms late"))
+            events.append(VehicleEvent(now.mono_ns, "late", f"{late_ms} ms"))
         self.gate.watch(now.mono_ns)
         self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
         return events
