@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import secrets
-import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -33,6 +32,7 @@ from lavt.streams import stream, stream_key
 from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
+from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.sim.camera import SimCamera
@@ -286,13 +286,9 @@ def parse_address(key: str, text: str) -> tuple[str, int]:
 
 
 def resolved_address(key: str, text: str) -> tuple[str, int]:
-    """Read `host:port` and look the host up, once: no datagram waits for a name server, and numbers can be compared."""
+    """Read `host:port` and look the host up; raises `UserError` naming `key`."""
     host, port = parse_address(key, text)
-    try:
-        return socket.gethostbyname(host), port
-    except (OSError, ValueError) as error:  # ValueError: what cannot be a name at all
-        why = error.strerror if isinstance(error, OSError) else error
-        raise UserError(f"{key}: the host {host!r} is not known ({why})") from error
+    return look_up(key, host), port
 
 
 def run_seed(seed: int, route: str, repetition: int) -> int:

@@ -24,11 +24,6 @@ class MachineClock:
         return Now(time.monotonic_ns(), time.time_ns())
 
 
-def cpu_ns() -> int:
-    """CPU time of this process and the children it has waited for, in nanoseconds."""
-    return time.process_time_ns()
-
-
 def pause(duration_ns: int) -> None:
     """Sleep; for the outermost loops of programs only."""
     if duration_ns > 0:

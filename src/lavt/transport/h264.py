@@ -27,7 +27,6 @@ from lavt.transport.rtp import split_nal_units
 _MIN_SIDE_PX: Final = 64
 _MAX_DECODED_PX: Final = 4096 * 2304
 """A forged parameter set cannot make the decoder ask for more memory than pictures of this size need."""
-_RTP_TICK = Fraction(1, 90_000)
 _KEYFRAME_KINDS: Final = {5, 7, 8}
 """An IDR slice, a sequence and a picture parameter set (H.264, table 7-1)."""
 _PRESETS: Final = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")

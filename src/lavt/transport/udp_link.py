@@ -43,7 +43,7 @@ class UdpLink:
         self._clock = clock
         self._channel = channel
         self._deliver = deliver
-        self._remote = None if remote is None else (_resolved(remote[0]), remote[1])
+        self._remote = None if remote is None else (look_up("video.server", remote[0]), remote[1])
         self._server: tuple[str, int] | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
@@ -101,12 +101,15 @@ class UdpLink:
             self._deliver(self._channel, datagram, arrival(ancillary, self._clock.now()), address)
 
 
-def _resolved(host: str) -> str:
-    """Look a host up once: every datagram would ask again, and never say that nobody knows it."""
+def look_up(key: str, host: str) -> str:
+    """Look a host up, once: no datagram waits for a name server, and senders are compared by their numbers.
+
+    Raises `UserError` naming the config `key` where nobody knows the host.
+    """
     try:
         return socket.gethostbyname(host)
     except (OSError, ValueError) as error:
-        raise UserError(f"the video's server {host!r} is not known ({_why(error)}): name another host") from error
+        raise UserError(f"{key}: the host {host!r} is not known ({_why(error)}): name another") from error
 
 
 def _why(error: OSError | ValueError) -> str:
