@@ -144,14 +144,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: P
 
 @pytest.fixture(scope="module")
 def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
-    """The same outages of client and network, with a server that obeys whatever it can read."""
+    """The same outages of the network, with a server that obeys whatever it can read."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
         drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(OBEYS_EVERYTHING),))
         drive.start()
         what_the_network_does(drive)
-        drive.reach(SLOW_MPS)
-        drive.suspend("client suspended", drive.client, OUTAGE_S)
         drive.reach(AT_ALL_MPS)
         drive.end()
     return drive
@@ -244,11 +242,14 @@ def test_nothing_from_before_a_stop_is_obeyed_after_it(drive: Drive, server: Rec
     assert np.sum(obeyed(server).ints("received_mono_ns") > armed.mono_ns) > 20
 
 
-@pytest.mark.parametrize("outage", ["router killed", "network stalled", "client suspended"])
+@pytest.mark.parametrize("outage", ["router killed", "network stalled"])
 def test_a_server_that_obeys_everything_would_obey_what_is_stale(
     unguarded: Drive, unguarded_server: Record, outage: str
 ) -> None:
-    """Without the server's checks each of these outages ends with stale commands obeyed: the tests above can fail."""
+    """Without the server's checks an outage of the network ends with stale commands obeyed: the tests above can fail.
+
+    A client that was suspended is not among them: whether it hears of the stop before it commands again is a race.
+    """
     stop = transition(unguarded_server, "safe_stop", unguarded.broken[outage].mono_ns)
 
     assert stale(unguarded_server, stop) > 0
