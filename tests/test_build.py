@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from lavt.build import (
     MachineEntropy,
     SeededEntropy,
+    build_controller,
     build_plant,
     camera_model,
     check_names,
@@ -17,6 +18,7 @@ from lavt.build import (
     run_seed,
 )
 from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
+from lavt.domain import Lane
 from lavt.errors import UserError
 
 
@@ -96,3 +98,16 @@ def test_unknown_vehicle() -> None:
     """A server of a vehicle that does not exist is not built."""
     with pytest.raises(UserError, match="the known kinds are simulator"):
         build_plant(ServerConfig(vehicle=VehicleConfig(kind="boat")))
+
+
+def test_settings_of_the_config_replace_those_of_the_preset() -> None:
+    """A lookahead, limit or speed in the config changes what is driven, and results name what was changed."""
+    changed = ControllerConfig(preset="designed", lookahead_s=2.0, speed_mps=5.0)
+    lane = Lane((0.5, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0)
+    far, near = (build_controller(config).decide(lane, 8.0, 0) for config in (changed, ControllerConfig()))
+
+    assert 0 < far.steering_rad < near.steering_rad
+    assert (far.throttle, near.brake) == (0.0, 0.0)
+    assert far.brake > 0
+    assert changed.settings == "designed, lookahead_s 2, speed_mps 5"
+    assert ControllerConfig().settings == "designed"

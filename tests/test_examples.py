@@ -8,7 +8,10 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
-SAYS = {"compare_delays.py": ("L0: completed", "L3: ")}
+SAYS = {
+    "compare_delays.py": ("L0: completed", "L3: "),
+    "my_controller.py": ("lane_keeper under L1: completed", "stanley under L1: completed"),
+}
 """What each example must print."""
 
 

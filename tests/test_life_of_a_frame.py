@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import count
 
-from lavt.control.drive_controller import make_controller
+from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.control.limiter import Limiter
 from lavt.control.limits import LIMITS
 from lavt.control.safety import SafetyGate
@@ -118,7 +118,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     assert abs(seen_y_m - (-truth.cross_track_m - 8 * truth.heading_error_rad)) < 0.1
 
     # 10. The lane becomes a command: go, and steer towards the middle.
-    controller = make_controller("lane_keeper", "designed", car.capabilities.wheelbase_m)
+    controller = make_controller("lane_keeper", PRESETS["designed"], car.capabilities.wheelbase_m)
     decision = controller.decide(lane, car.state().speed_mps, now_ns)
     assert decision.throttle > 0
     command = Command(

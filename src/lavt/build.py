@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from lavt.config import CameraConfig, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
-from lavt.control.drive_controller import make_controller
+from lavt.control.drive_controller import DriveController, find_preset, make_controller
 from lavt.control.limiter import Limiter
 from lavt.control.limits import CLIENT_LIMITS, LIMITS, Limits
 from lavt.control.safety import SafetyGate
@@ -180,7 +180,12 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     _vehicle(vehicle.kind)
     if vehicle.kind == "simulator":
         load_road(vehicle.route)
-    make_controller(controller.kind, controller.preset, controller.wheelbase_m)
+    build_controller(controller)
+
+
+def build_controller(config: ControllerConfig) -> DriveController:
+    """Make the configured controller; raises `UserError` naming the known ones and the known presets."""
+    return make_controller(config.kind, replace(find_preset(config.preset), **config.changes), config.wheelbase_m)
 
 
 def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
@@ -254,7 +259,7 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
     controller = config.controller
     model = camera_model(config.camera)
     detector = LaneDetector(model)
-    lane_keeper = make_controller(controller.kind, controller.preset, controller.wheelbase_m)
+    drive_controller = build_controller(controller)
     start = now()
     session = ClientSession(
         config.who,
@@ -268,7 +273,7 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
         DriverNode(
             Decoder(),
             detector,
-            lane_keeper,
+            drive_controller,
             session,
             CLIENT_LIMITS,
             picture_shape=(model.height_px, model.width_px, 3),

@@ -89,12 +89,30 @@ class ControllerConfig(Section):
 
     kind: str = "lane_keeper"
     preset: str = "designed"
+    lookahead_s: float | None = Field(None, ge=0.2, le=5)
+    """Instead of the preset's, like the three below: how far ahead the car aims, in seconds of driving."""
+    steering_limit_rad: float | None = Field(None, gt=0, le=0.5)
+    """Of the road wheels."""
+    lateral_limit_mps2: float | None = Field(None, gt=0, le=20)
+    speed_mps: float | None = Field(None, ge=1, le=11)
+    """The vehicle gives no throttle above 40 km/h, whatever is asked."""
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """Of the vehicle that is driven; the built-in car's."""
     rearm: bool = False
     """Arm again by itself after a safe stop."""
     clear_emergency_stop: bool = False
     """Clear an emergency stop that is found, as whoever set this has seen to what caused it."""
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Settings that are not the preset's own."""
+        settings = ("lookahead_s", "steering_limit_rad", "lateral_limit_mps2", "speed_mps")
+        return {name: value for name in settings if (value := getattr(self, name)) is not None}
+
+    @property
+    def settings(self) -> str:
+        """The preset's name, and what differs from it: results call it so."""
+        return ", ".join([self.preset, *(f"{name} {value:g}" for name, value in self.changes.items())])
 
 
 class ClocksConfig(Section):

@@ -27,7 +27,7 @@ every_one = pytest.mark.parametrize(
 
 
 def new(kind: str, preset: str) -> DriveController:
-    return make_controller(kind, preset, wheelbase_m=2.8448)
+    return make_controller(kind, PRESETS[preset], wheelbase_m=2.8448)
 
 
 def decide(controller: DriveController, seen: list[tuple[Lane, float]]) -> list[Decision]:

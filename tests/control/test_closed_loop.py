@@ -57,7 +57,7 @@ def drive(
     """Drive from standstill until something ends it; `seen` is what becomes of pictures after `blind_after_s`."""
     car = Simulator(road=ROAD, seed=1, start_mono_ns=0)
     detector, watch = LaneDetector(MODEL), LaneWatch()
-    controller = make_controller("lane_keeper", preset, wheelbase_m=car.capabilities.wheelbase_m)
+    controller = make_controller("lane_keeper", PRESETS[preset], wheelbase_m=car.capabilities.wheelbase_m)
     done = Drive([], [], [], "ok")
     for number in range(round(seconds * 30)):
         now_ns = number * FRAME_NS

@@ -4,7 +4,7 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from lavt.control import drive_controller
-from lavt.control.drive_controller import DESIGNED, PRESETS, LaneKeeper, Preset, make_controller
+from lavt.control.drive_controller import DESIGNED, PRESETS, LaneKeeper, Preset, find_preset, make_controller
 from lavt.control.lane_watch import BRAKE_AFTER_NS, STOP_AFTER_NS
 from lavt.control.pure_pursuit import curvature_per_m
 from lavt.domain import NS_PER_S, PATH_POINTS, Decision, Lane
@@ -98,9 +98,9 @@ def test_a_lane_seen_again_is_followed_at_once() -> None:
 def test_unknown_names_are_told_with_the_known_ones() -> None:
     """A controller or preset that is not there is the user's mistake, and the message names those there are."""
     with pytest.raises(UserError, match="lane_keeper"):
-        make_controller("lane_keper", "designed", WHEELBASE_M)
+        make_controller("lane_keper", PRESETS["designed"], WHEELBASE_M)
     with pytest.raises(UserError, match="designed, paper_calibrated"):
-        make_controller("lane_keeper", "tuned", WHEELBASE_M)
+        find_preset("tuned")
 
 
 class Statue:
@@ -121,5 +121,5 @@ def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPa
     """A controller registered in the group `lavt.controllers` is found by its name and told what the car is like."""
     entry = EntryPoint("statue", f"{__name__}:Statue", drive_controller.ENTRY_POINTS)
     monkeypatch.setattr(drive_controller, "entry_points", lambda group: [entry] if group == "lavt.controllers" else [])
-    controller = make_controller("statue", "designed", WHEELBASE_M, max_braking_mps2=8.0)
+    controller = make_controller("statue", PRESETS["designed"], WHEELBASE_M, max_braking_mps2=8.0)
     assert getattr(controller, "known", None) == ("designed", WHEELBASE_M, 2.0, 8.0)

@@ -131,14 +131,14 @@ ENTRY_POINTS = "lavt.controllers"
 
 
 def make_controller(
-    kind: str, preset: str, wheelbase_m: float, max_acceleration_mps2: float = 2.0, max_braking_mps2: float = 6.0
+    kind: str, preset: Preset, wheelbase_m: float, max_acceleration_mps2: float = 2.0, max_braking_mps2: float = 6.0
 ) -> DriveController:
-    """Make the controller called `kind` with the preset called `preset`; UserError names those there are.
+    """Make the controller called `kind` with the settings `preset`; UserError names the controllers there are.
 
     The accelerations are the car's at full throttle and full brake, both positive; the defaults are the simulator's.
     """
     return _factory(kind)(
-        find_preset(preset),
+        preset,
         wheelbase_m=wheelbase_m,
         max_acceleration_mps2=max_acceleration_mps2,
         max_braking_mps2=max_braking_mps2,

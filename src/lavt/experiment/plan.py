@@ -45,7 +45,7 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         "route": config.vehicle.route,
         "condition": config.network.condition,
         "controller": config.controller.kind,
-        "preset": config.controller.preset,
+        "preset": config.controller.settings,
         "driver": config.controller.kind,
         "participant": config.study.participant,
         "block": config.study.block,

@@ -1,0 +1,56 @@
+"""A controller of your own: Stanley's law (Hoffmann et al., American Control Conference 2007) beside the lane keeper.
+
+python examples/my_controller.py [DIRECTORY]
+
+A package of yours makes it known to every `lavt` command, as `controller.kind: stanley`, by an entry point:
+
+    [project.entry-points."lavt.controllers"]
+    stanley = "my_package:Stanley"
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from tempfile import mkdtemp
+
+from lavt.config import RunConfig, load_config, shipped
+from lavt.control.drive_controller import CONTROLLERS, Preset
+from lavt.domain import PATH_POINTS, Decision, Lane
+from lavt.experiment.plan import plan_run
+from lavt.experiment.run import run_once
+
+
+class Stanley:
+    """Steers the front axle onto the lane's centre, and keeps the preset's speed."""
+
+    gain_per_s = 1.2
+
+    def __init__(
+        self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
+    ) -> None:
+        del max_acceleration_mps2, max_braking_mps2
+        self._preset, self._wheelbase_m = preset, wheelbase_m
+
+    def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
+        """Give wheel angle and pedals for the newest lane (vehicle's frame, left positive) and speed."""
+        del now_ns
+        c0, c1, c2 = lane.centre
+        error_m = c0 + (c1 + c2 * self._wheelbase_m) * self._wheelbase_m
+        heading_rad = math.atan(c1 + 2 * c2 * self._wheelbase_m)
+        steering_rad = heading_rad + math.atan2(self.gain_per_s * error_m, max(speed_mps, 1.0))
+        limit_rad = self._preset.steering_limit_rad
+        throttle = 0.0 if lane.confidence < 0.2 else min(max(self._preset.speed_mps - speed_mps, 0.0), 1.0)
+        path_per_m = (2 * c2,) * PATH_POINTS  # the vehicle follows it when commands stop coming
+        return Decision(min(max(steering_rad, -limit_rad), limit_rad), throttle, 0.0, path_per_m)
+
+
+if __name__ == "__main__":
+    CONTROLLERS["stanley"] = Stanley
+    directory = Path(sys.argv[1] if len(sys.argv) > 1 else mkdtemp(prefix="lavt-"))
+    for kind in ("lane_keeper", "stanley"):
+        changes = [f"controller.kind={kind}", "network.condition=L1", "vehicle.scenery=none"]
+        run = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
+        result = run_once(run, directory / kind)
+        print(f"{kind} under L1: {result['ending']}, cross-track P95 {result['p95_m']:.2f} m")
