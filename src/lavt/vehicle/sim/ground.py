@@ -20,9 +20,6 @@ from lavt.vehicle.sim.textures import SCALES_M, Grey, all_textures
 TILE_M = (16.0, 32.0, 64.0)
 """Edge of a tile at each scale."""
 
-DASH_M, GAP_M = 3.0, 6.0
-"""Broken marks; the map does not say how long they are, so this is our choice."""
-
 _MARK_M = 0.125
 _KEPT_TILES = (128, 512, 512)
 _CHUNK_M = 8.0
@@ -55,9 +52,14 @@ class Ground:
     def __init__(self, road: Road) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
         self._gravel = _join(
-            [_strips(road, strip.left_m + _GRAVEL_M, strip.right_m - _GRAVEL_M) for strip in road.paved]
+            [
+                _strips(road, strip.left_m + _GRAVEL_M, strip.right_m - _GRAVEL_M, strip.from_m, strip.to_m)
+                for strip in road.paved
+            ]
         )
-        self._asphalt = _join([_strips(road, strip.left_m, strip.right_m) for strip in road.paved])
+        self._asphalt = _join(
+            [_strips(road, strip.left_m, strip.right_m, strip.from_m, strip.to_m) for strip in road.paved]
+        )
         edges = np.array(road.lanes.edges_m)
         tracks = [centre + side for centre in (edges[1:] + edges[:-1]) / 2 for side in (-0.85, 0.85)]
         self._tracks = [
@@ -188,13 +190,10 @@ def _marks(road: Road, colour: str) -> Strips:
         if mark.kind == "solid":
             found.append(_strips(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
-        first_m, last_m = max(mark.from_m, road.first_m), min(mark.to_m, road.last_m)
-        period_m = DASH_M + GAP_M
-        begin = np.arange(np.floor(first_m / period_m), np.ceil(last_m / period_m)) * period_m
-        begin = begin[(begin >= first_m) & (begin + DASH_M <= last_m)]
+        begin = mark.dashes_m(road.first_m, road.last_m)
         # Two halves a dash, so that it bends with the road.
-        halves = np.concatenate([begin, begin + DASH_M / 2])
-        found.append(_pieces(road, left_m, right_m, halves, halves + DASH_M / 2 + _OVERLAP_M))
+        halves = np.concatenate([begin, begin + mark.dash_m / 2])
+        found.append(_pieces(road, left_m, right_m, halves, halves + mark.dash_m / 2 + _OVERLAP_M))
     return _join(found) if found else Strips(np.empty((0, 4, 2)), np.empty((0, 4)))
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
 from lavt.streams import stream
+from lavt.vehicle.sim.cross_section import Rail
 from lavt.vehicle.sim.panorama import HAZE
 from lavt.vehicle.sim.pinhole import View
-from lavt.vehicle.sim.road import Rail, Road
+from lavt.vehicle.sim.road import Road
 from lavt.vehicle.sim.sprites import TREE_KINDS, draw_tree
 
 _WORLD_SEED = 0
