@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from lavt.domain import CameraModel, Picture, Pose
+from lavt.domain import CameraModel, Pose, Sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,7 +14,7 @@ class CapturedFrame:
 
     number: int
     capture_ns: int | None
-    picture: Picture
+    picture: Sight
 
 
 class Camera(Protocol):
