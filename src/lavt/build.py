@@ -44,7 +44,7 @@ from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
-from lavt.vehicle.camera import Camera
+from lavt.vehicle.camera import Camera, FrameTimes
 from lavt.vehicle.sim.camera import SimCamera
 from lavt.vehicle.sim.lane_camera import LaneCamera
 from lavt.vehicle.sim.road import Road, load_road
@@ -302,11 +302,16 @@ def build_server(
     host: str,
     video_port: int,
     fidelity: Fidelity = VIDEO,
+    lives_on_demand: bool = False,
 ) -> ServerNodes:
-    """Make the server's nodes; their time begins when everything that is slow has been prepared."""
+    """Make the server's nodes; their time begins when everything that is slow has been prepared.
+
+    With `lives_on_demand` the vehicle lives on only when somebody looks, where no wake is ever late: in virtual time.
+    """
     plant = fidelity.plant(config)
     pictures = fidelity.sender(config)
     start = now()
+    frames = FrameTimes(start.mono_ns + plant.camera.phase_ns, plant.camera.rate_hz) if lives_on_demand else None
     vehicle = plant.start(start)
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
@@ -333,7 +338,7 @@ def build_server(
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
         ),
-        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route),
+        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route, frames=frames),
         ClockSyncNode(start.mono_ns),
     )
 

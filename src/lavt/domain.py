@@ -7,7 +7,7 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,7 @@ PATH_STEP_M = 2.0
 PATH_POINTS = 10
 
 
-@dataclass(frozen=True, slots=True)
-class Now:
+class Now(NamedTuple):
     """One reading of a host's two clocks."""
 
     mono_ns: int
