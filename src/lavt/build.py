@@ -24,19 +24,30 @@ from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ClockSyncNode
-from lavt.nodes.driver import DriverNode
+from lavt.nodes.driver import Detector, DriverNode
 from lavt.nodes.receiver import ReceiverNode
 from lavt.nodes.reports import Route
-from lavt.perception.lane_detector import LaneDetector
+from lavt.perception.lane_detector import GRID, LaneDetector
+from lavt.perception.lane_given import GivenLane
 from lavt.streams import stream, stream_key
 from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.pictures import (
+    HandedOver,
+    LaneReceiver,
+    LaneSender,
+    PictureReceiver,
+    PictureSender,
+    VideoReceiver,
+    VideoSender,
+)
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
-from lavt.vehicle.camera import Camera
+from lavt.vehicle.camera import Camera, FrameTimes
 from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.lane_camera import LaneCamera
+from lavt.vehicle.sim.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 
@@ -136,16 +147,44 @@ def camera_model(config: CameraConfig) -> CameraModel:
 def build_simulator(config: ServerConfig) -> Plant:
     """Make the built-in simulator and its camera."""
     road = load_road(config.vehicle.route)
-    period_ns = round(NS_PER_S / config.camera.rate_hz)
     camera = SimCamera(
         model=camera_model(config.camera),
         rate_hz=config.camera.rate_hz,
-        phase_ns=int(stream(config.seed, "camera phase").integers(period_ns)),
+        phase_ns=camera_phase_ns(config),
         road=road,
         seed=config.seed,
         scenery=config.vehicle.scenery,
     )
     camera.prepare()
+    return _simulated(config, road, camera)
+
+
+def build_unpictured(config: ServerConfig) -> Plant:
+    """Make the built-in simulator with a camera that gives the lane itself; other vehicles' roads are not known."""
+    if config.vehicle.kind != "simulator":
+        raise UserError(
+            f"fidelity geometry needs the road, which only the built-in simulator tells: choose vehicle.kind simulator "
+            f"instead of {config.vehicle.kind!r}, or another fidelity"
+        )
+    road = load_road(config.vehicle.route)
+    camera = LaneCamera(
+        model=camera_model(config.camera),
+        rate_hz=config.camera.rate_hz,
+        phase_ns=camera_phase_ns(config),
+        road=road,
+        near_m=GRID.near_m,
+        far_m=GRID.far_m,
+        half_width_m=GRID.half_width_m,
+    )
+    return _simulated(config, road, camera)
+
+
+def camera_phase_ns(config: ServerConfig) -> int:
+    """Draw when the camera's first frame is taken after the start: anywhere within its period."""
+    return int(stream(config.seed, "camera phase").integers(round(NS_PER_S / config.camera.rate_hz)))
+
+
+def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
     stations_m = np.arange(0.0, road.length_m, ROUTE_STEP_M)
     x_m, y_m, _, _ = road.point(stations_m)
     points = tuple(zip(x_m.tolist(), y_m.tolist(), strict=True))
@@ -172,6 +211,58 @@ def _vehicle(kind: str) -> Callable[[ServerConfig], Plant]:
         raise UserError(f"there is no vehicle {kind!r}: the known kinds are {', '.join([*VEHICLES, *custom])}")
     build: Callable[[ServerConfig], Plant] = custom[kind].load()
     return build
+
+
+@dataclass(frozen=True, slots=True)
+class Fidelity:
+    """How the pictures of a run come about and cross the network: what is made for it on both sides."""
+
+    plant: Callable[[ServerConfig], Plant]
+    sender: Callable[[ServerConfig], PictureSender]
+    receiver: Callable[[ClientConfig], PictureReceiver]
+    detector: Callable[[ClientConfig], Detector]
+
+
+def _video_sender(config: ServerConfig) -> VideoSender:
+    video, camera = config.video, config.camera
+    return VideoSender(
+        Encoder(
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            rate_hz=camera.rate_hz,
+            bit_rate_bps=video.bit_rate_bps,
+            gop_frames=video.gop_frames,
+            buffer_s=video.buffer_ms / 1000,
+        )
+    )
+
+
+def _video_receiver(config: ClientConfig) -> VideoReceiver:
+    return VideoReceiver(Decoder(), (config.camera.height_px, config.camera.width_px, 3))
+
+
+def _lane_detector(config: ClientConfig) -> LaneDetector:
+    return LaneDetector(camera_model(config.camera))
+
+
+VIDEO = Fidelity(build_plant, _video_sender, _video_receiver, _lane_detector)
+
+
+def _pixels() -> Fidelity:
+    between = HandedOver()
+    return Fidelity(build_plant, lambda _: between, lambda _: between, _lane_detector)
+
+
+def _geometry() -> Fidelity:
+    return Fidelity(build_unpictured, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
+
+
+FIDELITIES: dict[str, Callable[[], Fidelity]] = {
+    "video": lambda: VIDEO,
+    "pixels": _pixels,
+    "geometry": _geometry,
+}
+"""By the config's `fidelity`: what to make for one run, whose two sides may share something."""
 
 
 @lru_cache(maxsize=64)  # a sweep asks for each of its runs
@@ -209,20 +300,23 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
 
 
 def build_server(
-    config: ServerConfig, now: Callable[[], Now], entropy: Entropy, *, host: str, video_port: int
+    config: ServerConfig,
+    now: Callable[[], Now],
+    entropy: Entropy,
+    *,
+    host: str,
+    video_port: int,
+    fidelity: Fidelity = VIDEO,
+    lives_on_demand: bool = False,
 ) -> ServerNodes:
-    """Make the server's nodes; their time begins when everything that is slow has been prepared."""
-    plant = build_plant(config)
-    video, camera = config.video, config.camera
-    encoder = Encoder(
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        rate_hz=camera.rate_hz,
-        bit_rate_bps=video.bit_rate_bps,
-        gop_frames=video.gop_frames,
-        buffer_s=video.buffer_ms / 1000,
-    )
+    """Make the server's nodes; their time begins when everything that is slow has been prepared.
+
+    With `lives_on_demand` the vehicle lives on only when somebody looks, where no wake is ever late: in virtual time.
+    """
+    plant = fidelity.plant(config)
+    pictures = fidelity.sender(config)
     start = now()
+    frames = FrameTimes(start.mono_ns + plant.camera.phase_ns, plant.camera.rate_hz) if lives_on_demand else None
     vehicle = plant.start(start)
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
@@ -243,22 +337,23 @@ def build_server(
     return ServerNodes(
         CameraNode(
             plant.camera,
-            encoder,
+            pictures,
             Packetizer(entropy.number(32), entropy.number(16)),
             PathServer(lambda: entropy.token(32)),
             start_ns=start.mono_ns,
-            send_to=[resolved_address("video.send_to", each) for each in video.send_to],
+            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
         ),
-        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route),
+        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route, frames=frames),
         ClockSyncNode(start.mono_ns),
     )
 
 
-def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy) -> ClientNodes:
+def build_client(
+    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: Fidelity = VIDEO
+) -> ClientNodes:
     """Make the client's nodes."""
     controller = config.controller
-    model = camera_model(config.camera)
-    detector = LaneDetector(model)
+    pictures, detector = fidelity.receiver(config), fidelity.detector(config)
     drive_controller = build_controller(controller)
     start = now()
     session = ClientSession(
@@ -271,12 +366,11 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
     return ClientNodes(
         ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
         DriverNode(
-            Decoder(),
+            pictures,
             detector,
             drive_controller,
             session,
             CLIENT_LIMITS,
-            picture_shape=(model.height_px, model.width_px, 3),
         ),
         ClockSyncNode(start.mono_ns),
     )

@@ -152,9 +152,16 @@ class RunConfig(Section):
     clocks: ClocksConfig = ClocksConfig()
     study: StudyConfig = StudyConfig()
     time: Literal["real", "virtual"] = "virtual"
+    fidelity: Literal["video", "pixels", "geometry"] = "video"
+    """In virtual time: pictures through H.264; pictures as rendered; or no pictures, but the lane they would show."""
     seed: int = Field(1, ge=0, lt=2**63)
     repetition: int = Field(0, ge=0)
     """Which of several runs with one seed: each has its own start and noise, the same under every condition."""
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """Channels that stay out of the record; what stands for H.264 at another fidelity is no video."""
+        return self.record.left_out if self.fidelity == "video" else frozenset({"video"})
 
 
 class SweepConfig(RunConfig):

@@ -7,13 +7,17 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Picture = NDArray[np.uint8]
 """A picture: (height, width, 3), blue green red, 0 to 255."""
+
+Sight = Any
+"""Opaque: what a camera gives and a detector looks at; a `Picture` or, where nothing is rendered, a `SeenLane`. Only
+these two and what carries it look inside."""
 
 FloatArray = NDArray[np.float64]
 
@@ -26,8 +30,7 @@ PATH_STEP_M = 2.0
 PATH_POINTS = 10
 
 
-@dataclass(frozen=True, slots=True)
-class Now:
+class Now(NamedTuple):
     """One reading of a host's two clocks."""
 
     mono_ns: int
@@ -132,6 +135,17 @@ class Lane:
     far_m: float
     confidence: float
     """0 (nothing of a lane in the picture) to 1 (both lines seen over the whole length)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenLane:
+    """What takes the place of a picture where nothing is rendered: the lane that would be seen in it."""
+
+    stamp_ns: int
+    """0 until it is stamped."""
+    at_ns: int
+    """When it was taken (server's monotonic clock)."""
+    lane: Lane
 
 
 @dataclass(frozen=True, slots=True)

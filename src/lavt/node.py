@@ -7,8 +7,7 @@ comes out at the end, and wakes the node when it asked. The same node objects ru
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from lavt.domain import Now
 
@@ -19,8 +18,7 @@ WAKE = "wake"
 """The channel on which a node is woken; its payload is None."""
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """What a node gets: a payload on a channel, when it arrived on this host, and from whom."""
 
     channel: str
@@ -29,8 +27,7 @@ class Message:
     peer: Peer = None
 
 
-@dataclass(frozen=True, slots=True)
-class Send:
+class Send(NamedTuple):
     """What a node wants sent: a payload on a channel, to the channel's receivers or to one peer.
 
     On a channel that crosses the network the payload is bytes, elsewhere an object that nobody changes.

@@ -150,6 +150,7 @@ def test_identity(time: str) -> None:
     assert {name: identity[name] for name in IDENTITY if name != "seed"} == {
         "run": "this",
         "time": time,
+        "fidelity": "video",
         "injection": "model" if time == "virtual" else "relay",
         "inherent": "paper_wifi5",
         "route": "a_key",

@@ -10,6 +10,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
 from lavt.transport.h264 import Encoder
+from lavt.transport.pictures import VideoSender
 from lavt.transport.rtcp import picture_loss, receiver_report
 from lavt.transport.rtp import Packetizer, parse_packet
 from lavt.transport.stamp import rtp_timestamp
@@ -24,9 +25,11 @@ PLEASE = picture_loss(1, 2)
 
 def node_with(camera: NoiseCamera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
     numbers = count()
-    encoder = Encoder(SMALL.width_px, SMALL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
+    pictures = VideoSender(
+        Encoder(SMALL.width_px, SMALL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
+    )
     path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
-    return CameraNode(camera or NoiseCamera(), encoder, Packetizer(2, 0), path, start_ns=MONO_NS, send_to=send_to)
+    return CameraNode(camera or NoiseCamera(), pictures, Packetizer(2, 0), path, start_ns=MONO_NS, send_to=send_to)
 
 
 def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:

@@ -20,6 +20,7 @@ from lavt.perception.lane_detector import LaneDetector
 from lavt.transport.channels import CHANNELS
 from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.messages import decode, encode
+from lavt.transport.pictures import VideoReceiver
 from lavt.transport.stamp import rtp_timestamp, write_stamp
 
 FRAME_NS = NS_PER_S // 30
@@ -59,12 +60,11 @@ class Bench:
         self.detector = SeesALane()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
         self.node = DriverNode(
-            Decoder(),
-            detector or self.detector,  # type: ignore[arg-type]
+            VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px, 3)),
+            detector or self.detector,
             GoesStraight(),
             self.session,
             CLIENT_LIMITS,
-            picture_shape=(SMALL.height_px, SMALL.width_px, 3),
         )
         self.mono_ns = 0
         self.sends: list[Send] = []

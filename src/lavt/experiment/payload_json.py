@@ -9,7 +9,7 @@ import base64
 import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from typing import Any
@@ -42,6 +42,18 @@ def _plain(value: Any) -> Json:
     raise TypeError(f"a record cannot hold a {type(value).__name__}")
 
 
+@functools.cache
+def _serializer(payload_type: type) -> Callable[[Any], bytes] | None:
+    """Pydantic's compiled serializer of a dataclass; None for others, and where it would write bytes in its own way."""
+    if not is_dataclass(payload_type) or b"base64" in json_schema(payload_type):
+        return None
+    try:
+        adapter: TypeAdapter[Any] = TypeAdapter(payload_type)
+    except PydanticUserError:
+        return None
+    return functools.partial(adapter.serializer.to_json, warnings=False)
+
+
 _ENCODER = json.JSONEncoder(default=_plain, separators=(",", ":"), allow_nan=False)
 
 
@@ -65,6 +77,10 @@ def to_json(payload: Any) -> bytes:
 
     Raises `TypeError` for values that JSON has no words for.
     """
+    payload_type: Any = type(payload)
+    serialize = _serializer(payload_type)
+    if serialize is not None:
+        return serialize(payload)
     try:
         return _ENCODER.encode(payload).encode()
     except ValueError:  # a float that is not finite: rare, and worth a second walk only then

@@ -36,10 +36,15 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
             "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
             "inherent loopback"
         )
+    if config.time == "real" and config.fidelity != "video":
+        raise UserError(
+            f"fidelity {config.fidelity} is for virtual time only: choose fidelity video for real time, or time virtual"
+        )
     seed = run_seed(config.seed, config.vehicle.route, config.repetition)
     identity = {
         "run": name,
         "time": config.time,
+        "fidelity": config.fidelity,
         "injection": "model" if config.time == "virtual" else config.network.injection,
         "inherent": config.network.inherent,
         "route": config.vehicle.route,

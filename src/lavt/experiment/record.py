@@ -18,10 +18,10 @@ from typing import Any, Literal, Protocol
 from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
+from lavt.experiment.mcap_file import McapFile
 from lavt.experiment.payload_json import json_schema, to_json
 from lavt.experiment.table import EMPTY, Table, table_of
 
@@ -67,7 +67,7 @@ class Digest(Protocol):
 class RecordWriter:
     """Writes the record of one side.
 
-    `digest`, where there is one, gets every message: side, channel, monotonic time, length and JSON. Both sides of a
+    `digest`, where there is one, gets every message: side, channel, both times, length and JSON. Both sides of a
     run in virtual time share one, so it also holds the order between them. What `annotate` writes stays out of it, and
     so do the channels `left_out`, which are not recorded.
     """
@@ -78,12 +78,10 @@ class RecordWriter:
         self._side = side
         self._left_out = left_out
         self._digest = digest
-        self._file = path.open("wb")
-        self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES)
-        self._mcap.start(library=f"lavt {side}")
+        self._mcap = McapFile(path, library=f"lavt {side}", chunk_bytes=CHUNK_BYTES)
         self._channels: dict[tuple[str, type], int] = {}
         self._schemas: dict[type, int] = {}
-        self._sequence = 0
+        self._said = side.encode()
 
     def write(self, channel: str, payload: Any, now: Now) -> None:
         """Write one message: a dataclass or a dict, on the topic "/" + `channel`.
@@ -94,34 +92,33 @@ class RecordWriter:
             return
         data = _video_json(payload) if channel == VIDEO else to_json(payload)
         channel_id = self._channels.get((channel, type(payload))) or self._register(channel, type(payload))
-        self._sequence += 1
-        self._mcap.add_message(channel_id, now.wall_ns, data, now.mono_ns, self._sequence & 0xFFFFFFFF)
+        head = self._mcap.add_message(channel_id, now.wall_ns, now.mono_ns, data)
         if self._digest is not None:
-            self._digest.update(f"{self._side} {channel} {now.mono_ns} {len(data)}\n".encode())
-            self._digest.update(data)
+            self._digest.update(self._said + head + data)
 
     def annotate(self, name: str, entries: Mapping[str, str]) -> None:
         """Write what belongs to this machine and not to the run's result: versions, the machine itself."""
-        self._mcap.add_metadata(name, dict(entries))
+        self._mcap.add_metadata(name, entries)
 
     def close(self) -> None:
         """Finish the file; a file without this can still be read, but says that it is not complete."""
-        if not self._file.closed:
-            self._mcap.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
+        if not self._mcap.closed:
+            self._mcap.close()
 
     def _register(self, channel: str, payload_type: type) -> int:
         """Channel number for a payload type; the second type of a channel becomes a second channel of its topic."""
         if channel == VIDEO:
-            schema_id = self._mcap.register_schema(_VIDEO_SCHEMA_NAME, "jsonschema", json.dumps(_VIDEO_SCHEMA).encode())
+            schema_id = self._mcap.add_schema(_VIDEO_SCHEMA_NAME, "jsonschema", json.dumps(_VIDEO_SCHEMA).encode())
         else:
             if payload_type not in self._schemas:
                 name = "object" if payload_type is dict else f"lavt.{payload_type.__name__}"
                 schema = json_schema(payload_type)
-                self._schemas[payload_type] = self._mcap.register_schema(name, "jsonschema", schema)
+                self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
-        channel_id = self._mcap.register_channel("/" + channel, "json", schema_id)
+        channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
         self._channels[channel, payload_type] = channel_id
+        if self._digest is not None:
+            self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())
         return channel_id
 
 

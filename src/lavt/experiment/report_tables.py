@@ -8,15 +8,21 @@ from typing import Any
 from lavt.experiment.breakdown import Share
 from lavt.experiment.page import NOTHING, interval, latency, number, percent, table
 
+FIDELITY_SAYS = {
+    "video": "network and clocks are modelled, pictures, codec and packets are real",
+    "pixels": "network, clocks and codec are modelled, pictures are real",
+    "geometry": "network, clocks, codec, camera and perception are modelled, the lane is seen without fault",
+}
+
 
 def how_it_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Say in words whether time was real, and who injected the delay."""
-    ways = {(run["time"], run["injection"]) for run in runs}
+    """Say in words whether time was real, what was modelled, and who injected the delay."""
+    ways = {(run["time"], run.get("fidelity") or "video", run["injection"]) for run in runs}
     return "; ".join(
-        "virtual time: network and clocks are modelled, pictures, codec and packets are real"
+        f"virtual time, fidelity {fidelity}: {FIDELITY_SAYS[fidelity]}"
         if time == "virtual"
         else f"real time, {'nothing injected' if injection == 'none' else f'injected by {injection}'}"
-        for time, injection in sorted(ways, key=str)
+        for time, fidelity, injection in sorted(ways, key=str)
     )
 
 

@@ -16,6 +16,7 @@ from lavt.experiment.validity import invalid_because
 IDENTITY = (
     "run",
     "time",
+    "fidelity",
     "injection",
     "inherent",
     "route",

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lavt.build import ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
+from lavt.build import FIDELITIES, ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig, condition, load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, Now
 from lavt.experiment.directory import make_directory
@@ -92,14 +92,17 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     config, seed, costs = planned.config, planned.seed, read_costs()
     asked = condition(config.network.condition)
     server_clock, client_clock = clocks or host_clocks(config)
+    fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
         server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
-        host="virtual-server", video_port=SERVER_VIDEO_PORT,
+        host="virtual-server", video_port=SERVER_VIDEO_PORT, fidelity=fidelity, lives_on_demand=True,
     )  # fmt: skip
-    client = build_client(client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"))
+    client = build_client(
+        client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
+    )
     make_directory(out)
     digest = hashlib.sha256()
-    left_out = config.record.left_out
+    left_out = config.left_out
     writers = (
         RecordWriter(out / "server.mcap", "server", digest, left_out=left_out),
         RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from lavt.domain import NS_PER_S, Now, Picture, Pose
+from lavt.domain import NS_PER_S, Now, Pose, Sight
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.reports import FrameWritten, VideoUnit
-from lavt.transport.h264 import Encoder
+from lavt.transport.pictures import PictureSender
 from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp import Packetizer
-from lavt.transport.stamp import STAMP_PX, rtp_timestamp, write_stamp
+from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathServer
 from lavt.vehicle.camera import Camera, CapturedFrame
 
@@ -34,7 +31,7 @@ class Stamped:
     pixel_crc: int
     stamp_ns: int
     stamped_mono_ns: int
-    picture: Picture
+    picture: Sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +54,7 @@ class CameraNode:
     def __init__(
         self,
         camera: Camera,
-        encoder: Encoder,
+        pictures: PictureSender,
         packetizer: Packetizer,
         path: PathServer,
         *,
@@ -66,7 +63,7 @@ class CameraNode:
     ) -> None:
         self._counts: Counter[str] = Counter()
         self._camera = camera
-        self._encoder = encoder
+        self._pictures = pictures
         self._packetizer = packetizer
         self._path = path
         self._start_ns = start_ns + camera.phase_ns
@@ -123,12 +120,8 @@ class CameraNode:
         return frame
 
     def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, int]:
-        """Take a checksum of the pixels around the stamp, before the time of the stamp begins.
-
-        A camera that gives the same buffer again gives it with the stamp that was written into it.
-        """
-        pixel_crc = zlib.crc32(np.ascontiguousarray(frame.picture[STAMP_PX:]).data)
-        return frame, zlib.crc32(np.ascontiguousarray(frame.picture[:STAMP_PX, STAMP_PX:]).data, pixel_crc)
+        """Take a checksum of the picture without its stamp, before the time of the stamp begins."""
+        return frame, self._pictures.checksum(frame.picture)
 
     def _stamp(self, checked: tuple[CapturedFrame, int], now: Now) -> Stamped:
         frame, pixel_crc = checked
@@ -136,15 +129,14 @@ class CameraNode:
         while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
             stamp_ns += 1
         self._stamps.append(stamp_ns)
-        write_stamp(frame.picture, stamp_ns)
-        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, frame.picture)
+        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(frame.picture, stamp_ns))
 
     def _encode(self, stamped: Stamped, now: Now) -> Encoded:
         keyframe = self._keyframe_wanted and now.mono_ns - self._keyframe_ns >= KEYFRAME_PAUSE_NS
         if keyframe:
             self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
             self._counts["keyframes_on_request"] += 1
-        return Encoded(stamped, stamped.stamp_ns, self._encoder.encode(stamped.picture, keyframe=keyframe))
+        return Encoded(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
 
     def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit

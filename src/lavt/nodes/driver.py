@@ -5,19 +5,31 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from lavt.control.drive_controller import DriveController
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.control.limits import ClientLimits
-from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, State
-from lavt.errors import BadMessage
+from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
+from lavt.errors import BadMessage, BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, VideoUnit, View
-from lavt.perception.lane_detector import LaneDetector
-from lavt.transport.h264 import DecodedPicture, Decoder
 from lavt.transport.messages import decode, encode
-from lavt.transport.stamp import read_stamp, stamp_agrees
+from lavt.transport.pictures import PictureReceiver, Received
+from lavt.transport.stamp import stamp_agrees
+
+
+class Detector(Protocol):
+    """Finds the lane in one picture after another."""
+
+    def forget(self) -> None:
+        """Take the next picture as the first one."""
+        ...
+
+    def detect(self, picture: Sight, /) -> Lane:
+        """Give the lane in the next picture."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +37,7 @@ class Decoded:
     """A received access unit and the picture that came of it."""
 
     unit: ReceivedUnit
-    picture: DecodedPicture | None
+    picture: Received | None
     decoded_mono_ns: int
 
 
@@ -58,22 +70,19 @@ class DriverNode:
 
     def __init__(
         self,
-        decoder: Decoder,
-        detector: LaneDetector,
+        pictures: PictureReceiver,
+        detector: Detector,
         controller: DriveController,
         session: ClientSession,
         limits: ClientLimits,
-        *,
-        picture_shape: tuple[int, int, int],
     ) -> None:
         self.counts: Counter[str] = Counter()
         self.session = session
-        self._decoder = decoder
+        self._pictures = pictures
         self._detector = detector
         self._controller = controller
         self._watch = LaneWatch()
         self._limits = limits
-        self._picture_shape = picture_shape
         self._in_doubt = True
         self._sequence = 0
         self._view: View | None = None
@@ -102,18 +111,16 @@ class DriverNode:
     def _decode(self, message: Message, now: Now) -> Decoded:
         unit: ReceivedUnit = message.payload
         self._in_doubt = not unit.complete or (self._in_doubt and not unit.keyframe)
-        return Decoded(unit, self._decoder.decode(unit.data), now.mono_ns)
+        return Decoded(unit, self._pictures.decode(unit.data), now.mono_ns)
 
     def _read_stamp(self, decoded: Decoded, now: Now) -> StampRead:
         decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
         if decoded.picture is None:
             return StampRead(decoded, 0, "no picture")
-        if decoded.picture.picture.shape != self._picture_shape:
-            height_px, width_px, _ = decoded.picture.picture.shape
-            return StampRead(
-                decoded, 0, f"a picture of {width_px} x {height_px} pixels, which is not what was configured"
-            )
-        stamp_ns = read_stamp(decoded.picture.luma)
+        try:
+            stamp_ns = self._pictures.read_stamp(decoded.picture)
+        except BadPacket as error:
+            return StampRead(decoded, 0, str(error))
         if not stamp_agrees(stamp_ns, decoded.unit.rtp_timestamp):
             return StampRead(decoded, 0, "stamp and RTP timestamp disagree")
         return StampRead(decoded, stamp_ns, "")

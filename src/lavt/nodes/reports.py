@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavt.domain import Lane, Picture
+from lavt.domain import Lane, Sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class View:
 
     stamp_ns: int
     read_wall_ns: int
-    picture: Picture
+    picture: Sight
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from lavt.domain import Now
 from lavt.node import Hop, Message, Send
@@ -23,8 +24,7 @@ class Timeline:
     hops: tuple[tuple[str, int], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Walked:
+class Walked(NamedTuple):
     """What came of a message: what to send, when the node was done, and the timeline where there is a stamp."""
 
     sends: list[Send]

@@ -35,11 +35,19 @@ class Inbox:
         self._number += 1
         queue.append((self._number, message))
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something waits."""
+        return bool(self._newest) or any(self._queues.values())
+
     def take(self) -> Message | None:
         """Take the next message; None when nothing waits."""
-        waiting = [queue for queue in self._queues.values() if queue]
-        if waiting:
-            return min(waiting, key=lambda queue: queue[0][0]).popleft()[1]
+        first = None
+        for queue in self._queues.values():
+            if queue and (first is None or queue[0][0] < first[0][0]):
+                first = queue
+        if first is not None:
+            return first.popleft()[1]
         if self._newest:
             return self._newest.pop(next(iter(self._newest)))
         return None

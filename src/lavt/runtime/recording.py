@@ -7,7 +7,7 @@ import queue
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from lavt.domain import Command, Now, SessionReply, SessionRequest, State
@@ -41,15 +41,19 @@ def _without_token(data: bytes) -> object:
     return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
 
 
-def _packet(data: bytes) -> object:
-    """Sequence and timestamp of an RTP packet (RFC 3550, section 5.1), and its size."""
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A datagram of the video; sequence and timestamp where it is RTP (RFC 3550, section 5.1)."""
+
+    sequence: int | None
+    timestamp: int | None
+    size_bytes: int
+
+
+def _packet(data: bytes) -> Packet:
     if len(data) < 12 or data[0] >> 6 != 2:
-        return {"sequence": None, "timestamp": None, "size_bytes": len(data)}
-    return {
-        "sequence": int.from_bytes(data[2:4], "big"),
-        "timestamp": int.from_bytes(data[4:8], "big"),
-        "size_bytes": len(data),
-    }
+        return Packet(None, None, len(data))
+    return Packet(int.from_bytes(data[2:4], "big"), int.from_bytes(data[4:8], "big"), len(data))
 
 
 def _size(data: bytes) -> object:
@@ -66,7 +70,9 @@ WIRE: dict[str, Callable[[bytes], object]] = {
 }
 """How the bytes of a channel that crosses the network are written down."""
 
-UNRECORDED = ("pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report")
+UNRECORDED = frozenset(
+    {"pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report"}
+)
 """Written down elsewhere (the truth, the pictures' units, the clock samples), or secret."""
 
 
@@ -78,7 +84,8 @@ def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
 
 def as_written(channel: str, payload: Any) -> Any:
     """Give a message as it is written down: what is bytes on the network in fields."""
-    return WIRE[channel](payload) if channel in WIRE else payload
+    read = WIRE.get(channel)
+    return payload if read is None else read(payload)
 
 
 class QueuedRecorder:

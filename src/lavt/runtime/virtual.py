@@ -40,15 +40,16 @@ class HostClock:
     def at(self, true_ns: int) -> Now:
         """Read both clocks at a true time."""
         gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB
-        stepped_ns = sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
-        wall_ns = self.wall_start_ns + self.offset_ns + gone_ns + stepped_ns
+        wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
+        if self.steps:
+            wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
         return Now(self.mono_start_ns + gone_ns, wall_ns)
 
     def true_ns(self, mono_ns: int) -> int:
         """Tell the first true time at which the monotonic clock shows at least `mono_ns`."""
         gone_ns = mono_ns - self.mono_start_ns
         guess_ns = gone_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
-        while self.at(guess_ns).mono_ns < mono_ns:
+        while guess_ns + guess_ns * self.drift_ppb // NS_PER_PPB < gone_ns:
             guess_ns += 1
         return guess_ns
 
@@ -166,9 +167,12 @@ class VirtualRuntime:
         spent_ns = host.costs_ns.get((node.name, f"wait_{message.channel}"), 0)
         start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
 
-        def after(hop: str, _before: Now) -> Now:
+        def after(hop: str, before: Now) -> Now:
             nonlocal spent_ns
-            spent_ns += host.costs_ns.get((node.name, hop), 0)
+            cost_ns = host.costs_ns.get((node.name, hop), 0)
+            if cost_ns == 0:
+                return before
+            spent_ns += cost_ns
             return host.clock.at(self.true_ns + spent_ns)
 
         walked = walk(node.name, node.chains[message.channel], message, start, after)
@@ -180,7 +184,14 @@ class VirtualRuntime:
                 self.at(running.free_ns, lambda: self._send_all(host, walked.sends))
             else:
                 self._send_all(host, walked.sends)
-        self._poke(running, running.free_ns)
+        self._rest(running)
+
+    def _rest(self, running: _Running) -> None:
+        """Look at a node again when it is free and has something to do."""
+        if running.inbox.waiting:
+            self._poke(running, running.free_ns)
+        elif (wake_ns := running.node.next_wake_ns()) is not None:
+            self._poke(running, max(running.free_ns, running.host.clock.true_ns(wake_ns)))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send]) -> None:
         now = host.clock.at(self.true_ns)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from lavt.domain import CameraModel, Picture, Pose
+from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,7 +14,19 @@ class CapturedFrame:
 
     number: int
     capture_ns: int | None
-    picture: Picture
+    picture: Sight
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTimes:
+    """When a camera takes its frames, on the server's monotonic clock."""
+
+    first_ns: int
+    rate_hz: float
+
+    def due_ns(self, number: int) -> int:
+        """When frame `number` is taken; from the number each time, so that nothing drifts."""
+        return self.first_ns + round(number * NS_PER_S / self.rate_hz)
 
 
 class Camera(Protocol):

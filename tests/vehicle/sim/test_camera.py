@@ -32,7 +32,8 @@ def pose_at(road: Road, s_m: float, lateral_m: float = 0.0, turned_rad: float = 
 def picture_of(camera: SimCamera, pose: Pose, number: int = 0) -> Picture:
     frame = camera.capture(number, 7, pose)
     assert frame is not None
-    return frame.picture
+    picture: Picture = frame.picture
+    return picture
 
 
 def digest(picture: Picture) -> str:

@@ -1,0 +1,192 @@
+"""How a picture gets its stamp, becomes an access unit, and comes back: as H.264, or in virtual time by a shorter way.
+
+What stands for H.264 on the two shorter ways is one small access unit that needs no other: RTP packets, order, delay
+and loss act on it as on video. It is text, which holds neither a start code nor a zero byte.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, replace
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from lavt.domain import Lane, Picture, SeenLane, Sight
+from lavt.errors import BadPacket
+from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
+from lavt.transport.stamp import STAMP_PX, read_stamp, write_stamp
+
+_STANDS_ALONE: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
+"""An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
+_LANE: Final = struct.Struct("!Qq7d")
+KEPT_PICTURES: Final = 300
+"""Pictures that are on their way at most: 10 s of them at 30 Hz, and 280 MB."""
+
+
+class Received(Protocol):
+    """What came of an access unit."""
+
+    @property
+    def picture(self) -> Sight:
+        """What a detector looks at."""
+        ...
+
+
+class PictureSender(Protocol):
+    """The camera's end."""
+
+    def checksum(self, picture: Sight) -> int:
+        """Give a number that tells a picture, without its stamp, from the one before."""
+        ...
+
+    def write_stamp(self, picture: Sight, stamp_ns: int) -> Sight:
+        """Put the stamp into the picture, in place where it is pixels, and return it."""
+        ...
+
+    def encode(self, picture: Sight, *, keyframe: bool) -> bytes:
+        """Make an access unit of a stamped picture; a keyframe where one is asked for."""
+        ...
+
+
+class PictureReceiver(Protocol):
+    """The driver's end."""
+
+    def decode(self, access_unit: bytes) -> Received | None:
+        """Give the picture of an access unit; None when there is none."""
+        ...
+
+    def read_stamp(self, received: Any) -> int:
+        """Read the stamp of what `decode` gave; raises `BadPacket` for a picture that cannot be looked at."""
+        ...
+
+
+class VideoSender:
+    """Stamps pixels and encodes them as H.264."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self._encoder = encoder
+
+    def checksum(self, picture: Picture) -> int:
+        """CRC-32 of the pixels around the stamp: a camera that gives the same buffer again gives it with its stamp."""
+        return _pixel_crc(picture)
+
+    def write_stamp(self, picture: Picture, stamp_ns: int) -> Picture:
+        """Write the stamp into the pixels."""
+        write_stamp(picture, stamp_ns)
+        return picture
+
+    def encode(self, picture: Picture, *, keyframe: bool) -> bytes:
+        """Encode one picture."""
+        return self._encoder.encode(picture, keyframe=keyframe)
+
+
+class VideoReceiver:
+    """Decodes H.264; pictures must be of the `shape` that was configured, (height, width, 3)."""
+
+    def __init__(self, decoder: Decoder, shape: tuple[int, int, int]) -> None:
+        self._decoder = decoder
+        self._shape = shape
+
+    def decode(self, access_unit: bytes) -> DecodedPicture | None:
+        """Decode one access unit."""
+        return self._decoder.decode(access_unit)
+
+    def read_stamp(self, received: DecodedPicture) -> int:
+        """Read the stamp from the luma."""
+        if received.picture.shape != self._shape:
+            height_px, width_px, _ = received.picture.shape
+            raise BadPacket(f"a picture of {width_px} x {height_px} pixels, which is not what was configured")
+        return read_stamp(received.luma)
+
+
+class HandedOver:
+    """Both ends for pictures as they were rendered: the access unit is a key, the pixels wait here until it arrives.
+
+    Access units arrive in order: what is older than one that arrived was lost, and goes.
+    """
+
+    def __init__(self) -> None:
+        self._pictures: dict[int, Picture] = {}
+        self._key = 0
+
+    def checksum(self, picture: Picture) -> int:
+        """CRC-32 of the pixels around the stamp."""
+        return _pixel_crc(picture)
+
+    def write_stamp(self, picture: Picture, stamp_ns: int) -> Picture:
+        """Write the stamp into the pixels."""
+        write_stamp(picture, stamp_ns)
+        return picture
+
+    def encode(self, picture: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+        """Keep a copy of the picture, as a camera may use its buffer again, and give its key."""
+        self._key += 1
+        self._pictures[self._key] = picture.copy()
+        self._pictures.pop(self._key - KEPT_PICTURES, None)
+        return _STANDS_ALONE + str(self._key).encode()
+
+    def decode(self, access_unit: bytes) -> DecodedPicture | None:
+        """Give the picture of a key."""
+        text = access_unit.removeprefix(_STANDS_ALONE)
+        key = int(text) if text.isdigit() else 0
+        picture = self._pictures.get(key)
+        if picture is None:
+            return None
+        self._pictures = {each: kept for each, kept in self._pictures.items() if each > key}
+        return DecodedPicture(picture[:, :, 1], picture, corrupt=False)
+
+    def read_stamp(self, received: DecodedPicture) -> int:
+        """Read the stamp: black and white are so in each colour, green is as good as luma."""
+        return read_stamp(received.luma)
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedLane:
+    """A lane that came in the place of a picture."""
+
+    picture: SeenLane
+
+
+class LaneSender:
+    """Puts the lane itself into the access unit, with its stamp and time: no pixels."""
+
+    def checksum(self, picture: SeenLane) -> int:
+        """CRC-32 of lane and time: two pictures of a car that stands differ by their noise, these by their time."""
+        return zlib.crc32(_packed(picture))
+
+    def write_stamp(self, picture: SeenLane, stamp_ns: int) -> SeenLane:
+        """Give the same with the stamp."""
+        return replace(picture, stamp_ns=stamp_ns)
+
+    def encode(self, picture: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+        """Write it in hexadecimal digits."""
+        return _STANDS_ALONE + _packed(picture).hex().encode()
+
+
+class LaneReceiver:
+    """Takes a lane out of its access unit."""
+
+    def decode(self, access_unit: bytes) -> ReceivedLane | None:
+        """Read the digits; None where they are not those of a lane."""
+        try:
+            packed = bytes.fromhex(access_unit.removeprefix(_STANDS_ALONE).decode())
+            stamp_ns, at_ns, c0, c1, c2, *rest = _LANE.unpack(packed)
+        except (ValueError, struct.error):
+            return None
+        return ReceivedLane(SeenLane(stamp_ns, at_ns, Lane((c0, c1, c2), *rest)))
+
+    def read_stamp(self, received: ReceivedLane) -> int:
+        """Give the stamp."""
+        return received.picture.stamp_ns
+
+
+def _packed(seen: SeenLane) -> bytes:
+    lane = seen.lane
+    return _LANE.pack(seen.stamp_ns, seen.at_ns, *lane.centre, lane.width_m, lane.near_m, lane.far_m, lane.confidence)
+
+
+def _pixel_crc(picture: Picture) -> int:
+    crc = zlib.crc32(np.ascontiguousarray(picture[STAMP_PX:]).data)
+    return zlib.crc32(np.ascontiguousarray(picture[:STAMP_PX, STAMP_PX:]).data, crc)
