@@ -46,6 +46,8 @@ from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
 from lavt.vehicle.camera import Camera, FrameTimes
 from lavt.vehicle.sim.camera import SimCamera
+from lavt.vehicle.sim.cars import named_car
+from lavt.vehicle.sim.dynamics import CarParameters
 from lavt.vehicle.sim.lane_camera import LaneCamera
 from lavt.vehicle.sim.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
@@ -144,6 +146,18 @@ def camera_model(config: CameraConfig) -> CameraModel:
     )  # fmt: skip
 
 
+def car_of(config: VehicleConfig) -> CarParameters:
+    """Take the configured car with the configured lags; raises `UserError` naming the known cars."""
+    given = {
+        "steering_dead_time_s": config.steering_dead_time_ms,
+        "steering_lag_s": config.steering_lag_ms,
+        "pedal_dead_time_s": config.pedal_dead_time_ms,
+        "throttle_lag_s": config.throttle_lag_ms,
+        "brake_lag_s": config.brake_lag_ms,
+    }
+    return replace(named_car(config.car), **{name: each / 1000 for name, each in given.items() if each is not None})
+
+
 def build_simulator(config: ServerConfig) -> Plant:
     """Make the built-in simulator and its camera."""
     road = load_road(config.vehicle.route)
@@ -190,7 +204,14 @@ def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
     points = tuple(zip(x_m.tolist(), y_m.tolist(), strict=True))
     return Plant(
         camera,
-        lambda start: Simulator(road=road, seed=config.seed, start_mono_ns=start.mono_ns),
+        lambda start: Simulator(
+            road=road,
+            seed=config.seed,
+            start_mono_ns=start.mono_ns,
+            parameters=car_of(config.vehicle),
+            goes_on=config.vehicle.after_collision == "continue",
+            limit_s=config.vehicle.time_limit_s,
+        ),
         Route(config.vehicle.route, road.length_m, points),
     )
 
@@ -271,6 +292,7 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     _vehicle(vehicle.kind)
     if vehicle.kind == "simulator":
         load_road(vehicle.route)
+        car_of(vehicle)
     build_controller(controller)
 
 
@@ -343,7 +365,14 @@ def build_server(
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
         ),
-        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route, frames=frames),
+        ActuatorNode(
+            vehicle,
+            gate,
+            start_ns=start.mono_ns,
+            route=plant.route,
+            frames=frames,
+            after_collision=config.vehicle.after_collision,
+        ),
         ClockSyncNode(start.mono_ns),
     )
 

@@ -24,6 +24,9 @@ _SHARES = tuple(zip(((_NODES + 1) / 2).tolist(), (_WEIGHTS / 2).tolist(), strict
 _TURN_RAD = 1.0
 """A clothoid is cut where it has turned by this much, so that the rule above holds for each piece."""
 
+_STRAIGHT_PER_M = 1e-12
+"""Less is taken as straight: over 20 km it makes 0.2 mm, and its inverse is no number to count with."""
+
 _FOOT_M = 1e-9
 _FOOT_STEPS = 12
 
@@ -56,8 +59,6 @@ class _Piece:
     heading_rad: float
     curvature_per_m: float
     rate_per_m2: float
-    cosine: float
-    sine: float
 
     def turn_rad(self, along_m: float) -> float:
         """How far the line has turned `along_m` into the piece."""
@@ -77,6 +78,9 @@ class _Piece:
         return ahead_m * along_m, left_m * along_m
 
 
+_Searched = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
+
+
 class Centreline:
     """Segments laid end to end from a pose on; beyond both ends it goes straight on."""
 
@@ -88,18 +92,18 @@ class Centreline:
         before = Segment(0.0, 0.0, 0.0)
         for segment in (before, *(part for each in segments for part in each.cut()), before):
             length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
+            if abs(curvature_per_m) < _STRAIGHT_PER_M:
+                curvature_per_m = 0.0
             rate = (segment.end_curvature_per_m - curvature_per_m) / length_m if length_m else 0.0
-            cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
-            piece = _Piece(s_m, x_m, y_m, heading_rad, curvature_per_m, rate, cosine, sine)
+            piece = _Piece(s_m, x_m, y_m, heading_rad, curvature_per_m, rate)
             self._pieces.append(piece)
-            ahead_m, left_m = piece.reached(length_m)
+            ahead_m, left_m = _turned(*piece.reached(length_m), -heading_rad)
             s_m += length_m
-            x_m += ahead_m * cosine - left_m * sine
-            y_m += ahead_m * sine + left_m * cosine
+            x_m += ahead_m
+            y_m += left_m
             heading_rad += piece.turn_rad(length_m)
         self.last_m = s_m
         self._begins = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
-        self._ends = [*self._begins[1:], math.inf]
 
     def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Tell x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, any shape."""
@@ -131,31 +135,49 @@ class Centreline:
         Returns its station (m), the place's lateral offset (m, left positive), and heading (rad) and curvature (1/m)
         of the line at the point.
         """
-        pieces, begins, ends = self._pieces, self._begins, self._ends
         best = (first_m, math.inf, 0.0, 0.0)
         best_m = math.inf
-        index = bisect_right(begins, first_m) - 1
-        while index < len(pieces) and begins[index] <= last_m:
-            piece = pieces[index]
-            low_m, high_m = max(begins[index], first_m) - piece.s_m, min(ends[index], last_m) - piece.s_m
-            index += 1
-            dx_m, dy_m = x_m - piece.x_m, y_m - piece.y_m
-            ahead_m = dx_m * piece.cosine + dy_m * piece.sine
-            left_m = dy_m * piece.cosine - dx_m * piece.sine
-            along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
+        for index in range(bisect_right(self._begins, first_m) - 1, len(self._searched)):
+            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = self._searched[index]
+            if begin_m > last_m:
+                break
+            low_m, high_m = max(begin_m, first_m) - s_m, min(end_m, last_m) - s_m
+            dx_m, dy_m = x_m - x0_m, y_m - y0_m
+            ahead_m, left_m = dx_m * cosine + dy_m * sine, dy_m * cosine - dx_m * sine
             turn_rad = 0.0
-            if piece.curvature_per_m == 0.0 and piece.rate_per_m2 == 0.0:
+            if piece is not None:
+                along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
+                reached_m, turn_rad = piece.reached(along_m), piece.turn_rad(along_m)
+                ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                curvature_per_m += piece.rate_per_m2 * along_m
+            elif curvature_per_m == 0.0:
+                along_m = min(max(ahead_m, low_m), high_m)
                 ahead_m -= along_m
             else:
-                reached_m = piece.reached(along_m)
-                turn_rad = piece.turn_rad(along_m)
-                ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                along_m = _arc_foot_m(ahead_m, left_m, curvature_per_m, (low_m + high_m) / 2)
+                along_m = min(max(along_m, low_m), high_m)
+                turn_rad = curvature_per_m * along_m
+                turned_cosine, turned_sine = math.cos(turn_rad), math.sin(turn_rad)
+                ahead_m -= turned_sine / curvature_per_m
+                left_m -= (1.0 - turned_cosine) / curvature_per_m
+                ahead_m, left_m = (
+                    ahead_m * turned_cosine + left_m * turned_sine, left_m * turned_cosine - ahead_m * turned_sine
+                )  # fmt: skip
             distance_m = math.hypot(ahead_m, left_m)
             if distance_m < best_m:
                 best_m = distance_m
-                curvature_per_m = piece.curvature_per_m + piece.rate_per_m2 * along_m
-                best = (piece.s_m + along_m, left_m, piece.heading_rad + turn_rad, curvature_per_m)
+                best = (s_m + along_m, left_m, heading_rad + turn_rad, curvature_per_m)
         return best
+
+    @cached_property
+    def _searched(self) -> list[_Searched]:
+        """For each piece what a projection needs, as plain numbers; the piece itself where it is a clothoid."""
+        found: list[_Searched] = []
+        for begin_m, end_m, each in zip(self._begins, [*self._begins[1:], math.inf], self._pieces, strict=True):
+            place = (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m)
+            bent = each if each.rate_per_m2 else None
+            found.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), bent))
+        return found
 
     @cached_property
     def _table(self) -> FloatArray:
@@ -168,11 +190,8 @@ class Centreline:
 
 
 def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: float) -> float:
-    """Arc length to the foot of a point given in the frame of a piece's beginning, from `low_m` to `high_m`."""
-    middle_m = (low_m + high_m) / 2
-    if piece.rate_per_m2 == 0.0:
-        return min(max(_arc_foot_m(ahead_m, left_m, piece.curvature_per_m, middle_m), low_m), high_m)
-    along_m = middle_m
+    """Arc length to the foot of a point given in the frame of a clothoid's beginning, from `low_m` to `high_m`."""
+    along_m = (low_m + high_m) / 2
     for _ in range(_FOOT_STEPS):
         # The foot on the circle that fits the clothoid where we are; its error shrinks with the step's cube.
         reached_m = piece.reached(along_m)
@@ -186,7 +205,7 @@ def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: 
 
 def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m: float) -> float:
     """Arc length to the foot of a point given in the frame of an arc's beginning; of all turns that at `middle_m`."""
-    if abs(curvature_per_m) < 1e-12:
+    if abs(curvature_per_m) < _STRAIGHT_PER_M:
         return ahead_m
     sign = math.copysign(1.0, curvature_per_m)
     turn_rad = math.atan2(sign * ahead_m, sign * (1.0 / curvature_per_m - left_m))

@@ -200,6 +200,9 @@ def _problems(road: RoadFile) -> Iterable[str]:
             yield f"{name} goes from {each.from_m} m to {each.to_m} m: from_m must be less than to_m"
         if each.to_m <= -road.run_in_m or each.from_m >= road.laid_m + road.run_out_m:
             yield f"{name} is not on the road, which lies from {-road.run_in_m} m to {road.laid_m + road.run_out_m} m"
+    for index, rail in enumerate(road.rails):
+        if abs(rail.offset_m) <= lanes.widths_m[lanes.driven] / 2:
+            yield f"rails.{index} stands in the driven lane, at {rail.offset_m} m: move it out"
     for strip in road.all_paved:
         if strip.left_m <= strip.right_m:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
