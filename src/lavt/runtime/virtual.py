@@ -83,6 +83,14 @@ class VirtualHost:
 
     def __post_init__(self) -> None:
         self.running = {node.name: _Running(self, node) for node in self.nodes}
+        self._read_ns = -1
+        self._read = Now(0, 0)
+
+    def now(self, true_ns: int) -> Now:
+        """Read both clocks; several things happen at one time, so the last reading is kept."""
+        if true_ns != self._read_ns:
+            self._read_ns, self._read = true_ns, self.clock.at(true_ns)
+        return self._read
 
 
 class _Running:
@@ -92,6 +100,7 @@ class _Running:
         self.host = host
         self.node = node
         self.inbox = Inbox()
+        self.costs_ns = {hop: cost_ns for (name, hop), cost_ns in host.costs_ns.items() if name == node.name}
         self.free_ns = 0
         self.poke_ns: int | None = None
 
@@ -134,7 +143,7 @@ class VirtualRuntime:
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
         """Let a message arrive on a side, now; what came over the network is written down."""
         host = self.hosts[side]
-        arrived = host.clock.at(self.true_ns)
+        arrived = host.now(self.true_ns)
         row = CHANNELS[channel]
         if row.carrier != "local":
             record(host.recorder, channel, payload, arrived)
@@ -153,7 +162,7 @@ class VirtualRuntime:
         if running.poke_ns != true_ns:
             return  # it was looked at earlier, and has asked anew
         running.poke_ns = None
-        now = running.host.clock.at(true_ns)
+        now = running.host.now(true_ns)
         wake_ns = running.node.next_wake_ns()
         if wake_ns is not None and wake_ns <= now.mono_ns:
             self._walk(running, Message(WAKE, None, now), now)
@@ -164,12 +173,13 @@ class VirtualRuntime:
 
     def _walk(self, running: _Running, message: Message, start: Now) -> None:
         host, node = running.host, running.node
-        spent_ns = host.costs_ns.get((node.name, f"wait_{message.channel}"), 0)
+        costs_ns = running.costs_ns
+        spent_ns = costs_ns.get(f"wait_{message.channel}", 0)
         start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
 
         def after(hop: str, before: Now) -> Now:
             nonlocal spent_ns
-            cost_ns = host.costs_ns.get((node.name, hop), 0)
+            cost_ns = costs_ns.get(hop, 0)
             if cost_ns == 0:
                 return before
             spent_ns += cost_ns
@@ -194,7 +204,7 @@ class VirtualRuntime:
             self._poke(running, max(running.free_ns, running.host.clock.true_ns(wake_ns)))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send]) -> None:
-        now = host.clock.at(self.true_ns)
+        now = host.now(self.true_ns)
         for send in sends:
             record(host.recorder, send.channel, send.payload, now)
             carrier = CHANNELS[send.channel].carrier
