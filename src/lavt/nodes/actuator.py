@@ -78,6 +78,7 @@ class ActuatorNode:
         self._publish_ns = start_ns
         self._frames = frames
         self._next_frame = 0
+        self._pose_ns = start_ns
         self._ending: str | None = None
         self._driving = False
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -100,10 +101,7 @@ class ActuatorNode:
     def next_wake_ns(self) -> int:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
-        if self._frames is None:
-            lives_ns = self.vehicle.next_wake_ns()
-        else:
-            lives_ns = self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS
+        lives_ns = self.vehicle.next_wake_ns() if self._frames is None else self._pose_ns
         due_ns = min(lives_ns, self._publish_ns)
         return due_ns if watch_ns is None else min(due_ns, watch_ns)
 
@@ -176,7 +174,8 @@ class ActuatorNode:
     def _advance(self, message: Message, now: Now) -> list[VehicleEvent]:
         due_ns = min(self.vehicle.next_wake_ns(), message.arrived.mono_ns)
         events = self.vehicle.advance(now.mono_ns)
-        while self._frames is not None and self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS <= now.mono_ns:
+        while self._frames is not None and self._pose_ns <= now.mono_ns:
+            self._pose_ns = self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS
             self._next_frame += 1
         if now.mono_ns - due_ns > LATE_NS:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS

@@ -112,22 +112,23 @@ class VirtualRuntime:
         self.true_ns = 0
         self.hosts = {host.side: host for host in hosts}
         self.links = dict(links)
-        self._heap: list[tuple[int, int, Callable[[], None]]] = []
+        self._other = {side: next(other for other in self.hosts if other != side) for side in self.hosts}
+        self._heap: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._number = 0
         for host in hosts:
             for running in host.running.values():
                 self._poke(running, 0)
 
-    def at(self, true_ns: int, action: Callable[[], None]) -> None:
-        """Call `action` at a true time."""
+    def at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
+        """Call `action` with `arguments` at a true time."""
         self._number += 1
-        heapq.heappush(self._heap, (true_ns, self._number, action))
+        heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
 
     def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
         """Run until `finished()` or to the limit; tell whether it finished."""
         while self._heap and self._heap[0][0] <= limit_ns:
-            self.true_ns, _, action = heapq.heappop(self._heap)
-            action()
+            self.true_ns, _, action, arguments = heapq.heappop(self._heap)
+            action(*arguments)
             if finished():
                 return True
         return False
@@ -156,7 +157,7 @@ class VirtualRuntime:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""
         if running.poke_ns is None or true_ns < running.poke_ns:
             running.poke_ns = true_ns
-            self.at(true_ns, lambda: self._look(running, true_ns))
+            self.at(true_ns, self._look, running, true_ns)
 
     def _look(self, running: _Running, true_ns: int) -> None:
         if running.poke_ns != true_ns:
@@ -191,7 +192,7 @@ class VirtualRuntime:
             host.recorder.write("timeline", walked.timeline, walked.end)
         if walked.sends:
             if spent_ns:
-                self.at(running.free_ns, lambda: self._send_all(host, walked.sends))
+                self.at(running.free_ns, self._send_all, host, walked.sends)
             else:
                 self._send_all(host, walked.sends)
         self._rest(running)
@@ -221,8 +222,7 @@ class VirtualRuntime:
         if not link.open:
             return
         due_ns = link.line.push((send.payload, host.peer), self.true_ns, link.index(send.payload, link.count))
-        other = next(side for side in self.hosts if side != host.side)
-        self.at(due_ns, lambda: self._arrive(link, send.channel, other))
+        self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
 
     def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
         for payload, peer in link.line.pop_due(self.true_ns):
