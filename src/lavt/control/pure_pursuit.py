@@ -89,13 +89,11 @@ def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place
     It is where pure pursuit would go: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead. The lane's
     own curvature would not do: a car that is beside its lane, or turned, would stay so along a path of that curvature.
     """
-    curvatures = []
-    curvature_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
+    curvatures = [limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)]
     for _ in range(PATH_POINTS):
-        place = place.moved(PATH_STEP_M, curvature_per_m)
-        curvature_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
-        curvatures.append(curvature_per_m)
-    return tuple(curvatures)
+        place = place.moved(PATH_STEP_M, curvatures[-1])
+        curvatures.append(limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m))
+    return tuple(curvatures[1:])
 
 
 def limited(value: float, limit: float) -> float:

@@ -91,7 +91,8 @@ class RecordWriter:
         """
         if channel in self._left_out:
             return
-        channel_id, to_bytes = self._channels.get((channel, type(payload))) or self._register(channel, type(payload))
+        kind = (channel, type(payload))
+        channel_id, to_bytes = self._channels.get(kind) or self._register(*kind)
         data = to_bytes(payload)
         head = self._mcap.add_message(channel_id, now.wall_ns, now.mono_ns, data)
         if self._digest is not None:

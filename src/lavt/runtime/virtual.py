@@ -101,6 +101,7 @@ class _Running:
         self.node = node
         self.inbox = Inbox()
         self.costs_ns = {hop: cost_ns for (name, hop), cost_ns in host.costs_ns.items() if name == node.name}
+        self.waits_ns = {channel: self.costs_ns.get(f"wait_{channel}", 0) for channel in node.chains}
         self.free_ns = 0
         self.poke_ns: int | None = None
 
@@ -175,15 +176,14 @@ class VirtualRuntime:
     def _walk(self, running: _Running, message: Message, start: Now) -> None:
         host, node = running.host, running.node
         costs_ns = running.costs_ns
-        spent_ns = costs_ns.get(f"wait_{message.channel}", 0)
+        spent_ns = running.waits_ns[message.channel]
         start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
 
         def after(hop: str, before: Now) -> Now:
             nonlocal spent_ns
-            cost_ns = costs_ns.get(hop, 0)
-            if cost_ns == 0:
+            if hop not in costs_ns:
                 return before
-            spent_ns += cost_ns
+            spent_ns += costs_ns[hop]
             return host.clock.at(self.true_ns + spent_ns)
 
         walked = walk(node.name, node.chains[message.channel], message, start, after)

@@ -134,10 +134,10 @@ def _decoded(kind: type[Any], data: bytes) -> Any:
     checks = CHECKS[kind]
     if not isinstance(values, list) or len(values) != 1 + len(checks):
         raise BadMessage(f"not the shape of a {kind.__name__}")
-    if type(values[0]) is not int or values[0] != VERSION:
+    version, *given = values
+    if type(version) is not int or version != VERSION:
         raise BadMessage("a message of another version")
-    for (name, check), value in zip(checks.items(), values[1:], strict=True):
-        if not check(value):
+    for name, value in zip(checks, given, strict=True):
+        if not checks[name](value):
             raise BadMessage(f"{kind.__name__}.{name} is out of range")
-    checked: list[Any] = [tuple(value) if isinstance(value, list) else value for value in values[1:]]
-    return kind(*checked)
+    return kind(*(tuple(value) if type(value) is list else value for value in given))

@@ -46,7 +46,7 @@ class LaneCamera:
         self._ahead = math.ceil(math.hypot(far_m, half_width_m)) * STATIONS_PER_M + 1
         stations_m = np.arange(road.length_m * STATIONS_PER_M + 2 * self._ahead) / STATIONS_PER_M
         lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
-        self._stations: list[list[float]] = np.concatenate(lines, axis=1).tolist()
+        self._stations: list[list[list[float]]] = np.stack(lines, axis=1).tolist()
         """World x and y of the lane's centre, of its left line and of its right one."""
         self._near_s_m = 0.0
 
@@ -62,22 +62,26 @@ class LaneCamera:
         first = max(math.ceil(self._near_s_m * STATIONS_PER_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
+        near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
+        slope, lens_m = self._view_slope, self.model.x_m
         centre, lines_seen = [], 0
-        for cx, cy, lx, ly, rx, ry in self._stations[first : first + self._ahead]:
-            left = self._in_view((lx - x_m) * cosine + (ly - y_m) * sine, (ly - y_m) * cosine - (lx - x_m) * sine)
-            right = self._in_view((rx - x_m) * cosine + (ry - y_m) * sine, (ry - y_m) * cosine - (rx - x_m) * sine)
-            if left or right:
-                lines_seen += left + right
-                centre.append(((cx - x_m) * cosine + (cy - y_m) * sine, (cy - y_m) * cosine - (cx - x_m) * sine))
+        for line in self._stations[first : first + self._ahead]:
+            seen = 0
+            for world_x, world_y in line[1:]:
+                dx, dy = world_x - x_m, world_y - y_m
+                ahead_m = dx * cosine + dy * sine
+                if near_m <= ahead_m <= far_m:
+                    aside_m = abs(dy * cosine - dx * sine)
+                    seen += aside_m <= wide_m and aside_m <= (ahead_m - lens_m) * slope
+            if seen:
+                lines_seen += seen
+                dx, dy = line[0][0] - x_m, line[0][1] - y_m
+                centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
         if len(centre) < POINTS_AT_LEAST:
-            return Lane((0.0, 0.0, 0.0), self._width_m, self._near_m, self._far_m, 0.0)
-        share = lines_seen / STATIONS_PER_M / (2 * (self._far_m - self._near_m))
+            return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
+        share = lines_seen / STATIONS_PER_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
-
-    def _in_view(self, x_m: float, y_m: float) -> bool:
-        aside_m = min((x_m - self.model.x_m) * self._view_slope, self._half_width_m)
-        return self._near_m <= x_m <= self._far_m and -aside_m <= y_m <= aside_m
 
 
 def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
