@@ -77,10 +77,16 @@ def to_json(payload: Any) -> bytes:
 
     Raises `TypeError` for values that JSON has no words for.
     """
-    payload_type: Any = type(payload)
-    serialize = _serializer(payload_type)
-    if serialize is not None:
-        return serialize(payload)
+    return writer_of(type(payload))(payload)
+
+
+def writer_of(payload_type: type) -> Callable[[Any], bytes]:
+    """Give the function that makes JSON of payloads of a type."""
+    which: Any = payload_type
+    return _serializer(which) or _by_hand
+
+
+def _by_hand(payload: Any) -> bytes:
     try:
         return _ENCODER.encode(payload).encode()
     except ValueError:  # a float that is not finite: rare, and worth a second walk only then

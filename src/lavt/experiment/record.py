@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,7 +22,7 @@ from mcap.stream_reader import StreamReader
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment.mcap_file import McapFile
-from lavt.experiment.payload_json import json_schema, to_json
+from lavt.experiment.payload_json import json_schema, writer_of
 from lavt.experiment.table import EMPTY, Table, table_of
 
 CHUNK_BYTES = 64 * 1024
@@ -79,7 +79,8 @@ class RecordWriter:
         self._left_out = left_out
         self._digest = digest
         self._mcap = McapFile(path, library=f"lavt {side}", chunk_bytes=CHUNK_BYTES)
-        self._channels: dict[tuple[str, type], int] = {}
+        self._channels: dict[tuple[str, type], tuple[int, Callable[[Any], bytes]]] = {}
+        """For each channel and type of payload its number, and what makes JSON of it."""
         self._schemas: dict[type, int] = {}
         self._said = side.encode()
 
@@ -90,8 +91,9 @@ class RecordWriter:
         """
         if channel in self._left_out:
             return
-        data = _video_json(payload) if channel == VIDEO else to_json(payload)
-        channel_id = self._channels.get((channel, type(payload))) or self._register(channel, type(payload))
+        kind = (channel, type(payload))
+        channel_id, to_bytes = self._channels.get(kind) or self._register(*kind)
+        data = to_bytes(payload)
         head = self._mcap.add_message(channel_id, now.wall_ns, now.mono_ns, data)
         if self._digest is not None:
             self._digest.update(self._said + head + data)
@@ -105,8 +107,8 @@ class RecordWriter:
         if not self._mcap.closed:
             self._mcap.close()
 
-    def _register(self, channel: str, payload_type: type) -> int:
-        """Channel number for a payload type; the second type of a channel becomes a second channel of its topic."""
+    def _register(self, channel: str, payload_type: type) -> tuple[int, Callable[[Any], bytes]]:
+        """Add the channel of a payload type; the second type of a channel becomes a second channel of its topic."""
         if channel == VIDEO:
             schema_id = self._mcap.add_schema(_VIDEO_SCHEMA_NAME, "jsonschema", json.dumps(_VIDEO_SCHEMA).encode())
         else:
@@ -116,10 +118,10 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
-        self._channels[channel, payload_type] = channel_id
+        self._channels[channel, payload_type] = channel_id, _video_json if channel == VIDEO else writer_of(payload_type)
         if self._digest is not None:
             self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())
-        return channel_id
+        return self._channels[channel, payload_type]
 
 
 def _video_json(payload: Any) -> bytes:

@@ -83,6 +83,8 @@ class ActuatorNode:
         self._publish_ns = start_ns
         self._frames = frames
         self._next_frame = 0
+        self._pose_ns = start_ns
+        self._pose_wanted = True
         self._ending: str | None = None
         self._driving = False
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -105,10 +107,7 @@ class ActuatorNode:
     def next_wake_ns(self) -> int:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
-        if self._frames is None:
-            lives_ns = self.vehicle.next_wake_ns()
-        else:
-            lives_ns = self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS
+        lives_ns = self.vehicle.next_wake_ns() if self._frames is None else self._pose_ns
         due_ns = min(lives_ns, self._publish_ns)
         return due_ns if watch_ns is None else min(due_ns, watch_ns)
 
@@ -181,7 +180,9 @@ class ActuatorNode:
     def _advance(self, message: Message, now: Now) -> list[VehicleEvent]:
         due_ns = min(self.vehicle.next_wake_ns(), message.arrived.mono_ns)
         events = self.vehicle.advance(now.mono_ns)
-        while self._frames is not None and self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS <= now.mono_ns:
+        self._pose_wanted = self._frames is None or self._pose_ns <= now.mono_ns
+        while self._frames is not None and self._pose_ns <= now.mono_ns:
+            self._pose_ns = self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS
             self._next_frame += 1
         if now.mono_ns - due_ns > LATE_NS:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS
@@ -193,7 +194,7 @@ class ActuatorNode:
     def _publish(self, events: list[VehicleEvent], now: Now) -> list[Send]:
         sends = []
         truth = self.vehicle.ground_truth()
-        if truth is not None:
+        if truth is not None and self._pose_wanted:
             sends.append(Send("pose", Pose(truth.mono_ns, truth.x_m, truth.y_m, truth.heading_rad)))
         for event in events:
             sends.append(Send("event", Event(event.mono_ns, event.kind, event.detail)))

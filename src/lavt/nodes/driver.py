@@ -103,8 +103,10 @@ class DriverNode:
 
     def next_wake_ns(self) -> int | None:
         """When the next command or session query is due."""
-        times = (self.session.next_wake_ns(), self._command_ns)
-        return min((time for time in times if time is not None), default=None)
+        asks_ns = self.session.next_wake_ns()
+        if asks_ns is None or self._command_ns is None:
+            return asks_ns if self._command_ns is None else self._command_ns
+        return min(asks_ns, self._command_ns)
 
     # A picture comes.
 

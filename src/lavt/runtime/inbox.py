@@ -16,6 +16,8 @@ class Inbox:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self.waiting = 0
+        """How many messages wait."""
         self._number = 0
         self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
         self._newest: dict[str, Message] = {}
@@ -26,28 +28,28 @@ class Inbox:
         if row.waiting == "newest":
             if message.channel in self._newest:
                 self.counts[f"{message.channel}_replaced"] += 1
+            else:
+                self.waiting += 1
             self._newest[message.channel] = message
             return
         queue = self._queues[message.channel]
         if len(queue) >= row.length:
             queue.popleft()
             self.counts[f"{message.channel}_dropped"] += 1
+        else:
+            self.waiting += 1
         self._number += 1
         queue.append((self._number, message))
 
-    @property
-    def waiting(self) -> bool:
-        """Whether something waits."""
-        return bool(self._newest) or any(self._queues.values())
-
     def take(self) -> Message | None:
         """Take the next message; None when nothing waits."""
+        if not self.waiting:
+            return None
+        self.waiting -= 1
         first = None
         for queue in self._queues.values():
             if queue and (first is None or queue[0][0] < first[0][0]):
                 first = queue
         if first is not None:
             return first.popleft()[1]
-        if self._newest:
-            return self._newest.pop(next(iter(self._newest)))
-        return None
+        return self._newest.pop(next(iter(self._newest)))

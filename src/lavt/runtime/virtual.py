@@ -83,6 +83,14 @@ class VirtualHost:
 
     def __post_init__(self) -> None:
         self.running = {node.name: _Running(self, node) for node in self.nodes}
+        self._read_ns = -1
+        self._read = Now(0, 0)
+
+    def now(self, true_ns: int) -> Now:
+        """Read both clocks; several things happen at one time, so the last reading is kept."""
+        if true_ns != self._read_ns:
+            self._read_ns, self._read = true_ns, self.clock.at(true_ns)
+        return self._read
 
 
 class _Running:
@@ -92,6 +100,8 @@ class _Running:
         self.host = host
         self.node = node
         self.inbox = Inbox()
+        self.costs_ns = {hop: cost_ns for (name, hop), cost_ns in host.costs_ns.items() if name == node.name}
+        self.waits_ns = {channel: self.costs_ns.get(f"wait_{channel}", 0) for channel in node.chains}
         self.free_ns = 0
         self.poke_ns: int | None = None
 
@@ -103,22 +113,23 @@ class VirtualRuntime:
         self.true_ns = 0
         self.hosts = {host.side: host for host in hosts}
         self.links = dict(links)
-        self._heap: list[tuple[int, int, Callable[[], None]]] = []
+        self._other = {side: next(other for other in self.hosts if other != side) for side in self.hosts}
+        self._heap: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._number = 0
         for host in hosts:
             for running in host.running.values():
                 self._poke(running, 0)
 
-    def at(self, true_ns: int, action: Callable[[], None]) -> None:
-        """Call `action` at a true time."""
+    def at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
+        """Call `action` with `arguments` at a true time."""
         self._number += 1
-        heapq.heappush(self._heap, (true_ns, self._number, action))
+        heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
 
     def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
         """Run until `finished()` or to the limit; tell whether it finished."""
         while self._heap and self._heap[0][0] <= limit_ns:
-            self.true_ns, _, action = heapq.heappop(self._heap)
-            action()
+            self.true_ns, _, action, arguments = heapq.heappop(self._heap)
+            action(*arguments)
             if finished():
                 return True
         return False
@@ -134,7 +145,7 @@ class VirtualRuntime:
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
         """Let a message arrive on a side, now; what came over the network is written down."""
         host = self.hosts[side]
-        arrived = host.clock.at(self.true_ns)
+        arrived = host.now(self.true_ns)
         row = CHANNELS[channel]
         if row.carrier != "local":
             record(host.recorder, channel, payload, arrived)
@@ -147,13 +158,13 @@ class VirtualRuntime:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""
         if running.poke_ns is None or true_ns < running.poke_ns:
             running.poke_ns = true_ns
-            self.at(true_ns, lambda: self._look(running, true_ns))
+            self.at(true_ns, self._look, running, true_ns)
 
     def _look(self, running: _Running, true_ns: int) -> None:
         if running.poke_ns != true_ns:
             return  # it was looked at earlier, and has asked anew
         running.poke_ns = None
-        now = running.host.clock.at(true_ns)
+        now = running.host.now(true_ns)
         wake_ns = running.node.next_wake_ns()
         if wake_ns is not None and wake_ns <= now.mono_ns:
             self._walk(running, Message(WAKE, None, now), now)
@@ -164,15 +175,15 @@ class VirtualRuntime:
 
     def _walk(self, running: _Running, message: Message, start: Now) -> None:
         host, node = running.host, running.node
-        spent_ns = host.costs_ns.get((node.name, f"wait_{message.channel}"), 0)
+        costs_ns = running.costs_ns
+        spent_ns = running.waits_ns[message.channel]
         start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
 
         def after(hop: str, before: Now) -> Now:
             nonlocal spent_ns
-            cost_ns = host.costs_ns.get((node.name, hop), 0)
-            if cost_ns == 0:
+            if hop not in costs_ns:
                 return before
-            spent_ns += cost_ns
+            spent_ns += costs_ns[hop]
             return host.clock.at(self.true_ns + spent_ns)
 
         walked = walk(node.name, node.chains[message.channel], message, start, after)
@@ -181,7 +192,7 @@ class VirtualRuntime:
             host.recorder.write("timeline", walked.timeline, walked.end)
         if walked.sends:
             if spent_ns:
-                self.at(running.free_ns, lambda: self._send_all(host, walked.sends))
+                self.at(running.free_ns, self._send_all, host, walked.sends)
             else:
                 self._send_all(host, walked.sends)
         self._rest(running)
@@ -194,7 +205,7 @@ class VirtualRuntime:
             self._poke(running, max(running.free_ns, running.host.clock.true_ns(wake_ns)))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send]) -> None:
-        now = host.clock.at(self.true_ns)
+        now = host.now(self.true_ns)
         for send in sends:
             record(host.recorder, send.channel, send.payload, now)
             carrier = CHANNELS[send.channel].carrier
@@ -211,8 +222,7 @@ class VirtualRuntime:
         if not link.open:
             return
         due_ns = link.line.push((send.payload, host.peer), self.true_ns, link.index(send.payload, link.count))
-        other = next(side for side in self.hosts if side != host.side)
-        self.at(due_ns, lambda: self._arrive(link, send.channel, other))
+        self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
 
     def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
         for payload, peer in link.line.pop_due(self.true_ns):

@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from lavt.domain import CameraModel, FloatArray, Lane, Pose, SeenLane
+from lavt.domain import CameraModel, Lane, Pose, SeenLane
 from lavt.vehicle.camera import CapturedFrame
 from lavt.vehicle.sim.road import Road
 
-STEP_M = 0.5
-"""Between the points of the lane's centre that are looked at."""
 LINEAR_BELOW_M = 6.0
 """Of length seen: as with pixels, less gives no curvature."""
 POINTS_AT_LEAST = 3
+STATIONS_PER_M = 1
+"""Of the lane's lines that are looked at."""
 
 
 class LaneCamera:
@@ -22,6 +22,7 @@ class LaneCamera:
 
     The ground it looks at is that of the detector: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to
     both sides, as far as the camera's field of view has it. Confidence is the share of the lane's two lines in there.
+    A car that has turned by more than 90 degrees sees none.
     """
 
     def __init__(
@@ -42,11 +43,11 @@ class LaneCamera:
         self._near_m, self._far_m, self._half_width_m = near_m, far_m, half_width_m
         self._view_slope = math.tan(model.field_of_view_rad / 2)
         self._width_m = road.lanes.widths_m[road.lanes.driven]
-        self._reach = round(far_m / STEP_M) + 2
-        stations_m = np.arange(-self._reach, road.length_m / STEP_M + 2 * self._reach) * STEP_M
-        half_m = self._width_m / 2
-        # One array for all: x and y of the centre, of the left line and of the right one, a row for each station.
-        self._lines = np.stack([road.across(stations_m, offset_m) for offset_m in (0.0, half_m, -half_m)])
+        self._ahead = math.ceil(math.hypot(far_m, half_width_m)) * STATIONS_PER_M + 1
+        stations_m = np.arange(road.length_m * STATIONS_PER_M + 2 * self._ahead) / STATIONS_PER_M
+        lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
+        self._stations: list[list[list[float]]] = np.stack(lines, axis=1).tolist()
+        """World x and y of the lane's centre, of its left line and of its right one."""
         self._near_s_m = 0.0
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
@@ -58,29 +59,51 @@ class LaneCamera:
     def lane_from(self, pose: Pose) -> Lane:
         """Fit the driven lane's centre as far as its lines are in view; confidence 0 where nothing of them is."""
         self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
-        x, y = self._around(pose)
-        seen = (x >= self._near_m) & (x <= self._far_m) & (np.abs(y) <= self._half_width_m)
-        seen &= np.abs(y) <= (x - self.model.x_m) * self._view_slope
-        chosen = seen[1] | seen[2]
-        count = int(np.count_nonzero(chosen))
-        if count < POINTS_AT_LEAST:
-            return Lane((0.0, 0.0, 0.0), self._width_m, self._near_m, self._far_m, 0.0)
-        ahead, left = x[0][chosen], y[0][chosen]
-        share = np.count_nonzero(seen[1:]) * STEP_M / (2 * (self._far_m - self._near_m))
-        centre = _fit(ahead, left, degree=2 if float(np.ptp(ahead)) >= LINEAR_BELOW_M else 1)
-        return Lane(centre, self._width_m, float(ahead.min()), float(ahead.max()), min(share, 1.0))
-
-    def _around(self, pose: Pose) -> tuple[FloatArray, FloatArray]:
-        """Give the lines around the car in its own frame: x and y, (3, points)."""
-        middle = round(self._near_s_m / STEP_M) + self._reach
-        lines = self._lines[:, max(middle - self._reach, 0) : middle + self._reach]
-        dx, dy = lines[..., 0] - pose.x_m, lines[..., 1] - pose.y_m
+        first = max(math.ceil(self._near_s_m * STATIONS_PER_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-        return dx * cosine + dy * sine, dy * cosine - dx * sine
+        x_m, y_m = pose.x_m, pose.y_m
+        near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
+        slope, lens_m = self._view_slope, self.model.x_m
+        centre, lines_seen = [], 0
+        for line in self._stations[first : first + self._ahead]:
+            seen = 0
+            for world_x, world_y in line[1:]:
+                dx, dy = world_x - x_m, world_y - y_m
+                ahead_m = dx * cosine + dy * sine
+                if near_m <= ahead_m <= far_m:
+                    aside_m = abs(dy * cosine - dx * sine)
+                    seen += aside_m <= wide_m and aside_m <= (ahead_m - lens_m) * slope
+            if seen:
+                lines_seen += seen
+                dx, dy = line[0][0] - x_m, line[0][1] - y_m
+                centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
+        if len(centre) < POINTS_AT_LEAST:
+            return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
+        share = lines_seen / STATIONS_PER_M / (2 * (far_m - near_m))
+        near_m, far_m = min(centre)[0], max(centre)[0]
+        return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
 
 
-def _fit(x: FloatArray, y: FloatArray, degree: int) -> tuple[float, float, float]:
-    """Least squares for c0, c1 and, with degree 2, c2."""
-    powers = np.stack([np.ones_like(x), x, x * x][: degree + 1])
-    solved = np.linalg.solve(powers @ powers.T, powers @ y).tolist()
-    return solved[0], solved[1], solved[2] if degree == 2 else 0.0
+def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
+    """Least squares for c0, c1 and, where `curved`, c2; two dozen points are too few for arrays to be faster.
+
+    x is taken from its mean, so that the normal equations are well conditioned.
+    """
+    n = len(points)
+    mean = sum(x for x, _ in points) / n
+    x2 = x3 = x4 = y0 = y1 = y2 = 0.0
+    for x, y in points:
+        u = x - mean
+        uu = u * u
+        x2 += uu
+        x3 += uu * u
+        x4 += uu * uu
+        y0 += y
+        y1 += y * u
+        y2 += y * uu
+    bend = 0.0
+    if curved:
+        bend = (y2 - y0 * x2 / n - y1 * x3 / x2) / (x4 - x2 * x2 / n - x3 * x3 / x2)
+    slope = (y1 - bend * x3) / x2
+    height = (y0 - bend * x2) / n
+    return height - slope * mean + bend * mean * mean, slope - 2 * bend * mean, bend
