@@ -294,6 +294,13 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
     return limits
 
 
+def looks_of(camera: Camera, start_ns: int) -> list[FrameTimes]:
+    """Tell when the vehicle's pose is needed: when the shutter opens and, where the camera has an exposure, closes."""
+    opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
+    exposure_ns = getattr(camera, "exposure_ns", 0)
+    return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]
+
+
 def build_server(
     config: ServerConfig,
     now: Callable[[], Now],
@@ -311,7 +318,7 @@ def build_server(
     plant = fidelity.plant(config)
     pictures = fidelity.sender(config)
     start = now()
-    frames = FrameTimes(start.mono_ns + plant.camera.phase_ns, plant.camera.rate_hz) if lives_on_demand else None
+    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand else ()
     vehicle = plant.start(start)
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
@@ -338,7 +345,7 @@ def build_server(
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
         ),
-        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route, frames=frames),
+        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route, looks=looks),
         ClockSyncNode(start.mono_ns),
     )
 
