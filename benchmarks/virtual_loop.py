@@ -1,13 +1,14 @@
 """How fast the loop runs in virtual time, and where the time of a frame goes.
 
-    python benchmarks/virtual_loop.py [--routes a_key] [--repetitions 5] [--limit-s 600]
+    python benchmarks/virtual_loop.py [--settings full bare geometry] [--routes a_key] [--repetitions 5] [--limit-s 600]
 
 Drives the way `lavt run` does (`plan_run`, `build_loop`, `drive`), at L0, with everything recorded. What is counted is
 CPU time of this process and its children, as the operating system has it, against the virtual time that went by in the
 drive: medians over the repetitions. Building the loop (reading the road, painting the ground, opening the codec) is
 no part of a drive and has a figure of its own; imports have none. The stages are timed in one more drive, hop by hop.
 
-The last line is JSON: how many times real time each setting reaches, and two stages of the one with everything.
+The last line is JSON: how many times real time each setting reaches, and two stages of the one with everything; null
+is what was not measured.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ STAGES = {
     "control": (("driver", "decide"), ("driver", "command")),
 }
 """Hops that make up a stage; what is left is "rest": car and judge, packets, links, safety, records, the runtime."""
+
+SAID = ("full_x", "bare_x", "geometry_x", "perception_ms", "render_ms")
+"""What the last line says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +109,10 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
     return {stage: 1e3 * sum(spent_s[hop] for hop in hops) / driven.frames for stage, hops in STAGES.items()}
 
 
-def measure(routes: Sequence[str], repetitions: int, limit_s: float, names: Iterable[str] = SETTINGS) -> dict[str, Any]:
+def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit_s: float) -> dict[str, float | None]:
     """Measure the named settings and print what was found; returns what the last line says."""
     cv2.setNumThreads(1)
-    found: dict[str, Any] = {}
+    found: defaultdict[str, list[float]] = defaultdict(list)
     for name in names:
         for route in routes:
             changes = (*SETTINGS[name], f"vehicle.route={route}")
@@ -119,15 +123,14 @@ def measure(routes: Sequence[str], repetitions: int, limit_s: float, names: Iter
             frame_ms = median(1e3 * each.drive_cpu_s / each.frames for each in drives)
             stages = stages_ms(changes, limit_s)
             stages["rest"] = frame_ms - sum(stages.values())
-            found.setdefault(name, []).append(speed)
+            found[f"{name}_x"].append(speed)
             if name == "full":
-                found.setdefault("perception", []).append(stages["perception"])
-                found.setdefault("render", []).append(stages["render"])
+                found["perception_ms"].append(stages["perception"])
+                found["render_ms"].append(stages["render"])
             print(f"{name}, {route}: {drives[0].simulated_s:.1f} s simulated, {repetitions} drives")
             print(f"  {speed:.2f} times real time; with {building_s:.2f} s to build the loop {whole:.2f}")
             print(f"  a frame {frame_ms:.3f} ms: " + ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items()))
-    key = {**{name: f"{name}_x" for name in SETTINGS}, "perception": "perception_ms", "render": "render_ms"}
-    return {key[name]: round(median(values), 3) for name, values in found.items()}
+    return {name: round(median(found[name]), 3) if found[name] else None for name in SAID}
 
 
 def machine() -> str:
@@ -144,12 +147,13 @@ def machine() -> str:
 def main() -> None:
     """Measure everything."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--routes", nargs="+", default=["a_key"])
     parser.add_argument("--repetitions", type=int, default=5)
     parser.add_argument("--limit-s", type=float, default=600.0)
     arguments = parser.parse_args()
     print(machine())
-    print(json.dumps(measure(arguments.routes, arguments.repetitions, arguments.limit_s)))
+    print(json.dumps(measure(arguments.settings, arguments.routes, arguments.repetitions, arguments.limit_s)))
 
 
 if __name__ == "__main__":

@@ -231,8 +231,8 @@ class ActuatorNode:
             if before == "arming" and after == "driving":
                 self._driving, self._ending = True, None
                 sends.append(Send("event", Event(now.mono_ns, "drive_began", "")))
-        stopped = self.gate.state not in ACTIVE and self.gate.stands(self.vehicle.state())
-        if self._driving and self._ending is None and stopped:
+        over = self._driving and self._ending is None and self.gate.state not in ACTIVE
+        if over and self.gate.stands(self.vehicle.state()):
             sends += self._end("safe_stop", now.mono_ns)
         return sends
 
