@@ -106,6 +106,8 @@ class Plant:
     camera: Camera
     start: Callable[[Now], Vehicle]
     route: Route | None
+    catches_up: bool = False
+    """The vehicle loses nothing when `advance` is called later than it asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +194,7 @@ def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
         camera,
         lambda start: Simulator(road=road, seed=config.seed, start_mono_ns=start.mono_ns),
         Route(config.vehicle.route, road.length_m, points),
+        catches_up=True,
     )
 
 
@@ -313,12 +316,13 @@ def build_server(
 ) -> ServerNodes:
     """Make the server's nodes; their time begins when everything that is slow has been prepared.
 
-    With `lives_on_demand` the vehicle lives on only when somebody looks, where no wake is ever late: in virtual time.
+    With `lives_on_demand` a vehicle that catches up lives on only when somebody looks: where no wake is ever late, in
+    virtual time.
     """
     plant = fidelity.plant(config)
     pictures = fidelity.sender(config)
     start = now()
-    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand else ()
+    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
     vehicle = plant.start(start)
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
