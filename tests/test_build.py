@@ -2,24 +2,30 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.build import (
+    FIDELITIES,
     MachineEntropy,
     SeededEntropy,
     build_controller,
     build_plant,
+    build_server,
+    build_unpictured,
     camera_model,
     check_names,
     parse_address,
     run_seed,
 )
 from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
-from lavt.domain import Lane
+from lavt.domain import Lane, Now
 from lavt.errors import UserError
+from lavt.node import WAKE, Message
+from lavt.runtime.chain import walk
 
 
 @given(st.integers(0, 2**63 - 1), st.text(max_size=10), st.integers(0, 10_000))
@@ -113,3 +119,29 @@ def test_settings_of_the_config_replace_those_of_the_preset() -> None:
     assert far.brake > 0
     assert changed.settings == "designed, lookahead_s 2, speed_mps 5"
     assert ControllerConfig().settings == "designed"
+
+
+def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None:
+    """On demand, the simulator is woken for frames and its state only; a vehicle that may lose something is not."""
+    config = ServerConfig(camera=CameraConfig(width_px=128, height_px=128))
+    every_step, on_demand, careful = (
+        build_server(
+            config, lambda: Now(10**12, 10**18), SeededEntropy(1, "server"), host="", video_port=1,
+            fidelity=replace(FIDELITIES["geometry"](), plant=plant), lives_on_demand=asked,
+        ).actuator
+        for plant, asked in (
+            (build_unpictured, False),
+            (build_unpictured, True),
+            (lambda config: replace(build_unpictured(config), catches_up=False), True),
+        )
+    )  # fmt: skip
+    woken = []
+    for actuator in (every_step, on_demand, careful):
+        wakes = 0
+        while (wake_ns := actuator.next_wake_ns()) < 10**12 + 10**9:
+            now = Now(max(wake_ns, 10**12), 10**18)
+            walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, lambda _hop, before: before)
+            wakes += 1
+        woken.append(wakes)
+    assert woken[0] == woken[2] > 240
+    assert woken[1] <= 82

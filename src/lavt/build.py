@@ -108,6 +108,8 @@ class Plant:
     camera: Camera
     start: Callable[[Now], Vehicle]
     route: Route | None
+    catches_up: bool = False
+    """The vehicle loses nothing when `advance` is called later than it asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +215,7 @@ def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
             limit_s=config.vehicle.time_limit_s,
         ),
         Route(config.vehicle.route, road.length_m, points),
+        catches_up=True,
     )
 
 
@@ -321,6 +324,13 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
     return limits
 
 
+def looks_of(camera: Camera, start_ns: int) -> list[FrameTimes]:
+    """Tell when the vehicle's pose is needed: when the shutter opens and, where the camera has an exposure, closes."""
+    opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
+    exposure_ns = getattr(camera, "exposure_ns", 0)
+    return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]
+
+
 def build_server(
     config: ServerConfig,
     now: Callable[[], Now],
@@ -333,12 +343,13 @@ def build_server(
 ) -> ServerNodes:
     """Make the server's nodes; their time begins when everything that is slow has been prepared.
 
-    With `lives_on_demand` the vehicle lives on only when somebody looks, where no wake is ever late: in virtual time.
+    With `lives_on_demand` a vehicle that catches up lives on only when somebody looks: where no wake is ever late, in
+    virtual time.
     """
     plant = fidelity.plant(config)
     pictures = fidelity.sender(config)
     start = now()
-    frames = FrameTimes(start.mono_ns + plant.camera.phase_ns, plant.camera.rate_hz) if lives_on_demand else None
+    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
     vehicle = plant.start(start)
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
@@ -370,7 +381,7 @@ def build_server(
             gate,
             start_ns=start.mono_ns,
             route=plant.route,
-            frames=frames,
+            looks=looks,
             after_collision=config.vehicle.after_collision,
         ),
         ClockSyncNode(start.mono_ns),

@@ -85,6 +85,8 @@ BAD_RUNS = {
     "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
     "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
     "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
+    "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "virtual time only"),
+    "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
 }
 

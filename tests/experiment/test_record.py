@@ -168,6 +168,21 @@ def test_video_is_kept_and_playable(tmp_path: Path) -> None:
     assert json.loads(message.data)["format"] == "h264"
 
 
+def test_other_readers_find_their_way(tmp_path: Path) -> None:
+    """The file has the counts and indexes by which a reader finds the messages of a topic."""
+    path = tmp_path / "a.mcap"
+    write_samples(path, 3_000)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 3_000
+        assert len(summary.chunk_indexes) > 1
+        found = [json.loads(message.data)["number"] for _, _, message in reader.iter_messages(topics="/frame")]
+        assert found == list(range(3_000))
+
+
 def test_schemas_describe_the_payload() -> None:
     """The JSON Schema of a dataclass names its fields, which may be null, and how bytes are written."""
     schema = json.loads(json_schema(Sample))

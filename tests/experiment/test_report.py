@@ -80,7 +80,7 @@ def test_the_report_is_whole(sweep: Path) -> None:
 def test_real_and_virtual_runs_have_tables_of_their_own(sweep: Path) -> None:
     """The page says of each table whether time was real and who injected; an invalid run is named with its reason."""
     html = page_of(sweep)
-    assert "virtual time: network and clocks are modelled" in html
+    assert "virtual time, fidelity video: network and clocks are modelled" in html
     assert "real time, injected by relay" in html
     assert "not valid: the offset between the clocks is only known to 6.00 ms" in html
 

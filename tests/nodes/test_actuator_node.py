@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -15,9 +16,10 @@ from lavt.control.limits import LIMITS
 from lavt.control.safety import SafetyGate
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
-from lavt.nodes.actuator import ActuatorNode
+from lavt.nodes.actuator import POSE_AHEAD_NS, ActuatorNode
 from lavt.nodes.reports import Admission, FrameWritten, Route
 from lavt.transport.messages import decode, encode
+from lavt.vehicle.camera import FrameTimes
 
 TICK_NS = 20 * NS_PER_MS
 
@@ -25,12 +27,12 @@ TICK_NS = 20 * NS_PER_MS
 class Bench:
     """An actuator node with a vehicle that stands, and a client that commands it."""
 
-    def __init__(self, route: Route | None = None) -> None:
+    def __init__(self, route: Route | None = None, looks: Sequence[FrameTimes] = ()) -> None:
         numbers = count(1)
         limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
         self.vehicle = StandingVehicle()
         self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
-        self.node = ActuatorNode(self.vehicle, self.gate, start_ns=MONO_NS, route=route)
+        self.node = ActuatorNode(self.vehicle, self.gate, start_ns=MONO_NS, route=route, looks=looks)
         self.mono_ns = 0
         self.sequence = 0
         self.epoch = 0
@@ -96,6 +98,19 @@ def test_the_state_is_told_50_times_a_second() -> None:
     assert len(states) == 50
     assert {state.safety for state in states} == {"disarmed"}
     assert [state.state_mono_ns for state in states] == sorted(state.state_mono_ns for state in states)
+
+
+def test_a_vehicle_that_lives_on_demand_is_looked_at_before_each_frame() -> None:
+    """Given the times of frames it wakes just before each of them, and for its state, and not at each physics step."""
+    frames = FrameTimes(MONO_NS + 7 * NS_PER_MS, 30.0)
+    bench, woken = Bench(looks=[frames]), []
+    while (wake_ns := bench.node.next_wake_ns()) < MONO_NS + NS_PER_S:
+        bench.mono_ns = wake_ns - MONO_NS
+        bench.take(WAKE, None)
+        woken.append(wake_ns)
+        assert bench.vehicle.now_ns == wake_ns
+    assert {frames.due_ns(number) - POSE_AHEAD_NS for number in range(30)} <= set(woken)
+    assert len(woken) == 30 + 50
 
 
 def test_a_late_node_tells_one_state_and_says_that_the_physics_was_late() -> None:

@@ -68,7 +68,7 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> str:
     rows = [
         [
             str(run["run"]),
-            f"{run['time']}, {run['injection']}",
+            f"{run['time']}, {run.get('fidelity') or 'video'}, {run['injection']}",
             str(run["route"]),
             str(run["condition"]),
             str(run["ending"] or NOTHING),

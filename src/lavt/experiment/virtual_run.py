@@ -10,7 +10,7 @@ from typing import Any
 
 from lavt.build import FIDELITIES, ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig, condition, load_config, shipped
-from lavt.domain import NS_PER_S, NS_PER_US, Now
+from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
 from lavt.experiment.directory import make_directory
 from lavt.experiment.network import Network, injected_network, virtual_network
 from lavt.experiment.plan import PlannedRun
@@ -41,18 +41,19 @@ class EndingTap:
     def __init__(self, writer: RecordWriter) -> None:
         self.began = False
         self.ending: str | None = None
-        self._status: dict[str, Any] = {}
+        self._truth: GroundTruth | None = None
         self._writer = writer
 
     def status(self) -> dict[str, Any]:
         """Tell what a person wants to see of a drive while it goes on."""
-        return dict(self._status)
+        truth = self._truth
+        return {} if truth is None else {"speed_mps": truth.speed_mps, "cross_track_m": truth.cross_track_m}
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Write one entry."""
         if topic == "truth":
-            self._status.update(speed_mps=payload.speed_mps, cross_track_m=payload.cross_track_m)
-        if topic == "event":
+            self._truth = payload
+        elif topic == "event":
             self.began |= payload.kind == "drive_began"
             if payload.kind == "ending":
                 self.ending = payload.detail

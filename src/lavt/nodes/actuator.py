@@ -57,8 +57,8 @@ class Judged:
 class ActuatorNode:
     """The only one who talks to the vehicle: lets it live, watches, admits commands, and tells its state.
 
-    The vehicle lives on whenever it asks to; with `frames`, only when somebody looks, which is just before each frame
-    and when its state is told. That is enough where physics catches up without loss and no wake is ever late.
+    The vehicle lives on whenever it asks to; with `looks`, only when somebody looks, which is just before each of these
+    times, and when its state is told. That is enough where physics catches up without loss and no wake is ever late.
     """
 
     name = "actuator"
@@ -70,7 +70,7 @@ class ActuatorNode:
         *,
         start_ns: int,
         route: Route | None = None,
-        frames: FrameTimes | None = None,
+        looks: Sequence[FrameTimes] = (),
         after_collision: Literal["end", "continue"] = "end",
     ) -> None:
         self._counts: Counter[str] = Counter()
@@ -81,9 +81,9 @@ class ActuatorNode:
             kind: ending for kind, ending in ENDINGS.items() if (kind, after_collision) != ("collision", "continue")
         }
         self._publish_ns = start_ns
-        self._frames = frames
-        self._next_frame = 0
-        self._pose_ns = start_ns
+        self._looks = tuple(looks)
+        self._next_look = 0
+        self._look_ns = start_ns
         self._pose_wanted = True
         self._ending: str | None = None
         self._driving = False
@@ -107,7 +107,7 @@ class ActuatorNode:
     def next_wake_ns(self) -> int:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
-        lives_ns = self.vehicle.next_wake_ns() if self._frames is None else self._pose_ns
+        lives_ns = self._look_ns if self._looks else self.vehicle.next_wake_ns()
         due_ns = min(lives_ns, self._publish_ns)
         return due_ns if watch_ns is None else min(due_ns, watch_ns)
 
@@ -180,10 +180,11 @@ class ActuatorNode:
     def _advance(self, message: Message, now: Now) -> list[VehicleEvent]:
         due_ns = min(self.vehicle.next_wake_ns(), message.arrived.mono_ns)
         events = self.vehicle.advance(now.mono_ns)
-        self._pose_wanted = self._frames is None or self._pose_ns <= now.mono_ns
-        while self._frames is not None and self._pose_ns <= now.mono_ns:
-            self._pose_ns = self._frames.due_ns(self._next_frame) - POSE_AHEAD_NS
-            self._next_frame += 1
+        self._pose_wanted = not self._looks or self._look_ns <= now.mono_ns
+        while self._looks and self._look_ns <= now.mono_ns:
+            turn, number = self._next_look % len(self._looks), self._next_look // len(self._looks)
+            self._look_ns = self._looks[turn].due_ns(number) - POSE_AHEAD_NS
+            self._next_look += 1
         if now.mono_ns - due_ns > LATE_NS:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS
             events.append(VehicleEvent(now.mono_ns, "late", f"{late_ms} ms"))
@@ -235,8 +236,8 @@ class ActuatorNode:
             if before == "arming" and after == "driving":
                 self._driving, self._ending = True, None
                 sends.append(Send("event", Event(now.mono_ns, "drive_began", "")))
-        stopped = self.gate.state not in ACTIVE and self.gate.stands(self.vehicle.state())
-        if self._driving and self._ending is None and stopped:
+        over = self._driving and self._ending is None and self.gate.state not in ACTIVE
+        if over and self.gate.stands(self.vehicle.state()):
             sends += self._end("safe_stop", now.mono_ns)
         return sends
 

@@ -19,13 +19,13 @@ class CapturedFrame:
 
 @dataclass(frozen=True, slots=True)
 class FrameTimes:
-    """When a camera takes its frames, on the server's monotonic clock."""
+    """When a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
 
     first_ns: int
     rate_hz: float
 
     def due_ns(self, number: int) -> int:
-        """When frame `number` is taken; from the number each time, so that nothing drifts."""
+        """When it does for frame `number`; from the number each time, so that nothing drifts."""
         return self.first_ns + round(number * NS_PER_S / self.rate_hz)
 
 

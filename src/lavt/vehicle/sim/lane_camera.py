@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -35,10 +36,14 @@ class LaneCamera:
         near_m: float,
         far_m: float,
         half_width_m: float,
+        exposure_ns: int = 0,
+        sensor_delay_ns: int = 0,
     ) -> None:
         self.model = model
         self.rate_hz = rate_hz
         self.phase_ns = phase_ns
+        self.exposure_ns = exposure_ns
+        self.sensor_delay_ns = sensor_delay_ns
         self._road = road
         self._near_m, self._far_m, self._half_width_m = near_m, far_m, half_width_m
         self._view_slope = math.tan(model.field_of_view_rad / 2)
@@ -55,6 +60,16 @@ class LaneCamera:
         if pose is None:
             return None
         return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.lane_from(pose)))
+
+    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+        """Give the lane as it is seen half-way between the poses at the shutter's opening and at its closing."""
+        first, last = _newest(poses, begin_ns), _newest(poses, begin_ns + self.exposure_ns)
+        if first is None or last is None:
+            return None
+        turned_rad = math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi)
+        middle_ns = begin_ns + self.exposure_ns // 2
+        x_m, y_m = (first.x_m + last.x_m) / 2, (first.y_m + last.y_m) / 2
+        return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turned_rad / 2))
 
     def lane_from(self, pose: Pose) -> Lane:
         """Fit the driven lane's centre as far as its lines are in view; confidence 0 where nothing of them is."""
@@ -82,6 +97,10 @@ class LaneCamera:
         share = lines_seen / STATIONS_PER_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
+
+
+def _newest(poses: Sequence[Pose], at_ns: int) -> Pose | None:
+    return next((pose for pose in reversed(poses) if pose.mono_ns <= at_ns), None)
 
 
 def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:

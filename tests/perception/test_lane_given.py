@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import pytest
+
+from lavt.domain import Lane, SeenLane
+from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING
+from lavt.perception.lane_given import GivenLane
+
+
+def seen(offset_m: float, confidence: float = 1.0) -> SeenLane:
+    return SeenLane(1, 2, Lane((offset_m, 0.0, 0.0), 3.5, 3.6, 20.0, confidence))
+
+
+def test_it_averages_as_the_detector_of_pixels() -> None:
+    """The first lane stands alone; each next one moves the average by the weight that the theory reckons with."""
+    given = GivenLane()
+    assert given.detect(seen(1.0)).centre[0] == 1.0
+    assert given.detect(seen(2.0)).centre[0] == pytest.approx(1.0 + SMOOTHING)
+
+
+def test_without_a_lane_it_keeps_the_last_and_says_so() -> None:
+    """What is hardly seen changes the confidence only; after some of these, or when told, the next lane is a first."""
+    given = GivenLane()
+    given.detect(seen(1.0))
+    lost = [given.detect(seen(5.0, confidence=0.1)) for _ in range(FORGET_AFTER)]
+    assert [(lane.centre[0], lane.confidence) for lane in lost] == [(1.0, 0.1)] * FORGET_AFTER
+    assert given.detect(seen(3.0)).centre[0] == 3.0
+    given.forget()
+    assert given.detect(seen(7.0)).centre[0] == 7.0
