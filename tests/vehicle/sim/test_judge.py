@@ -201,6 +201,14 @@ def test_grass_before_a_rail_is_off_road() -> None:
     ]
 
 
+def test_asphalt_counts_where_it_is() -> None:
+    """A lay-by beside the lane is road between its stations and nowhere else."""
+    paved = "paved: [{left_m: 2.25, right_m: -2.25}, {left_m: -2.25, right_m: -6, from_m: 30, to_m: 60}]"
+    road = parse_road(f"title: x\nsegments: [{{length_m: 100}}]\n{paved}", source="x")
+    for s_m, off in ((20.0, True), (45.0, False), (70.0, True)):
+        assert ("off_road" in kinds(judged(road, [(s_m, -4.0)]))) == off
+
+
 def test_a_car_behind_a_rail_does_not_touch_it() -> None:
     """Where the rail begins, a body that is wholly behind it passes; one that it meets in front has a collision."""
     road = parse_road(OPEN_RAIL, source="x")
