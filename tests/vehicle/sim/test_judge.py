@@ -241,7 +241,16 @@ def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> N
     assert judge.contacts == ()
 
 
-ROADS = [load_road("a_key"), parse_road(OPEN_RAIL, source="x")]
+WINDING = """
+title: winding
+segments:
+  - {length_m: 15, end_curvature_per_m: 0.05}
+  - {length_m: 20, curvature_per_m: 0.05}
+  - {length_m: 30, curvature_per_m: 0.05, end_curvature_per_m: -0.05}
+  - {length_m: 20, curvature_per_m: -0.05}
+rails: [{offset_m: -5, to_m: 50}, {offset_m: 6, kind: barrier, from_m: 20}]
+"""
+ROADS = [load_road("a_key"), *(parse_road(text, source="x") for text in (OPEN_RAIL, WINDING))]
 STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
 
 
