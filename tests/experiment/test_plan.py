@@ -116,7 +116,7 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
     ({"conditions": ["L0", "L0"]}, "a_key_L0_00 more than once"),
     ({"axes": {"study.participant": ["a b", "a/b"]}}, "more than once"),
     ({"conditions": ["L0", "L9"]}, "'L9': the known ones are L0"),
-    ({"routes": ["a_key", "nowhere"]}, "'nowhere'; known are"),
+    ({"routes": ["a_key", "nowhere"]}, "'nowhere': name one"),
     ({"controller": {"preset": "magic"}}, "'magic'; choose one of"),
     ({"axes": {"controller.preset": ["designed", "magic"]}}, "'magic'; choose one of"),
     ({"axes": {"controller.kind": ["wizard"]}}, "'wizard'; choose one of"),

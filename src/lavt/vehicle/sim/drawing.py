@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
@@ -21,6 +23,7 @@ DETAIL_M = 40.0
 _STEP_M = 1.0
 _STATION_STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
 _STATIONS = 12
+_LABEL_PT = 24.0
 _ASPHALT, _LANE, _GRASS = "#8d9096", "#7f9fc4", "#dfe8d5"
 _PAINT = {"white": "#ffffff", "yellow": "#f2c14e"}
 _RAILS = {"rail": "#b5541c", "barrier": "#222222"}
@@ -53,10 +56,10 @@ def _draw_whole(axes: Axes, road: Road) -> None:
     spacing_m = next((each for each in _STATION_STEPS_M if road.length_m / each <= _STATIONS), _STATION_STEPS_M[-1])
     outer_m = min(strip.right_m for strip in road.paved)
     for s_m in np.arange(0.0, road.length_m, spacing_m).tolist():
-        tick = road.across(s_m, [outer_m, outer_m - road.length_m / 60])
-        text = road.across(s_m, outer_m - road.length_m / 24)
-        axes.plot(*tick.T, color="black", linewidth=0.8)
-        axes.annotate(f"{s_m:.0f} m", (float(text[0]), float(text[1])), fontsize=8, ha="center", va="center")
+        edge, beyond = road.across(s_m, [outer_m, outer_m - 1.0])
+        label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "center", "va": "center"}
+        line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 0.0}
+        axes.annotate(f"{s_m:.0f} m", edge, xytext=(beyond - edge) * _LABEL_PT, arrowprops=line, **label)
     edges_m = road.lanes.edges_m
     for s_m, colour, name in ((0.0, "#1a7f37", "start"), (road.length_m, "#c1121f", "end")):
         axes.plot(*road.across(s_m, [edges_m[0], edges_m[-1]]).T, color=colour, linewidth=2.5, label=name)
@@ -103,6 +106,7 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     for strip in _within(road.paved, first_m, last_m):
         _fill(axes, road, strip, (_low(strip, first_m), _high(strip, last_m)), _ASPHALT)
     _fill(axes, road, Paved(half_m, -half_m), (0.0, road.length_m), _LANE)
+    axes.plot(*road.across(_along(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)  # seen from any height
     for colour, paint in _PAINT.items():
         lines = [
             road.across(_along(*piece), mark.offset_m)
@@ -114,6 +118,7 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     for rail in _within(road.rails, first_m, last_m):
         along = _along(_low(rail, first_m), _high(rail, last_m))
         axes.plot(*road.across(along, rail.offset_m).T, color=_RAILS[rail.kind], linewidth=0.9)
+    axes.margins(0.12)  # room for the stations' labels
     axes.autoscale_view()
 
 
