@@ -1,0 +1,114 @@
+"""Vary a preset's settings one at a time, and print what theory says and what drives show, as Markdown tables.
+
+    python benchmarks/sensitivity.py [--routes a_key,b_key,c_key] [--repetitions 3] [--jobs N]
+
+Drives are in geometry fidelity: the lane's true centre takes the detector's place, everything else is the whole loop.
+The latency is that of `paper_wifi5`, the seeds are the same in every column. `docs/controllers.md` holds what this
+printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from lavt.config import SweepConfig, load_config, parse_config, shipped
+from lavt.control.drive_controller import Preset, find_preset
+from lavt.experiment.plan import plan_sweep
+from lavt.experiment.sweep import run_all
+from lavt.experiment.theory import LateralLoop, critical_delay_s, phase_margin_rad
+
+DELAY_S = 0.081
+"""At L0 with `paper_wifi5`: 62 + 9 ms, and 10 ms from the picture to the wheel's command: see find_designed_preset."""
+CONDITIONS = ("L0", "L1", "L2", "L3", "L5")
+"""L4 is the same total delay as L3."""
+
+Values = Sequence[float]
+
+
+def variations(preset: Preset) -> dict[str, Values]:
+    """Give the values that each setting takes, the preset's own among them."""
+    limits: dict[str, Values] = (
+        {"controller.lateral_limit_mps2": (2.0, 3.0, 4.5)}
+        if math.isfinite(preset.lateral_limit_mps2)
+        else {"controller.steering_limit_rad": (0.14, 0.21, 0.30, 0.50)}
+    )
+    return {
+        "controller.lookahead_s": tuple(round(preset.lookahead_s * factor, 3) for factor in (0.8, 0.9, 1.0, 1.1, 1.25)),
+        **limits,
+        "controller.speed_mps": (5.0, 30 / 3.6, 10.0),
+        "camera.rate_hz": (15.0, 30.0, 60.0),
+    }
+
+
+def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
+    """Give the theory's loop with one setting changed; it knows nothing of limits."""
+    settings = {"controller.lookahead_s": preset.lookahead_s, "controller.speed_mps": preset.speed_mps, key: value}
+    return LateralLoop(
+        lookahead_s=settings["controller.lookahead_s"],
+        speed_mps=settings["controller.speed_mps"],
+        frame_rate_hz=settings.get("camera.rate_hz", 30.0),
+    )
+
+
+def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Drive every value under every condition, and give the results."""
+    base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
+    base["controller"]["preset"] = preset
+    asked = {
+        **base,
+        "fidelity": "geometry",
+        "routes": options.routes.split(","),
+        "conditions": list(CONDITIONS),
+        "repetitions": options.repetitions,
+        "axes": {key: list(values)},
+    }
+    planned = plan_sweep(parse_config(SweepConfig, asked, "sensitivity"))
+    with TemporaryDirectory() as directory:
+        driven, _ = run_all(planned, Path(directory), jobs=options.jobs, tell=lambda _: None)
+    if driven.failed:
+        raise SystemExit(f"failed: {driven.failed}")
+    return list(driven.results)
+
+
+def cell(results: Sequence[dict[str, Any]]) -> str:
+    """Say how many of the drives were completed, and the median of their P95."""
+    p95_m = [result["p95_m"] for result in results if result["ending"] == "completed"]
+    share = f"{len(p95_m)}/{len(results)}"
+    return f"{share}, {median(p95_m):.2f} m" if p95_m else share
+
+
+def table(preset: Preset, key: str, values: Values, options: argparse.Namespace) -> None:
+    """Print one table."""
+    results = drives(preset.name, key, values, options)
+    print(f"\n`{preset.name}`, `{key}`:\n")
+    print("| value | phase margin at L0 | critical delay | " + " | ".join(CONDITIONS) + " |")
+    print("|---" * (3 + len(CONDITIONS)) + "|")
+    for value in values:
+        loop = loop_with(preset, key, value)
+        margin_deg, critical_ms = math.degrees(phase_margin_rad(loop, DELAY_S)), 1e3 * critical_delay_s(loop)
+        of_value = [result for result in results if result["axes"][key] == value]
+        cells = [cell([result for result in of_value if result["condition"] == name]) for name in CONDITIONS]
+        print(f"| {value:.3g} | {margin_deg:.0f} deg | {critical_ms:.0f} ms | " + " | ".join(cells) + " |", flush=True)
+
+
+def main() -> None:
+    """Print all tables of both presets."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--routes", default="a_key,b_key,c_key")
+    parser.add_argument("--repetitions", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=None)
+    options = parser.parse_args()
+    for name in ("designed", "paper_calibrated"):
+        preset = find_preset(name)
+        for key, values in variations(preset).items():
+            table(preset, key, values, options)
+
+
+if __name__ == "__main__":
+    main()
