@@ -17,7 +17,7 @@ from lavt.domain import FloatArray, Picture
 from lavt.streams import stream
 
 PERIOD_M = 32.0
-SCALES_M = (0.02, 0.08, 0.32)
+SCALES_M = (0.02, 0.04, 0.08, 0.16, 0.32)
 """Metres a texel, finest first."""
 
 Grey = NDArray[np.uint8]
