@@ -129,7 +129,7 @@ def camera_model(config: CameraConfig) -> CameraModel:
     """Geometry of the configured camera."""
     return CameraModel(
         config.width_px, config.height_px, math.radians(config.field_of_view_deg), config.x_m, config.z_m,
-        math.radians(config.pitch_deg),
+        math.radians(config.pitch_deg), config.y_m, math.radians(config.yaw_deg), math.radians(config.roll_deg),
     )  # fmt: skip
 
 
@@ -144,6 +144,9 @@ def build_simulator(config: ServerConfig) -> Plant:
         road=road,
         seed=config.seed,
         scenery=config.vehicle.scenery,
+        light=config.vehicle.light,
+        exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
     camera.prepare()
     stations_m = np.arange(0.0, road.length_m, ROUTE_STEP_M)

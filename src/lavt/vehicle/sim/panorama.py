@@ -77,7 +77,8 @@ def _away_from_sun(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatAr
 
 def _distant(colour: Colour, light: Light, haze: float) -> FloatArray:
     """Colour of something far away that was chosen for the noon light."""
-    return np.array(colour) * np.array(light.lit) * (1 - haze) + np.array(light.haze) * 0.85 * haze
+    near, far = np.array(colour) * np.array(light.lit), np.array(light.haze) * 0.85
+    return np.asarray(near * (1 - haze) + far * haze)
 
 
 def _add_sun(picture: FloatArray, away_rad: FloatArray) -> None:
