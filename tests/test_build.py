@@ -80,8 +80,10 @@ def test_addresses() -> None:
     ("vehicle", "controller", "said"),
     [
         ({"kind": "boat"}, {}, "'boat': the known kinds are simulator"),
-        ({"route": "z_key"}, {}, "'z_key'; known are: .*a_key"),
+        ({"route": "z_key"}, {}, "'z_key': name one.*a_key"),
         ({"route": "../a_key"}, {}, "no road"),
+        ({"route": "nowhere.yaml"}, {}, "nowhere.yaml cannot be read"),
+        ({"car": "boat"}, {}, "no car 'boat': the known ones are lincoln_mkz"),
         ({}, {"kind": "wizard"}, "'wizard'; choose one of lane_keeper"),
         ({}, {"preset": "magic"}, "'magic'; choose one of designed, paper_calibrated"),
     ],

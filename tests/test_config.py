@@ -29,11 +29,13 @@ from lavt.config import (
 )
 from lavt.control.limits import LIMITS
 from lavt.errors import UserError
+from lavt.experiment.plan import plan_sweep
 
 SCHEMAS: dict[str, type[Section]] = {
     "client.yaml": ClientConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
+    "paper.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
     "server.yaml": ServerConfig,
     "sweep.yaml": SweepConfig,
@@ -67,6 +69,15 @@ def test_demo_is_what_others_rely_on() -> None:
     demo = load_config(RunConfig, shipped("configs/demo.yaml"))
     assert (demo.vehicle.route, demo.controller.preset, demo.network.condition) == ("a_key", "paper_calibrated", "L0")
     assert (demo.safety.lateral_acceleration_mps2, demo.safety.picture_age_limit_ms) == (6.0, 2000.0)
+
+
+def test_the_paper_sweep_is_what_others_rely_on() -> None:
+    """The paper's campaign is six routes under six conditions, five times: 180 runs with the fitted gains."""
+    paper = load_config(SweepConfig, shipped("configs/paper.yaml"))
+    assert (paper.controller.preset, paper.network.inherent, paper.axes) == ("paper_calibrated", "paper_wifi5", {})
+    assert (paper.safety.lateral_acceleration_mps2, paper.safety.picture_age_limit_ms) == (6.0, 2000.0)
+    assert (paper.routes, paper.conditions) == (("a", "a_key", "b", "b_key", "c", "c_key"), tuple(PAPER))
+    assert len(plan_sweep(paper)) == 180
 
 
 PAPER = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}

@@ -36,6 +36,8 @@ from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.sim.camera import SimCamera
+from lavt.vehicle.sim.cars import named_car
+from lavt.vehicle.sim.dynamics import CarParameters
 from lavt.vehicle.sim.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
@@ -133,6 +135,18 @@ def camera_model(config: CameraConfig) -> CameraModel:
     )  # fmt: skip
 
 
+def car_of(config: VehicleConfig) -> CarParameters:
+    """Take the configured car with the configured lags; raises `UserError` naming the known cars."""
+    given = {
+        "steering_dead_time_s": config.steering_dead_time_ms,
+        "steering_lag_s": config.steering_lag_ms,
+        "pedal_dead_time_s": config.pedal_dead_time_ms,
+        "throttle_lag_s": config.throttle_lag_ms,
+        "brake_lag_s": config.brake_lag_ms,
+    }
+    return replace(named_car(config.car), **{name: each / 1000 for name, each in given.items() if each is not None})
+
+
 def build_simulator(config: ServerConfig) -> Plant:
     """Make the built-in simulator and its camera."""
     road = load_road(config.vehicle.route)
@@ -154,7 +168,14 @@ def build_simulator(config: ServerConfig) -> Plant:
     points = tuple(zip(x_m.tolist(), y_m.tolist(), strict=True))
     return Plant(
         camera,
-        lambda start: Simulator(road=road, seed=config.seed, start_mono_ns=start.mono_ns),
+        lambda start: Simulator(
+            road=road,
+            seed=config.seed,
+            start_mono_ns=start.mono_ns,
+            parameters=car_of(config.vehicle),
+            goes_on=config.vehicle.after_collision == "continue",
+            limit_s=config.vehicle.time_limit_s,
+        ),
         Route(config.vehicle.route, road.length_m, points),
     )
 
@@ -183,6 +204,7 @@ def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
     _vehicle(vehicle.kind)
     if vehicle.kind == "simulator":
         load_road(vehicle.route)
+        car_of(vehicle)
     make_controller(controller.kind, controller.preset, controller.wheelbase_m)
 
 
@@ -247,7 +269,13 @@ def build_server(
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in video.send_to],
         ),
-        ActuatorNode(vehicle, gate, start_ns=start.mono_ns, route=plant.route),
+        ActuatorNode(
+            vehicle,
+            gate,
+            start_ns=start.mono_ns,
+            route=plant.route,
+            after_collision=config.vehicle.after_collision,
+        ),
         ClockSyncNode(start.mono_ns),
     )
 

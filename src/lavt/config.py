@@ -28,13 +28,25 @@ class Section(BaseModel):
 
 
 class VehicleConfig(Section):
-    """Which vehicle, and what it drives."""
+    """Which vehicle, and what it drives; all but `kind` is the built-in simulator's."""
 
     kind: str = "simulator"
     route: str = "a_key"
+    """A road that comes with LAVT, or the path of a road's YAML file (`docs/roads.md`)."""
     scenery: Literal["full", "light", "none"] = "full"
     light: Literal["noon", "low_sun", "overcast"] = "noon"
     """The simulator's: where the sun stands and what the sky does, see `docs/camera.md`."""
+    car: str = "lincoln_mkz"
+    steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)
+    """From a command until the wheels begin to follow; like all lags here, the car's own where nothing is given."""
+    steering_lag_ms: float | None = Field(None, ge=0, le=2000)
+    pedal_dead_time_ms: float | None = Field(None, ge=0, le=2000)
+    throttle_lag_ms: float | None = Field(None, ge=0, le=5000)
+    brake_lag_ms: float | None = Field(None, ge=0, le=5000)
+    after_collision: Literal["end", "continue"] = "end"
+    """Whether a collision ends the drive, or the car slides along what it has hit and goes on."""
+    time_limit_s: float | None = Field(None, gt=0, le=86_400)
+    """Of a drive, from the first movement; where nothing is given, the route's time at 10 km/h and 30 s more."""
 
 
 class CameraConfig(Section):

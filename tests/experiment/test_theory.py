@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lavt.experiment.theory import (
     smallest_lookahead_s,
     spectral_radius,
 )
-from lavt.vehicle.sim.dynamics import CarParameters
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
 
 PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an independent computation of the same model
     (0.60, 0.15, 114),
@@ -30,13 +31,15 @@ PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an indepe
 @pytest.mark.parametrize(("lookahead_s", "steering_lag_s", "critical_ms"), PROTOTYPE_TABLE)
 def test_reproduces_the_prototype(lookahead_s: float, steering_lag_s: float, critical_ms: float) -> None:
     """The critical delays are those of an independent computation, within 3 ms."""
-    loop = LateralLoop(lookahead_s, car=CarParameters(steering_lag_s=steering_lag_s))
+    loop = LateralLoop(lookahead_s, car=replace(LINCOLN_MKZ, steering_lag_s=steering_lag_s))
     assert 1e3 * critical_delay_s(loop) == pytest.approx(critical_ms, abs=3)
 
 
 def test_without_lag_filter_and_hold_the_bound_is_the_textbook_one() -> None:
     """As lag, averaging, hold and tyres vanish, the critical delay becomes 0.5205 lookahead / speed."""
-    bare = LateralLoop(2.0, speed_mps=1.0, frame_rate_hz=100.0, smoothing=1.0, car=CarParameters(steering_lag_s=1e-3))
+    bare = LateralLoop(
+        2.0, speed_mps=1.0, frame_rate_hz=100.0, smoothing=1.0, car=replace(LINCOLN_MKZ, steering_lag_s=1e-3)
+    )
     bound_s = DELAY_PER_LOOKAHEAD * 2.0
     assert pytest.approx(0.52049, abs=1e-5) == DELAY_PER_LOOKAHEAD
     # 1 ms of lag, half a frame of hold and the 7 ms in which tyres relax at 1 m/s take their share.
@@ -81,8 +84,8 @@ def test_the_smallest_lookahead_leaves_just_the_margin() -> None:
         (LateralLoop(0.74, frame_rate_hz=15), LateralLoop(0.74, frame_rate_hz=60)),
         (LateralLoop(0.74, smoothing=0.3), LateralLoop(0.74, smoothing=1.0)),
         (
-            LateralLoop(0.74, car=CarParameters(steering_lag_s=0.2)),
-            LateralLoop(0.74, car=CarParameters(steering_lag_s=0.05)),
+            LateralLoop(0.74, car=replace(LINCOLN_MKZ, steering_lag_s=0.2)),
+            LateralLoop(0.74, car=replace(LINCOLN_MKZ, steering_lag_s=0.05)),
         ),
     ],
 )

@@ -27,6 +27,7 @@ from scipy.linalg import expm
 
 from lavt.domain import FloatArray
 from lavt.perception.lane_detector import SMOOTHING
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import CarParameters
 
 ComplexArray = NDArray[np.complex128]
@@ -36,7 +37,7 @@ DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(
 
 |L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase left there, atan(w / a), is acos(sqrt(2) - 1)."""
 
-DEFAULT_CAR = CarParameters()
+DEFAULT_CAR = LINCOLN_MKZ
 """The simulator's car; of its parameters the model takes those of the lateral motion at small slip."""
 
 _LONGEST_DELAY_S = 3.0  # past every delay that is of interest; the search ends there
@@ -68,14 +69,14 @@ def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
     angle.
     """
     car, speed = loop.car, loop.speed_mps
-    ahead, stiffness = car.front_axle_to_gravity_m, car.axle_stiffness_nprad
-    behind = car.wheelbase_m - ahead
+    ahead, behind = car.front_axle_to_gravity_m, car.wheelbase_m - car.front_axle_to_gravity_m
+    front, rear = car.front_stiffness_nprad, car.rear_stiffness_nprad
     mass, inertia = car.mass_kg, car.yaw_inertia_kgm2
-    coupling = stiffness * (behind - ahead)
+    coupling = rear * behind - front * ahead
     a = np.zeros((5, 5))
-    a[0] = [-2 * stiffness / (mass * speed), coupling / (mass * speed) - speed, 0, 0, stiffness / mass]
-    yaw_damping = stiffness * (ahead**2 + behind**2) / (inertia * speed)
-    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, stiffness * ahead / inertia]
+    a[0] = [-(front + rear) / (mass * speed), coupling / (mass * speed) - speed, 0, 0, front / mass]
+    yaw_damping = (front * ahead**2 + rear * behind**2) / (inertia * speed)
+    a[1] = [coupling / (inertia * speed), -yaw_damping, 0, 0, front * ahead / inertia]
     a[2] = [1, -behind, 0, speed, 0]
     a[3, 1] = 1
     a[4, 4] = -1 / car.steering_lag_s

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from lavt.control.safety import ACTIVE, SafetyGate, Verdict
 from lavt.domain import NS_PER_MS, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
@@ -24,7 +25,7 @@ ENDINGS: dict[str, Ending] = {
     "off_road": "off_road",
     "timeout": "timeout",
 }
-"""Events that end a drive."""
+"""Events that end a drive; a collision only where the vehicle does not go on after it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +56,22 @@ class ActuatorNode:
 
     name = "actuator"
 
-    def __init__(self, vehicle: Vehicle, gate: SafetyGate, *, start_ns: int, route: Route | None = None) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        gate: SafetyGate,
+        *,
+        start_ns: int,
+        route: Route | None = None,
+        after_collision: Literal["end", "continue"] = "end",
+    ) -> None:
         self._counts: Counter[str] = Counter()
         self.gate = gate
         self.vehicle = vehicle
         self._route = route
+        self._endings = {
+            kind: ending for kind, ending in ENDINGS.items() if (kind, after_collision) != ("collision", "continue")
+        }
         self._publish_ns = start_ns
         self._advanced_ns = start_ns
         self._ending: str | None = None
@@ -170,8 +182,8 @@ class ActuatorNode:
             sends.append(Send("pose", Pose(truth.mono_ns, truth.x_m, truth.y_m, truth.heading_rad)))
         for event in events:
             sends.append(Send("event", Event(event.mono_ns, event.kind, event.detail)))
-            if event.kind in ENDINGS:
-                sends += self._end(ENDINGS[event.kind], now)
+            if event.kind in self._endings:
+                sends += self._end(self._endings[event.kind], now)
         sends += self._changes(now)
         if now.mono_ns >= self._publish_ns:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)

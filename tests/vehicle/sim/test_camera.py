@@ -7,7 +7,7 @@ import pytest
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.ground import DASH_M, GAP_M
+from lavt.vehicle.sim.cross_section import DASH_M, GAP_M
 from lavt.vehicle.sim.pinhole import row_of_depth, view_from
 from lavt.vehicle.sim.renderer import SceneryKind
 from lavt.vehicle.sim.road import Road, load_road

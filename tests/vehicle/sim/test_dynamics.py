@@ -4,10 +4,11 @@ import math
 import pytest
 
 from lavt.domain import Actuation
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, Car, CarMotion, CarParameters
 
 STEP_S = 1 / 240
-CAR = CarParameters()
+CAR = LINCOLN_MKZ
 
 
 def car_at(speed_mps: float = 0.0, parameters: CarParameters = CAR) -> Car:
@@ -42,7 +43,7 @@ def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float) -> None
     cruise(car, speed_mps, steering_rad, 4.0)
     front_m = CAR.front_axle_to_gravity_m
     rear_m = CAR.wheelbase_m - front_m
-    understeer = CAR.mass_kg * (rear_m - front_m) / (CAR.axle_stiffness_nprad * CAR.wheelbase_m)
+    understeer = CAR.mass_kg * (rear_m - front_m) / (CAR.front_stiffness_nprad * CAR.wheelbase_m)
     theory = speed_mps * steering_rad / (CAR.wheelbase_m + understeer * speed_mps**2)
     assert car.motion.yaw_rate_radps == pytest.approx(theory, rel=0.01)
 
@@ -111,7 +112,7 @@ def test_steering_keeps_its_rate_and_its_limit() -> None:
 def test_pedals_follow_with_their_lag() -> None:
     """One lag after full throttle the pedal has made 63 % of it."""
     car = car_at()
-    drive(car, Actuation(0.0, 1.0, 0.0), CAR.pedal_lag_s)
+    drive(car, Actuation(0.0, 1.0, 0.0), CAR.throttle_lag_s)
     assert car.motion.throttle == pytest.approx(1 - math.exp(-1), rel=0.02)
 
 
@@ -121,7 +122,7 @@ def test_full_brake_stops_within_the_distance_of_theory() -> None:
     car = car_at(speed_mps)
     drive(car, Actuation(0.0, 0.0, 1.0), 3.0)
     braking = CAR.max_braking_mps2 + CAR.rolling_resistance_mps2
-    lag_s = CAR.pedal_lag_s
+    lag_s = CAR.brake_lag_s
     theory_m = speed_mps**2 / (2 * braking) + speed_mps * lag_s - braking * lag_s**2 / 2
     assert car.motion.speed_mps == 0.0
     assert car.motion.x_m == pytest.approx(theory_m, abs=0.1)

@@ -3,11 +3,12 @@ import math
 import pytest
 
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
-from lavt.vehicle.sim.dynamics import CarMotion, CarParameters
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.dynamics import CarMotion
 from lavt.vehicle.sim.judge import Judge
 from lavt.vehicle.sim.road import Road, load_road
 
-CAR = CarParameters()
+CAR = LINCOLN_MKZ
 SECOND_WITHOUT_RAIL_M = 40.0
 """Along the connecting road there is no rail to the right."""
 

@@ -18,6 +18,8 @@ _WORLD_SEED = 0
 _REPAIR_EVERY_M = 16.0
 _CRACK_EVERY_M = 7.0
 _SEAM_M = 0.03
+_PAVER_M = 3.5
+"""Asphalt is laid in widths of this much, with a seam between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +34,11 @@ class Damage:
 def damages(road: Road) -> list[Damage]:
     """All of one road, in the order of painting."""
     repairs, edges = _repairs(road)
-    lanes = [offset_m for strip in road.paved for offset_m in np.arange(strip.right_m + 3.5, strip.left_m - 1.0, 3.5)]
-    seams = [along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2) for offset_m in lanes]
+    seams = [
+        along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
+        for strip in road.paved
+        for offset_m in np.arange(strip.right_m + _PAVER_M, strip.left_m - 1.0, _PAVER_M)
+    ]
     return [
         *(Damage(join(found), 2.0, grey) for grey, found in repairs.items()),
         Damage(join(seams), _SEAM_M, 12),
@@ -51,8 +56,9 @@ def _repairs(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
     count = int((road.last_m - road.first_m) / _REPAIR_EVERY_M * len(road.paved))
     for _ in range(count):
         strip = road.paved[int(random.integers(len(road.paved)))]
-        begin_m = random.uniform(road.first_m, road.last_m)
-        end_m = min(begin_m + random.uniform(2.0, 16.0), road.last_m)
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        begin_m = random.uniform(first_m, last_m)
+        end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
         right_m = random.uniform(strip.right_m, strip.left_m - 2.0)
         left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
         found[sorted(found)[int(random.integers(len(found)))]].append(along(road, left_m, right_m, begin_m, end_m))
@@ -73,9 +79,10 @@ def _cracks(road: Road, name: str, width_m: float) -> Strips:
             ahead, left = random.uniform(0.15, 0.45, steps), random.normal(0.0, 0.10, steps)
         else:
             ahead, left = random.normal(0.0, 0.10, steps), random.uniform(0.15, 0.40, steps)
-        station = random.uniform(road.first_m, road.last_m) + np.cumsum(ahead)
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        station = random.uniform(first_m, last_m) + np.cumsum(ahead)
         offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
-        inside = (offset < strip.left_m) & (station < road.last_m)
+        inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
         if inside.sum() > 2:
             found.append(_line(road.across(station[inside], offset[inside]), width_m))
     return join(found)

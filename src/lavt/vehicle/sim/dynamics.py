@@ -15,36 +15,53 @@ from lavt.domain import Actuation
 GRAVITY_MPS2 = 9.81
 
 
+RAIL_FRICTION = 0.4
+"""Of a car's side on a guard rail or a concrete barrier: our estimate, between sheet on steel and on concrete."""
+
+
 @dataclass(frozen=True, slots=True)
 class CarParameters:
-    """A car of the class of a Lincoln MKZ.
+    """A car as numbers; `lavt.vehicle.sim.cars` has named ones, with where each number is from."""
 
-    Sizes, steering and pedals: ApolloAuto/apollo, modules/common/data/vehicle_param.pb.txt (LINCOLN_MKZ: steering
-    wheel to 8.203 rad at 8.552 rad/s, ratio 16). Mass and tyres: Apollo's lateral controller for the same car. Yaw
-    inertia, centre of gravity, friction, lags and resistance: our estimates for a car of this class.
-    """
-
-    wheelbase_m: float = 2.8448
-    rear_axle_to_front_m: float = 3.89
-    rear_axle_to_rear_m: float = 1.043
-    body_width_m: float = 1.86
+    wheelbase_m: float
+    rear_axle_to_front_m: float
+    rear_axle_to_rear_m: float
+    body_width_m: float
     """Without mirrors."""
-    front_axle_to_gravity_m: float = 1.40
-    mass_kg: float = 2080.0
-    yaw_inertia_kgm2: float = 3300.0
-    axle_stiffness_nprad: float = 155_495.0
-    """Side force of an axle for each radian of slip, front as rear."""
-    friction: float = 0.9
-    max_steering_rad: float = 0.513
-    max_steering_rate_radps: float = 0.534
-    steering_lag_s: float = 0.12
-    pedal_lag_s: float = 0.2
-    max_acceleration_mps2: float = 2.0
-    max_braking_mps2: float = 6.0
-    rolling_resistance_mps2: float = 0.1
-    drag_per_m: float = 0.0002
-    """Deceleration by air for each (m/s) squared: half of 1.2 kg/m3 x 0.3 x 2.3 m2 over the mass."""
-    kinematic_below_mps: float = 3.0
+    front_axle_to_gravity_m: float
+    mass_kg: float
+    yaw_inertia_kgm2: float
+    front_stiffness_nprad: float
+    rear_stiffness_nprad: float
+    """Side force of an axle for each radian of slip."""
+    friction: float
+    max_steering_rad: float
+    max_steering_rate_radps: float
+    steering_dead_time_s: float
+    """From a command until the wheels begin to follow it."""
+    steering_lag_s: float
+    """Time constant with which they follow."""
+    pedal_dead_time_s: float
+    throttle_lag_s: float
+    brake_lag_s: float
+    max_acceleration_mps2: float
+    max_braking_mps2: float
+    rolling_resistance_mps2: float
+    drag_per_m: float
+    """Deceleration by air for each (m/s) squared."""
+    kinematic_below_mps: float
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A point of the body that has got into something that does not give way."""
+
+    ahead_m: float
+    left_m: float
+    """Of the rear axle, in the car's frame."""
+    depth_m: float
+    out_rad: float
+    """Direction back out, in the world's frame."""
 
 
 @dataclass(slots=True)
@@ -74,10 +91,12 @@ class Car:
         weight_n = parameters.mass_kg * GRAVITY_MPS2 / parameters.wheelbase_m
         self._front_grip_n = parameters.friction * weight_n * self._to_rear_m
         self._rear_grip_n = parameters.friction * weight_n * parameters.front_axle_to_gravity_m
-        self._pedal_share = 1.0 - math.exp(-step_s / parameters.pedal_lag_s)
-        self._steering_share = 1.0 - math.exp(-step_s / parameters.steering_lag_s)
+        self._throttle_share = _share(step_s, parameters.throttle_lag_s)
+        self._brake_share = _share(step_s, parameters.brake_lag_s)
+        self._steering_share = _share(step_s, parameters.steering_lag_s)
         # At the speed where the models meet, tyres take the car to rolling without slip with this rate (1/s).
-        settling = 2 * parameters.axle_stiffness_nprad / (parameters.mass_kg * parameters.kinematic_below_mps)
+        stiffness = parameters.front_stiffness_nprad + parameters.rear_stiffness_nprad
+        settling = stiffness / (parameters.mass_kg * parameters.kinematic_below_mps)
         self._rolling_share = 1.0 - math.exp(-step_s * settling)
 
     def step(self, wanted: Actuation) -> None:
@@ -106,10 +125,45 @@ class Car:
         motion = self.motion
         motion.speed_mps = motion.side_speed_mps = motion.yaw_rate_radps = 0.0
 
+    def slide(self, contact: Contact) -> None:
+        """Put the car out of what it has got into, and take away its motion into it, with friction along it.
+
+        An inelastic impulse on a rigid body at the point of contact, in the plane; friction is Coulomb's.
+        """
+        motion, parameters = self.motion, self.parameters
+        motion.x_m += contact.depth_m * math.cos(contact.out_rad)
+        motion.y_m += contact.depth_m * math.sin(contact.out_rad)
+        ahead_m, left_m = contact.ahead_m - self._to_rear_m, contact.left_m  # of the centre of gravity
+        out_rad = contact.out_rad - motion.heading_rad
+        out = (math.cos(out_rad), math.sin(out_rad))
+        along = (-out[1], out[0])
+        inward_mps = -self._speed_at(ahead_m, left_m, out)
+        if inward_mps <= 0.0:
+            return
+        push = inward_mps / self._give(ahead_m, left_m, out)
+        hold = -self._speed_at(ahead_m, left_m, along) / self._give(ahead_m, left_m, along)
+        hold = min(max(hold, -RAIL_FRICTION * push), RAIL_FRICTION * push)
+        forward, sideways = push * out[0] + hold * along[0], push * out[1] + hold * along[1]
+        motion.speed_mps = max(0.0, motion.speed_mps + forward / parameters.mass_kg)
+        motion.side_speed_mps += sideways / parameters.mass_kg
+        motion.yaw_rate_radps += (ahead_m * sideways - left_m * forward) / parameters.yaw_inertia_kgm2
+
+    def _speed_at(self, ahead_m: float, left_m: float, direction: tuple[float, float]) -> float:
+        """Speed, in a direction of the car's frame, of a point of the body given from its centre of gravity."""
+        motion = self.motion
+        forward_mps = motion.speed_mps - motion.yaw_rate_radps * left_m
+        sideways_mps = motion.side_speed_mps + motion.yaw_rate_radps * ahead_m
+        return forward_mps * direction[0] + sideways_mps * direction[1]
+
+    def _give(self, ahead_m: float, left_m: float, direction: tuple[float, float]) -> float:
+        """Change of speed of that point for each newton second in the direction (1/kg)."""
+        lever_m = ahead_m * direction[1] - left_m * direction[0]
+        return 1.0 / self.parameters.mass_kg + lever_m * lever_m / self.parameters.yaw_inertia_kgm2
+
     def _follow(self, wanted: Actuation) -> None:
         parameters, motion = self.parameters, self.motion
-        motion.throttle += (min(max(wanted.throttle, 0.0), 1.0) - motion.throttle) * self._pedal_share
-        motion.brake += (min(max(wanted.brake, 0.0), 1.0) - motion.brake) * self._pedal_share
+        motion.throttle += (min(max(wanted.throttle, 0.0), 1.0) - motion.throttle) * self._throttle_share
+        motion.brake += (min(max(wanted.brake, 0.0), 1.0) - motion.brake) * self._brake_share
         target_rad = min(max(wanted.steering_rad, -parameters.max_steering_rad), parameters.max_steering_rad)
         furthest_rad = parameters.max_steering_rate_radps * self._step_s
         change_rad = (target_rad - motion.steering_rad) * self._steering_share
@@ -127,13 +181,12 @@ class Car:
     def _tyre_accelerations(self) -> tuple[float, float, float]:
         """Sideways and yaw acceleration by the tyres' side forces, and how much the turned front tyres slow the car."""
         parameters, motion = self.parameters, self.motion
-        stiffness = parameters.axle_stiffness_nprad
         front_speed = motion.side_speed_mps + parameters.front_axle_to_gravity_m * motion.yaw_rate_radps
         rear_speed = motion.side_speed_mps - self._to_rear_m * motion.yaw_rate_radps
         front_slip = motion.steering_rad - math.atan2(front_speed, motion.speed_mps)
         rear_slip = -math.atan2(rear_speed, motion.speed_mps)
-        front_n = self._front_grip_n * math.tanh(stiffness * front_slip / self._front_grip_n)
-        rear_n = self._rear_grip_n * math.tanh(stiffness * rear_slip / self._rear_grip_n)
+        front_n = self._front_grip_n * math.tanh(parameters.front_stiffness_nprad * front_slip / self._front_grip_n)
+        rear_n = self._rear_grip_n * math.tanh(parameters.rear_stiffness_nprad * rear_slip / self._rear_grip_n)
         across_n = front_n * math.cos(motion.steering_rad)
         turning_nm = parameters.front_axle_to_gravity_m * across_n - self._to_rear_m * rear_n
         return (
@@ -151,3 +204,8 @@ class Car:
         motion.x_m += (motion.speed_mps * cosine - rear_side_mps * sine) * step_s
         motion.y_m += (motion.speed_mps * sine + rear_side_mps * cosine) * step_s
         motion.heading_rad += motion.yaw_rate_radps * step_s
+
+
+def _share(step_s: float, lag_s: float) -> float:
+    """Share of the way to its target that a first-order lag goes in a step; all of it without a lag."""
+    return 1.0 - math.exp(-step_s / lag_s) if lag_s > 0.0 else 1.0

@@ -22,9 +22,6 @@ from lavt.vehicle.sim.textures import SCALES_M, all_textures
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """Edge of a tile at each scale."""
 
-DASH_M, GAP_M = 3.0, 6.0
-"""Broken marks; the map does not say how long they are, so this is our choice."""
-
 _MARK_M = 0.125
 _KEPT_TILES = (40, 60, 160, 400, 400)
 """The two finest scales are painted on the way, a few tiles at a time; the others are kept for a whole road."""
@@ -43,8 +40,15 @@ class Ground:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
         self._lit, self._dimmed = _tables(light)
         self._shadows = shadows
-        self._gravel = join([along(road, strip.left_m + _GRAVEL_M, strip.right_m - _GRAVEL_M) for strip in road.paved])
-        self._asphalt = join([along(road, strip.left_m, strip.right_m) for strip in road.paved])
+        self._gravel, self._asphalt = (
+            join(
+                [
+                    along(road, each.left_m + wide_m, each.right_m - wide_m, each.from_m, each.to_m)
+                    for each in road.paved
+                ]
+            )
+            for wide_m in (_GRAVEL_M, 0.0)
+        )
         self._tracks = _tracks(road)
         self._damages = damages(road)
         self._marks = {colour: _marks(road, colour) for colour in _PAINT}
@@ -165,13 +169,10 @@ def _marks(road: Road, colour: str) -> Strips:
         if mark.kind == "solid":
             found.append(along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
-        first_m, last_m = max(mark.from_m, road.first_m), min(mark.to_m, road.last_m)
-        period_m = DASH_M + GAP_M
-        begin = np.arange(np.floor(first_m / period_m), np.ceil(last_m / period_m)) * period_m
-        begin = begin[(begin >= first_m) & (begin + DASH_M <= last_m)]
+        begin = mark.dashes_m(road.first_m, road.last_m)
         # Two halves a dash, so that it bends with the road.
-        halves = np.concatenate([begin, begin + DASH_M / 2])
-        found.append(pieces(road, left_m, right_m, halves, halves + DASH_M / 2 + OVERLAP_M))
+        halves = np.concatenate([begin, begin + mark.dash_m / 2])
+        found.append(pieces(road, left_m, right_m, halves, halves + mark.dash_m / 2 + OVERLAP_M))
     return join(found)
 
 

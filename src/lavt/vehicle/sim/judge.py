@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
-from lavt.vehicle.sim.dynamics import CarMotion, CarParameters
+from lavt.vehicle.sim.cross_section import Rail
+from lavt.vehicle.sim.dynamics import CarMotion, CarParameters, Contact
 from lavt.vehicle.sim.road import Road
 
 REFERENCE_SPEED_MPS = 30.0 / 3.6
@@ -18,8 +21,11 @@ TIMEOUT_ALLOWANCE_S = 30.0
 MOVING_MPS = 0.1
 """The time of a drive counts from when the car is first faster than this."""
 
+CONTACT_GAP_NS = NS_PER_S // 2
+"""A car that has been clear of all rails for so long and touches one again has another collision."""
 
-Points = tuple[tuple[float, float], ...]
+Place = tuple[float, float, float]
+"""Station (m), lateral offset (m) and the road's heading (rad) of a point of the body."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,23 +37,29 @@ class Track:
     progress_m: float
 
 
-class Judge:
-    """Judges one drive; each ending happens once, lanes are left as often as they are."""
+def time_limit_s(length_m: float) -> float:
+    """Time that a drive of a route may take where nobody says otherwise."""
+    return length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
 
-    def __init__(self, road: Road, parameters: CarParameters, near_s_m: float) -> None:
+
+class Judge:
+    """Judges one drive; each ending happens once, lanes are left and rails are touched as often as they are."""
+
+    def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
         self._road = road
         half_m = parameters.body_width_m / 2
         front_m, rear_m = parameters.rear_axle_to_front_m, -parameters.rear_axle_to_rear_m
-        self._left_corners = ((front_m, half_m), (rear_m, half_m))
-        self._right_corners = ((front_m, -half_m), (rear_m, -half_m))
-        self._middle = (((front_m + rear_m) / 2, 0.0),)
-        self._paved_left_m, self._paved_right_m = _carriageway(road)
-        limit_s = road.length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
-        self._limit_ns = round(limit_s * NS_PER_S)
+        self._corners = tuple(itertools.product((front_m, rear_m), (half_m, -half_m)))
+        self._middle = ((front_m + rear_m) / 2, 0.0)
+        self._limit_ns = round((time_limit_s(road.length_m) if limit_s is None else limit_s) * NS_PER_S)
         self._began_ns: int | None = None
         self._lanes: tuple[int, int] | None = None
         self._happened: set[EventKind] = set()
         self._near_s_m = near_s_m
+        self._touched_ns: int | None = None
+        self._quiet = _Quiet(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
+        self.contacts: tuple[Contact, ...] = ()
+        """Where the body touches a rail at the moment judged last."""
 
     def track(self, motion: CarMotion) -> Track:
         """Measure the rear axle against the centre of the lane."""
@@ -56,22 +68,31 @@ class Judge:
 
     def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Tell what has happened since the last call; call it at every step."""
-        progress_m, _, _ = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
+        events = [] if self._quiet.holds(motion) else self._look(motion, at_ns)
+        if self._began_ns is None:
+            if motion.speed_mps > MOVING_MPS:
+                self._began_ns = at_ns
+        elif at_ns - self._began_ns > self._limit_ns:
+            events += self._once("timeout", f"{self._limit_ns / NS_PER_S:.0f} s were not enough", at_ns)
+        return events
+
+    def _look(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
+        """Find out where the whole body is, and what that means."""
+        progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         self._near_s_m = progress_m
-        left = self._places(motion, self._left_corners)
-        right = self._places(motion, self._right_corners)
-        events = self._lane_events(max(lateral for _, lateral in left), min(lateral for _, lateral in right), at_ns)
-        hit = self._rail_hit(left + right)
+        *corners, middle = self._places(motion, (*self._corners, self._middle))
+        offsets_m = [place[1] for place in corners]
+        events = self._lane_events(max(offsets_m), min(offsets_m), at_ns)
+        self.contacts, hit = self._contacts(corners)
         if hit is not None:
-            events += self._once("collision", f"the {hit} was reached at {progress_m:.1f} m", at_ns)
-        if hit is None and not self._on_asphalt(*self._places(motion, self._middle)[0]):
+            if self._touched_ns is None or at_ns - self._touched_ns > CONTACT_GAP_NS:
+                events.append(VehicleEvent(at_ns, "collision", f"the {hit.kind} was reached at {progress_m:.1f} m"))
+            self._touched_ns = at_ns
+        elif not self._on_asphalt(middle):
             events += self._once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
         if progress_m >= self._road.length_m:
             events += self._once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
-        if self._began_ns is None and motion.speed_mps > MOVING_MPS:
-            self._began_ns = at_ns
-        if self._began_ns is not None and at_ns - self._began_ns > self._limit_ns:
-            events += self._once("timeout", f"{self._limit_ns / NS_PER_S:.0f} s were not enough", at_ns)
+        self._quiet.begin(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
         return events
 
     def _once(self, kind: EventKind, detail: str, at_ns: int) -> list[VehicleEvent]:
@@ -80,19 +101,22 @@ class Judge:
         self._happened.add(kind)
         return [VehicleEvent(at_ns, kind, detail)]
 
-    def _places(self, motion: CarMotion, points: Points) -> Points:
-        """Stations and lateral offsets of points of the body, given ahead and to the left of the rear axle."""
+    def _places(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[Place]:
+        """Places of points of the body that are given ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
         project, near_s_m = self._road.project, self._near_s_m
-        return tuple(
-            project(motion.x_m + ahead * cosine - left * sine, motion.y_m + ahead * sine + left * cosine, near_s_m)[:2]
+        return [
+            project(motion.x_m + ahead * cosine - left * sine, motion.y_m + ahead * sine + left * cosine, near_s_m)
             for ahead, left in points
-        )
+        ]
 
     def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
-        """Make an event for each edge of the body that is in another lane than before; lanes count from the right."""
+        """Make an event for each edge of the body that is in another lane than before; lanes count from the right.
+
+        An edge that is exactly on a line is still in the body's lane.
+        """
         edges_m = self._road.lanes.edges_m
-        lanes = (bisect_left(edges_m, left_m), bisect_left(edges_m, right_m))
+        lanes = (bisect_left(edges_m, left_m), bisect_right(edges_m, right_m))
         before, self._lanes = self._lanes, lanes
         if before is None:
             return []
@@ -102,24 +126,67 @@ class Judge:
             if old != new
         ]
 
-    def _rail_hit(self, corners: Points) -> str | None:
+    def _contacts(self, corners: Sequence[Place]) -> tuple[tuple[Contact, ...], Rail | None]:
+        """Find the corners that are in a rail, and the rail; a body that is wholly behind a rail does not touch it."""
+        found, hit = [], None
         for rail in self._road.rails:
             side = math.copysign(1.0, rail.offset_m)
-            for s_m, lateral_m in corners:
-                if rail.from_m <= s_m <= rail.to_m and side * (lateral_m - rail.offset_m) >= 0:
-                    return rail.kind
-        return None
+            depths_m = [side * (lateral_m - rail.offset_m) for _, lateral_m, _ in corners]
+            if max(depths_m) < 0.0 or min(depths_m) >= 0.0:
+                continue
+            for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
+                if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
+                    found.append(Contact(ahead_m, left_m, depth_m, heading_rad - side * math.pi / 2))
+                    hit = hit or rail
+        return tuple(found), hit
 
-    def _on_asphalt(self, s_m: float, lateral_m: float) -> bool:
-        """Whether the place is on the driven carriageway, or a rail stands between it and the rest."""
-        if self._paved_right_m <= lateral_m <= self._paved_left_m:
-            return True
-        return any(rail.offset_m * lateral_m > 0 and rail.from_m <= s_m <= rail.to_m for rail in self._road.rails)
+    def _on_asphalt(self, place: Place) -> bool:
+        s_m, lateral_m, _ = place
+        return any(
+            strip.right_m <= lateral_m <= strip.left_m and strip.from_m <= s_m <= strip.to_m
+            for strip in self._road.paved
+        )
 
 
-def _carriageway(road: Road) -> tuple[float, float]:
-    """Find the left and right limit of the strip of asphalt in which the driven lane lies."""
-    for strip in road.paved:
-        if strip.right_m < 0.0 < strip.left_m:
-            return strip.left_m, strip.right_m
-    raise ValueError(f"the driven lane of {road.title!r} lies on no asphalt")
+class _Quiet:
+    """Knows for how far nothing can happen: until a point of the body may have reached the nearest line that counts.
+
+    Lines that count are edges of lanes and of asphalt, rails, the stations where these begin and end, and the end of
+    the route. A point's lateral offset changes by no more than the point moves, its station by no more than that over
+    `_slowest`: on the inside of a curve stations are closer together than metres.
+    """
+
+    def __init__(self, road: Road, reach_m: float) -> None:
+        self._reach_m = reach_m
+        across = [road.lanes.edges_m, *((strip.left_m, strip.right_m) for strip in road.paved)]
+        self._offsets_m = sorted({*itertools.chain(*across), *(rail.offset_m for rail in road.rails)})
+        ends = [(strip.from_m, strip.to_m) for strip in road.paved] + [(rail.from_m, rail.to_m) for rail in road.rails]
+        self._stations_m = sorted({road.length_m, *(each for each in itertools.chain(*ends) if math.isfinite(each))})
+        widest_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + reach_m
+        tightest = max(max(abs(each.curvature_per_m), abs(each.end_curvature_per_m)) for each in road.segments)
+        self._slowest = 1.0 - tightest * widest_m
+        self._from = (math.inf, math.inf, 0.0)
+        self._room_m = 0.0
+
+    def begin(self, motion: CarMotion, places: Iterable[Place]) -> None:
+        """Note where the body was looked at, and how far it is from what counts."""
+        self._from = (motion.x_m, motion.y_m, motion.heading_rad)
+        if self._slowest <= 0.0:
+            return  # a road for which this reckoning does not hold is looked at every time
+        self._room_m = min(
+            min(_distance_m(self._offsets_m, lateral_m), _distance_m(self._stations_m, s_m) * self._slowest)
+            for s_m, lateral_m, _ in places
+        )
+
+    def holds(self, motion: CarMotion) -> bool:
+        """Whether no point of the body can have reached a line since it was looked at."""
+        x_m, y_m, heading_rad = self._from
+        moved_m = math.hypot(motion.x_m - x_m, motion.y_m - y_m)
+        return moved_m + self._reach_m * abs(motion.heading_rad - heading_rad) < self._room_m
+
+
+def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
+    """Distance from a coordinate to the nearest of sorted lines."""
+    index = bisect_left(lines_m, at_m)
+    above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
+    return min(above_m, at_m - lines_m[index - 1]) if index else above_m

@@ -7,6 +7,7 @@ from collections import deque
 
 from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
 from lavt.streams import stream
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import Car, CarMotion, CarParameters
 from lavt.vehicle.sim.judge import Judge
 from lavt.vehicle.sim.road import Road
@@ -32,22 +33,32 @@ class Simulator:
 
     Its time is a grid of 1/240 s on the monotonic clock. It begins at the first point at or after `start_mono_ns`;
     `advance` takes every step up to the time given, however late it is called. After a collision the car stays where
-    it is.
+    it is or, with `goes_on`, slides along what it has hit.
     """
 
-    def __init__(self, *, road: Road, seed: int, start_mono_ns: int, parameters: CarParameters | None = None) -> None:
-        self._parameters = parameters or CarParameters()
+    def __init__(
+        self,
+        *,
+        road: Road,
+        seed: int,
+        start_mono_ns: int,
+        parameters: CarParameters = LINCOLN_MKZ,
+        goes_on: bool = False,
+        limit_s: float | None = None,
+    ) -> None:
+        self._parameters, self._goes_on = parameters, goes_on
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
         ahead_m = float(stream(seed, "start position").uniform(0.0, START_AHEAD_M))
         lateral_m = float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M))
         turned_rad = float(stream(seed, "start heading").uniform(-START_HEADING_RAD, START_HEADING_RAD))
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
-        self._car = Car(self._parameters, motion, 1.0 / STEPS_PER_S)
-        self._judge = Judge(road, self._parameters, near_s_m=ahead_m)
+        self._car = Car(parameters, motion, 1.0 / STEPS_PER_S)
+        self._judge = Judge(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
         self._judge.judge(motion, grid_ns(self._index))
         self._actuation = AT_REST
-        self._pending: deque[tuple[int, Actuation]] = deque()
+        self._steering: deque[tuple[int, float]] = deque()
+        self._pedals: deque[tuple[int, float, float]] = deque()
         self._wrecked = False
 
     @property
@@ -70,23 +81,41 @@ class Simulator:
         """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
         events: list[VehicleEvent] = []
         while self.next_wake_ns() <= to_ns:
-            begin_ns = grid_ns(self._index)
-            while self._pending and self._pending[0][0] <= begin_ns:
-                self._actuation = self._pending.popleft()[1]
+            self._obey(grid_ns(self._index))
             self._index += 1
             if self._wrecked:
                 continue
             self._car.step(self._actuation)
             happened = self._judge.judge(self._car.motion, grid_ns(self._index))
-            if any(event.kind == "collision" for event in happened):
+            if self._goes_on:
+                for contact in self._judge.contacts:
+                    self._car.slide(contact)
+            elif any(event.kind == "collision" for event in happened):
                 self._wrecked = True
                 self._car.stop_dead()
             events += happened
         return events
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Obey `actuation` from the first point of the grid at or after `now_ns`; call with growing times."""
-        self._pending.append((now_ns, actuation))
+        """Obey `actuation` from the first point of the grid at or after `now_ns` and the dead times.
+
+        Call it with growing times.
+        """
+        steering_ns = now_ns + round(self._parameters.steering_dead_time_s * NS_PER_S)
+        pedals_ns = now_ns + round(self._parameters.pedal_dead_time_s * NS_PER_S)
+        self._steering.append((steering_ns, actuation.steering_rad))
+        self._pedals.append((pedals_ns, actuation.throttle, actuation.brake))
+
+    def _obey(self, at_ns: int) -> None:
+        """Take over what has become due."""
+        steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
+        due = False
+        while self._steering and self._steering[0][0] <= at_ns:
+            due, (_, steering_rad) = True, self._steering.popleft()
+        while self._pedals and self._pedals[0][0] <= at_ns:
+            due, (_, throttle, brake) = True, self._pedals.popleft()
+        if due:
+            self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
         """Tell speed and road wheel angle at the newest point of the grid."""

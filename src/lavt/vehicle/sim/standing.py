@@ -13,7 +13,8 @@ import numpy as np
 
 from lavt.domain import FloatArray
 from lavt.streams import stream
-from lavt.vehicle.sim.road import Rail, Road
+from lavt.vehicle.sim.cross_section import Rail
+from lavt.vehicle.sim.road import Road
 from lavt.vehicle.sim.sprites import TREE_KINDS
 
 FAR_M = 160.0

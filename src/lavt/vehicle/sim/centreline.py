@@ -1,0 +1,219 @@
+"""The line a road follows: straight pieces, arcs and clothoids, one after the other, without a kink.
+
+A station `s_m` is a distance along the line. Positions of lines and arcs are in closed form; a clothoid's are
+integrated with Gauss and Legendre's rule over pieces that turn by at most a radian, which is exact to a nanometre.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lavt.domain import FloatArray
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+_SHARES_ARRAY = (_NODES + 1) / 2
+_SHARES = tuple(zip(((_NODES + 1) / 2).tolist(), (_WEIGHTS / 2).tolist(), strict=True))
+_TURN_RAD = 1.0
+"""A clothoid is cut where it has turned by this much, so that the rule above holds for each piece."""
+
+_STRAIGHT_PER_M = 1e-12
+"""Less is taken as straight: over 20 km it makes 0.2 mm, and its inverse is no number to count with."""
+
+_FOOT_M = 1e-9
+_FOOT_STEPS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A piece whose curvature (left positive) is linear in the arc length: a line, an arc or a clothoid."""
+
+    length_m: float
+    curvature_per_m: float
+    end_curvature_per_m: float
+
+    def cut(self) -> list[Segment]:
+        """Cut a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
+        if self.end_curvature_per_m == self.curvature_per_m:
+            return [self]
+        highest = max(abs(self.curvature_per_m), abs(self.end_curvature_per_m))
+        count = max(1, math.ceil(self.length_m * highest / _TURN_RAD))
+        bends = np.linspace(self.curvature_per_m, self.end_curvature_per_m, count + 1).tolist()
+        return [Segment(self.length_m / count, *each) for each in itertools.pairwise(bends)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """A segment in its place: first station, x, y, heading and curvature there, and the curvature's rate (1/m2)."""
+
+    s_m: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    curvature_per_m: float
+    rate_per_m2: float
+
+    def turn_rad(self, along_m: float) -> float:
+        """How far the line has turned `along_m` into the piece."""
+        return along_m * (self.curvature_per_m + self.rate_per_m2 * along_m / 2)
+
+    def reached(self, along_m: float) -> tuple[float, float]:
+        """Place `along_m` into the piece, ahead and to the left of its beginning."""
+        if self.rate_per_m2 == 0.0:
+            half_rad = self.curvature_per_m * along_m / 2
+            chord_m = along_m if abs(half_rad) < 1e-9 else along_m * math.sin(half_rad) / half_rad
+            return chord_m * math.cos(half_rad), chord_m * math.sin(half_rad)
+        ahead_m = left_m = 0.0
+        for share, weight in _SHARES:
+            turn_rad = self.turn_rad(share * along_m)
+            ahead_m += weight * math.cos(turn_rad)
+            left_m += weight * math.sin(turn_rad)
+        return ahead_m * along_m, left_m * along_m
+
+
+_Searched = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
+
+
+class Centreline:
+    """Segments laid end to end from a pose on; beyond both ends it goes straight on."""
+
+    def __init__(self, first_m: float, pose: tuple[float, float, float], segments: Sequence[Segment]) -> None:
+        x_m, y_m, heading_rad = pose
+        self._pieces: list[_Piece] = []
+        s_m = first_m
+        # The straight pieces before and beyond are pieces like others; only where they begin and end is not known.
+        before = Segment(0.0, 0.0, 0.0)
+        for segment in (before, *(part for each in segments for part in each.cut()), before):
+            length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
+            if abs(curvature_per_m) < _STRAIGHT_PER_M:
+                curvature_per_m = 0.0
+            rate = (segment.end_curvature_per_m - curvature_per_m) / length_m if length_m else 0.0
+            piece = _Piece(s_m, x_m, y_m, heading_rad, curvature_per_m, rate)
+            self._pieces.append(piece)
+            ahead_m, left_m = _turned(*piece.reached(length_m), -heading_rad)
+            s_m += length_m
+            x_m += ahead_m
+            y_m += left_m
+            heading_rad += piece.turn_rad(length_m)
+        self.last_m = s_m
+        self._begins = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
+
+    def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Tell x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, any shape."""
+        station = np.asarray(s_m, dtype=np.float64)
+        table = self._table
+        piece = table[np.searchsorted(np.array(self._begins), station, side="right") - 1]
+        begin_m, x0_m, y0_m, heading0_rad, curvature0, rate = (piece[..., column] for column in range(6))
+        along = station - begin_m
+        half_turn = curvature0 * along / 2
+        chord = along * np.sinc(half_turn / np.pi)
+        ahead, left = chord * np.cos(half_turn), chord * np.sin(half_turn)
+        bent = rate != 0.0
+        if bent.any():
+            inner = along[..., None] * _SHARES_ARRAY
+            turn = inner * (curvature0[..., None] + rate[..., None] * inner / 2)
+            ahead = np.where(bent, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
+            left = np.where(bent, np.sin(turn) @ _WEIGHTS / 2 * along, left)
+        cosine, sine = np.cos(heading0_rad), np.sin(heading0_rad)
+        return (
+            x0_m + ahead * cosine - left * sine,
+            y0_m + ahead * sine + left * cosine,
+            heading0_rad + along * (curvature0 + rate * along / 2),
+            curvature0 + rate * along,
+        )
+
+    def project(self, x_m: float, y_m: float, first_m: float, last_m: float) -> tuple[float, float, float, float]:
+        """Find the point nearest to a place among the stations from `first_m` to `last_m`.
+
+        Returns its station (m), the place's lateral offset (m, left positive), and heading (rad) and curvature (1/m)
+        of the line at the point.
+        """
+        best = (first_m, math.inf, 0.0, 0.0)
+        best_m = math.inf
+        for index in range(bisect_right(self._begins, first_m) - 1, len(self._searched)):
+            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = self._searched[index]
+            if begin_m > last_m:
+                break
+            low_m, high_m = max(begin_m, first_m) - s_m, min(end_m, last_m) - s_m
+            dx_m, dy_m = x_m - x0_m, y_m - y0_m
+            ahead_m, left_m = dx_m * cosine + dy_m * sine, dy_m * cosine - dx_m * sine
+            turn_rad = 0.0
+            if piece is not None:
+                along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
+                reached_m, turn_rad = piece.reached(along_m), piece.turn_rad(along_m)
+                ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                curvature_per_m += piece.rate_per_m2 * along_m
+            elif curvature_per_m == 0.0:
+                along_m = min(max(ahead_m, low_m), high_m)
+                ahead_m -= along_m
+            else:
+                along_m = _arc_foot_m(ahead_m, left_m, curvature_per_m, (low_m + high_m) / 2)
+                along_m = min(max(along_m, low_m), high_m)
+                turn_rad = curvature_per_m * along_m
+                turned_cosine, turned_sine = math.cos(turn_rad), math.sin(turn_rad)
+                ahead_m -= turned_sine / curvature_per_m
+                left_m -= (1.0 - turned_cosine) / curvature_per_m
+                ahead_m, left_m = (
+                    ahead_m * turned_cosine + left_m * turned_sine, left_m * turned_cosine - ahead_m * turned_sine
+                )  # fmt: skip
+            distance_m = math.hypot(ahead_m, left_m)
+            if distance_m < best_m:
+                best_m = distance_m
+                best = (s_m + along_m, left_m, heading_rad + turn_rad, curvature_per_m)
+        return best
+
+    @cached_property
+    def _searched(self) -> list[_Searched]:
+        """For each piece what a projection needs, as plain numbers; the piece itself where it is a clothoid."""
+        found: list[_Searched] = []
+        for begin_m, end_m, each in zip(self._begins, [*self._begins[1:], math.inf], self._pieces, strict=True):
+            place = (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m)
+            bent = each if each.rate_per_m2 else None
+            found.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), bent))
+        return found
+
+    @cached_property
+    def _table(self) -> FloatArray:
+        return np.array(
+            [
+                (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m, each.rate_per_m2)
+                for each in self._pieces
+            ]
+        )
+
+
+def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: float) -> float:
+    """Arc length to the foot of a point given in the frame of a clothoid's beginning, from `low_m` to `high_m`."""
+    along_m = (low_m + high_m) / 2
+    for _ in range(_FOOT_STEPS):
+        # The foot on the circle that fits the clothoid where we are; its error shrinks with the step's cube.
+        reached_m = piece.reached(along_m)
+        beside = _turned(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
+        step_m = _arc_foot_m(*beside, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
+        before_m, along_m = along_m, min(max(along_m + step_m, low_m), high_m)
+        if abs(along_m - before_m) < _FOOT_M:
+            break
+    return along_m
+
+
+def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m: float) -> float:
+    """Arc length to the foot of a point given in the frame of an arc's beginning; of all turns that at `middle_m`."""
+    if abs(curvature_per_m) < _STRAIGHT_PER_M:
+        return ahead_m
+    sign = math.copysign(1.0, curvature_per_m)
+    turn_rad = math.atan2(sign * ahead_m, sign * (1.0 / curvature_per_m - left_m))
+    middle_rad = curvature_per_m * middle_m
+    return (middle_rad + math.remainder(turn_rad - middle_rad, 2 * math.pi)) / curvature_per_m
+
+
+def _turned(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
+    """Give a vector in a frame that is turned to the left by `turn_rad`."""
+    cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
+    return ahead_m * cosine + left_m * sine, left_m * cosine - ahead_m * sine
