@@ -85,8 +85,8 @@ LIGHTS: dict[LightName, Light] = {
     "low_sun": Light(
         azimuth_rad=math.radians(112.0),
         elevation_rad=math.radians(10.0),
-        lit=(0.62, 0.82, 1.0),
-        shade=(0.40, 0.375, 0.36),
+        lit=(0.68, 0.84, 1.0),
+        shade=(0.43, 0.40, 0.38),
         zenith=(176.0, 128.0, 92.0),
         haze=(158.0, 180.0, 214.0),
         glow=(30.0, 70.0, 92.0),

@@ -50,7 +50,7 @@ class Renderer:
         cv2.setNumThreads(1)  # with more the split of the work, and with it the last bit, may change
         self._road, self._model, self._seed = road, model, seed
         self._level = levelled(model)
-        self._ground, self._scenery = _world(road, scenery, light)
+        self._ground, self._scenery = world(road, scenery, light)
         self._bands = bands_of(self._level)
         self._panorama = Panorama(self._level, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
         self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
@@ -167,7 +167,7 @@ class Renderer:
 
 
 @lru_cache(maxsize=2)
-def _world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
+def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
     """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
     light = LIGHTS[light_name]
     if scenery == "none":

@@ -25,6 +25,9 @@ _DETAIL_M = 45.0
 _POST_SPACING_M = 4.0
 _LAMP_SPACING_M = 36.0
 _STOREY_M = 3.2
+_AROUND_M = 110.0
+_TREE_EVERY_M2 = 480.0
+_BUILDING_EVERY_M2 = 6200.0
 
 _BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
     "barrier": (
@@ -66,6 +69,9 @@ class Walls:
     windows_m: tuple[FloatArray, ...]
 
 
+_NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
+
+
 @dataclass(frozen=True, slots=True)
 class Standing:
     """Everything that stands along one road.
@@ -90,7 +96,7 @@ def standing(road: Road, *, trees: bool) -> Standing:
         poles=_poles(road, runs, lamps=trees),
         trees=planted,
         tree_road_rad=_road_heading(road, planted[:, :2]),
-        walls=_build(road, 26 if trees else 0),
+        walls=_build(road) if trees else _NO_WALLS,
     )
 
 
@@ -179,17 +185,17 @@ def _road_heading(road: Road, places: FloatArray) -> FloatArray:
     return np.asarray(heading_rad[nearest], dtype=np.float64)
 
 
-def _free_places(road: Road, name: str, count: int, clear_m: float) -> FloatArray:
-    """Up to `count` random places around the road, none nearer than `clear_m` to its asphalt."""
+def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> FloatArray:
+    """Random places around the road, one in `every_m2`, none nearer than `clear_m` to its asphalt."""
     middle, _, half_width_m = _middle(road)
-    low, high = middle.min(axis=0) - 110.0, middle.max(axis=0) + 110.0
-    places = stream(_WORLD_SEED, name).uniform(low, high, (count, 2))
+    low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
+    places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
     distance = np.sqrt(((places[:, None] - middle[None]) ** 2).sum(axis=-1)).min(axis=1)
-    return np.asarray(places[distance > half_width_m + clear_m])
+    return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
 
 
 def _plant(road: Road) -> FloatArray:
-    places = _free_places(road, "tree places", 340, clear_m=6.0)
+    places = _free_places(road, "tree places", _TREE_EVERY_M2, clear_m=6.0)
     random = stream(_WORLD_SEED, "tree shapes")
     kinds = random.integers(0, TREE_KINDS, len(places))
     heights = np.where(
@@ -198,10 +204,10 @@ def _plant(road: Road) -> FloatArray:
     return np.column_stack([places, heights, kinds])
 
 
-def _build(road: Road, count: int) -> Walls:
+def _build(road: Road) -> Walls:
     random = stream(_WORLD_SEED, "building shapes")
     outlines, colours, normals, windows = [], [], [], []
-    for place in _free_places(road, "building places", count, clear_m=24.0):
+    for place in _free_places(road, "building places", _BUILDING_EVERY_M2, clear_m=24.0):
         length_m, width_m, storeys = random.uniform(14, 34), random.uniform(10, 16), int(random.integers(2, 7))
         heading_rad = random.uniform(0, math.pi)
         colour = np.array(_FACADES[int(random.integers(0, len(_FACADES)))], dtype=np.float64)
