@@ -213,7 +213,7 @@ def _crown(
     """A crown is made of clumps, each a ball of leaves with a bright and a dark side, before and behind each other."""
     bush = kind == TREE_KINDS - 1
     clumps = 26
-    half_height, centre_v, half_width = (92.0, 158.0, 84.0) if bush else (78.0, 92.0, 76.0)
+    half_height, centre_v, half_width = (84.0, 150.0, 70.0) if bush else (62.0, 96.0, 70.0)
     angle, away = random.uniform(0, 2 * np.pi, clumps), np.sqrt(random.uniform(0.02, 1, clumps))
     clump_u, clump_v = np.cos(angle) * away * half_width, np.sin(angle) * away * half_height
     clump_near, clump_size = random.uniform(0, 1, clumps), random.uniform(17.0, 30.0, clumps)
