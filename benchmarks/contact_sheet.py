@@ -1,6 +1,6 @@
 """Draws one sheet of the simulator's frames: every route in every light, as a driver would see them.
 
-    python benchmarks/contact_sheet.py [--out docs/pictures/frames.jpg]
+python benchmarks/contact_sheet.py [--out docs/pictures/frames.jpg]
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ number and the seed alone: equal to the byte for equal versions and processor fe
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
 
@@ -29,10 +30,11 @@ from lavt.vehicle.sim.standing import standing
 SceneryKind = Literal["full", "light", "none"]
 """full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails and no shadows either."""
 
-MOST_INSTANTS = 8
-"""An exposure is the mean of so many instants at most."""
+MOST_PARTS, MOST_INSTANTS = 8, 16
+"""An exposure is drawn in so many parts at most, the near ground in each from so many instants at most."""
 
-_INSTANT_PX = 2.0
+_STEP_PX = 3.0
+_NEAR_BANDS = 2
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
 _CLEAR_M = 11.0
@@ -77,23 +79,32 @@ class Renderer:
         return picture
 
     def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open."""
-        count = self._instants(begin, end)
-        if count == 1:
-            return self.render(_between(begin, end, 0.5), number)
+        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open.
+
+        The exposure is cut into parts, within which nothing but the near ground moves much; in each part that is seen
+        from several instants.
+        """
+        parts = _count(self._moved_px(begin, end, self._bands[_NEAR_BANDS].end_row), MOST_PARTS)
+        instants = _count(self._moved_px(begin, end, self._level.height_px - 1) / parts, MOST_INSTANTS)
         light = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
-        for instant in range(count):
-            light += self._drawn(_between(begin, end, (instant + 0.5) / count))
-        picture = ((light + count // 2) // count).astype(np.uint8)
+        for part in range(parts):
+            shares = (part + (np.arange(instants) + 0.5) / instants) / parts
+            near = [_between(begin, end, share) for share in shares.tolist()]
+            light += self._drawn(_between(begin, end, (part + 0.5) / parts), near)
+        picture = ((light + parts // 2) // parts).astype(np.uint8)
         self._add_noise(picture, number)
         return picture
 
-    def _drawn(self, pose: Pose) -> Picture:
+    def _drawn(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
+        """Draw the world without noise, from `pose`; the near ground as the mean of what is seen from `near`."""
         view = view_from(self._level, pose)
         self._panorama.cut(view.heading_rad, self._canvas[: self._bands[-1].first_row])
+        blurred = len(near) > 1
         homography = view.ground_from_picture()
-        for band in self._bands:
+        for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
             self._warp(band, view, homography)
+        if blurred:
+            self._blur_near([view_from(self._level, each) for each in near])
         self._add_haze()
         picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
         if self._scenery is not None:
@@ -144,20 +155,27 @@ class Renderer:
         turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
         return np.asarray(turned, dtype=np.uint8)
 
-    def _instants(self, begin: Pose, end: Pose) -> int:
-        """How many instants stand for an exposure: about two pixels apart where the picture moves most."""
-        model = self._model
+    def _blur_near(self, views: Sequence[View]) -> None:
+        rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
+        light = np.zeros(rows.shape, dtype=np.uint16)
+        for view in views:
+            homography = view.ground_from_picture()
+            for band in self._bands[:_NEAR_BANDS]:
+                self._warp(band, view, homography)
+            light += rows
+        rows[:] = (light + len(views) // 2) // len(views)
+
+    def _moved_px(self, begin: Pose, end: Pose, row: int) -> float:
+        """How far the ground in the corners of a row moves in the picture, or the horizon if that is more."""
+        model = self._level
         first, last = view_from(model, begin), view_from(model, end)
-        rows = np.array([model.height_px - 1.0, (3 * model.height_px) // 4, (3 * model.height_px) // 5])
-        pixels = np.array(
-            [[column, row, 1.0] for row in rows for column in (0.0, model.width_px / 2, model.width_px - 1)]
-        )
+        pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
         ground = pixels @ first.ground_from_picture().T
-        seen = ground[:, 2] > 1e-3  # below the horizon
-        places = np.column_stack([ground[seen, :2] / ground[seen, 2:], np.zeros(int(seen.sum()))])
-        moved_px = np.hypot(*(last.project(places)[:, :2] - pixels[seen, :2]).T).max(initial=0.0)
-        turned_px = model.focal_px * abs(math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi))
-        return min(max(math.ceil(max(float(moved_px), turned_px) / _INSTANT_PX), 1), MOST_INSTANTS)
+        turned_px = model.focal_px * abs(math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi))
+        if (ground[:, 2] <= 0.0).any():
+            return turned_px  # the row is above the horizon
+        places = np.column_stack([ground[:, :2] / ground[:, 2:], np.zeros(2)])
+        return max(float(np.hypot(*(last.project(places) - pixels)[:, :2].T).max()), turned_px)
 
     def _add_noise(self, picture: Picture, number: int) -> None:
         down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
@@ -175,6 +193,10 @@ def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Grou
     things = standing(road, trees=scenery == "full")
     shadows = Shadows(things, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
     return Ground(road, light, shadows), Scenery(things, light)
+
+
+def _count(moved_px: float, most: int) -> int:
+    return min(max(math.ceil(moved_px / _STEP_PX), 1), most)
 
 
 def _between(begin: Pose, end: Pose, share: float) -> Pose:
