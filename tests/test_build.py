@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -12,12 +13,14 @@ from lavt.build import (
     SeededEntropy,
     build_plant,
     camera_model,
+    car_of,
     check_names,
     parse_address,
     run_seed,
 )
 from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
 from lavt.errors import UserError
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
 
 
 @given(st.integers(0, 2**63 - 1), st.text(max_size=10), st.integers(0, 10_000))
@@ -74,6 +77,19 @@ def test_addresses() -> None:
     for bad in ("5600", ":5600", "desk:", "desk:65536", "desk:-1", "desk:²", "desk:1 ", "desk:" + "9" * 5000):
         with pytest.raises(UserError, match="write it as host:port"):
             parse_address("key", bad)
+
+
+def test_the_car_is_the_named_one_with_the_configured_lags() -> None:
+    """What the config gives replaces the car's own dead times and lags, and nothing else."""
+    assert car_of(VehicleConfig()) == LINCOLN_MKZ
+    given = VehicleConfig(
+        steering_dead_time_ms=240.0, steering_lag_ms=270.0, pedal_dead_time_ms=100.0, throttle_lag_ms=0.0,
+        brake_lag_ms=50.0,
+    )  # fmt: skip
+    assert car_of(given) == replace(
+        LINCOLN_MKZ, steering_dead_time_s=0.24, steering_lag_s=0.27, pedal_dead_time_s=0.1, throttle_lag_s=0.0,
+        brake_lag_s=0.05,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import count
-from typing import Any
+from typing import Any, Literal
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
@@ -13,7 +14,7 @@ from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
 from lavt.control.limiter import Limiter
 from lavt.control.limits import LIMITS
 from lavt.control.safety import SafetyGate
-from lavt.domain import NS_PER_MS, NS_PER_S, Command, SessionReply, SessionRequest, State, VehicleEvent
+from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.reports import Admission, FrameWritten, Route
@@ -25,12 +26,14 @@ TICK_NS = 20 * NS_PER_MS
 class Bench:
     """An actuator node with a vehicle that stands, and a client that commands it."""
 
-    def __init__(self, route: Route | None = None) -> None:
+    def __init__(self, route: Route | None = None, after_collision: Literal["end", "continue"] = "end") -> None:
         numbers = count(1)
         limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
         self.vehicle = StandingVehicle()
         self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
-        self.node = ActuatorNode(self.vehicle, self.gate, start_ns=MONO_NS, route=route)
+        self.node = ActuatorNode(
+            self.vehicle, self.gate, start_ns=MONO_NS, route=route, after_collision=after_collision
+        )
         self.mono_ns = 0
         self.sequence = 0
         self.epoch = 0
@@ -184,6 +187,21 @@ def test_a_stop_is_the_ending_once_the_vehicle_stands() -> None:
     assert bench.events("ending") == ["safe_stop"]
     bench.armed()
     assert len(bench.events("drive_began")) == 2
+
+
+@pytest.mark.parametrize(("after_collision", "endings"), [("end", ["collision"]), ("continue", ["completed"])])
+def test_whether_a_collision_ends_the_drive_is_a_setting(
+    after_collision: Literal["end", "continue"], endings: list[str]
+) -> None:
+    """A vehicle that goes on after a collision has it told each time, and its drive ends by what comes then."""
+    bench = Bench(after_collision=after_collision).armed()
+    happening: tuple[EventKind, ...] = ("collision", "collision", "completed")
+    for mono_ns, kind in enumerate(happening):
+        bench.drive()
+        bench.vehicle.happens = [VehicleEvent(mono_ns, kind, "")]
+        bench.go(TICK_NS)
+    assert bench.events("ending") == endings
+    assert len(bench.events("collision")) == 2
 
 
 def test_an_end_before_the_drive_is_none() -> None:

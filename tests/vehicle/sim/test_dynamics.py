@@ -1,11 +1,13 @@
-import dataclasses
 import math
+from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lavt.domain import Actuation
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
-from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, Car, CarMotion, CarParameters
+from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, RAIL_FRICTION, Car, CarMotion, CarParameters, Contact
 
 STEP_S = 1 / 240
 CAR = LINCOLN_MKZ
@@ -36,14 +38,15 @@ def test_a_car_at_rest_stays_at_rest() -> None:
 
 
 @pytest.mark.parametrize("steering_rad", [0.02, -0.04])
-def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float) -> None:
-    """At 30 km/h the yaw rate is the linear bicycle's, v d / (L + K v^2) with K = m (l_r - l_f) / (C L), within 1 %."""
+@pytest.mark.parametrize(("front_nprad", "rear_nprad"), [(155_495.0, 155_495.0), (90_000.0, 155_495.0), (2e5, 1.5e5)])
+def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float, front_nprad: float, rear_nprad: float) -> None:
+    """At 30 km/h the yaw rate is the linear bicycle's, v d / (L + K v^2), K = m (l_r / C_f - l_f / C_r) / L, to 1 %."""
     speed_mps = 30 / 3.6
-    car = car_at(speed_mps)
+    car = car_at(speed_mps, replace(CAR, front_stiffness_nprad=front_nprad, rear_stiffness_nprad=rear_nprad))
     cruise(car, speed_mps, steering_rad, 4.0)
     front_m = CAR.front_axle_to_gravity_m
     rear_m = CAR.wheelbase_m - front_m
-    understeer = CAR.mass_kg * (rear_m - front_m) / (CAR.front_stiffness_nprad * CAR.wheelbase_m)
+    understeer = CAR.mass_kg * (rear_m / front_nprad - front_m / rear_nprad) / CAR.wheelbase_m
     theory = speed_mps * steering_rad / (CAR.wheelbase_m + understeer * speed_mps**2)
     assert car.motion.yaw_rate_radps == pytest.approx(theory, rel=0.01)
 
@@ -52,7 +55,7 @@ def test_a_steady_circle_closes() -> None:
     """After the time of one turn at its yaw rate the rear axle is back where it was."""
     car = car_at(8.0)
     cruise(car, 8.0, 0.1, 5.0)
-    motion = dataclasses.replace(car.motion)
+    motion = replace(car.motion)
     cruise(car, 8.0, 0.1, 2 * math.pi / motion.yaw_rate_radps)
     assert math.hypot(car.motion.x_m - motion.x_m, car.motion.y_m - motion.y_m) < 0.1
 
@@ -139,3 +142,71 @@ def test_full_throttle_accelerates_as_stated() -> None:
     assert car.motion.speed_mps - before == pytest.approx(1.9, abs=0.02)
     assert car.motion.x_m > 0.0
     assert car.motion.y_m == 0.0
+
+
+def test_without_a_lag_the_next_step_has_what_was_asked() -> None:
+    """Lags of zero are no lags: pedals are there at once, the wheels as fast as their rate allows."""
+    car = car_at(parameters=replace(CAR, steering_lag_s=0.0, throttle_lag_s=0.0, brake_lag_s=0.0))
+    car.step(Actuation(0.001, 0.5, 0.25))
+    assert (car.motion.steering_rad, car.motion.throttle, car.motion.brake) == (0.001, 0.5, 0.25)
+
+
+def test_throttle_and_brake_have_lags_of_their_own() -> None:
+    """After 0.2 s a brake with a lag of 0.1 s has made 86 % of a step, a throttle with 0.4 s 39 %."""
+    car = car_at(parameters=replace(CAR, throttle_lag_s=0.4, brake_lag_s=0.1))
+    drive(car, Actuation(0.0, 1.0, 1.0), 0.2)
+    assert car.motion.throttle == pytest.approx(1 - math.exp(-0.5), rel=0.01)
+    assert car.motion.brake == pytest.approx(1 - math.exp(-2), rel=0.01)
+
+
+def energy_j(car: Car) -> float:
+    motion = car.motion
+    return (
+        CAR.mass_kg * (motion.speed_mps**2 + motion.side_speed_mps**2) + CAR.yaw_inertia_kgm2 * motion.yaw_rate_radps**2
+    ) / 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(4.0, 30.0), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=12), st.floats(0.0, 1.0))
+def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: list[float], brake: float) -> None:
+    """However it is steered, and sliding too, a car that only rolls or brakes loses energy, while tyres have slip."""
+    car = car_at(speed_mps)
+    for steering_rad in wheel_rad:
+        for _ in range(48):
+            before_j = energy_j(car)
+            car.step(Actuation(steering_rad, 0.0, brake))
+            if car.motion.speed_mps < CAR.kinematic_below_mps:
+                return
+            assert energy_j(car) <= before_j * (1 + 1e-3)
+    assert energy_j(car) < CAR.mass_kg * speed_mps**2 / 2
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.0, 20.0), st.floats(-5.0, 5.0), st.floats(-1.0, 1.0), st.floats(-3.2, 3.2), st.booleans())
+def test_a_rail_takes_the_motion_into_it_and_gives_none(
+    speed_mps: float, side_mps: float, yaw_radps: float, out_rad: float, front: bool
+) -> None:
+    """After a contact its point is out and moves in no more, and the car has no more energy, wherever it is."""
+    car = Car(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
+    ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)
+    before_j = energy_j(car)
+    car.slide(Contact(ahead_m, left_m, 0.02, out_rad))
+    motion = car.motion
+    assert (motion.x_m, motion.y_m) == pytest.approx((0.02 * math.cos(out_rad), 0.02 * math.sin(out_rad)))
+    assert energy_j(car) <= before_j + 1e-6
+    out = (math.cos(out_rad - 0.3), math.sin(out_rad - 0.3))
+    from_gravity_m = ahead_m - (CAR.wheelbase_m - CAR.front_axle_to_gravity_m)
+    outwards_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * out[0]
+    outwards_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * out[1]
+    if motion.speed_mps > 0.0:  # a car is not pushed backwards: there what is left of its speed is taken instead
+        assert outwards_mps >= -1e-9
+
+
+def test_a_car_along_a_rail_is_slowed_by_friction() -> None:
+    """Pressed sideways into a rail at its centre of gravity it loses friction times the speed that was stopped."""
+    car = Car(CAR, CarMotion(0.0, 0.0, 0.0, 8.0, 0.5, 0.0), STEP_S)
+    at_gravity_m = CAR.wheelbase_m - CAR.front_axle_to_gravity_m
+    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    assert (car.motion.speed_mps, car.motion.side_speed_mps) == pytest.approx((8.0 - RAIL_FRICTION * 0.5, 0.0))
+    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    assert car.motion.speed_mps == pytest.approx(8.0 - RAIL_FRICTION * 0.5)

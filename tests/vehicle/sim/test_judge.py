@@ -1,12 +1,15 @@
 import math
+from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import CarMotion
 from lavt.vehicle.sim.judge import Judge
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.road import Road, load_road, parse_road
 
 CAR = LINCOLN_MKZ
 SECOND_WITHOUT_RAIL_M = 40.0
@@ -120,3 +123,139 @@ def test_the_time_of_a_drive_counts_from_its_first_movement(road: Road) -> None:
     assert judge.judge(standing, began_ns + limit_ns) == []
     assert kinds(judge.judge(standing, began_ns + limit_ns + 1)) == ["timeout"]
     assert judge.judge(standing, began_ns + limit_ns + 2) == []
+
+
+def test_the_time_limit_can_be_set(road: Road) -> None:
+    """A drive may be given a time of its own."""
+    judge = Judge(road, CAR, near_s_m=0.0, limit_s=2.0)
+    moving = motion_at(road, 1.0, speed_mps=0.2)
+    assert [kinds(judge.judge(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
+
+
+def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
+    """On either side the line itself belongs to the lane the body is in; a hair further is an invasion."""
+    straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
+    wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
+    for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
+        judge = Judge(straight, wide, near_s_m=5.0)
+        judge.judge(motion_at(straight, 5.0), 0)
+        assert kinds(judge.judge(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
+
+
+def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
+    """A car across its lane invades to both sides in the same step, left edge first."""
+    events = judged(road, [(5.0, 0.0), (5.0, 0.0)])
+    assert events == []
+    judge = Judge(road, CAR, near_s_m=5.0)
+    judge.judge(motion_at(road, 5.0), 0)
+    events = judge.judge(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
+    assert [event.detail for event in events] == [
+        "left edge from lane 2 to 3 from the right", "right edge from lane 2 to 1 from the right"
+    ]  # fmt: skip
+
+
+def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
+    """A car that has turned round in its lane has invaded on the way, and at the end is where it was."""
+    judge = Judge(road, CAR, near_s_m=5.0)
+    events = []
+    for index in range(181):
+        events += judge.judge(motion_at(road, 5.0, 0.0, math.radians(index)), index)
+    sides = [event.detail.split()[0] for event in events if event.kind == "lane_invasion"]
+    assert sides == ["left", "left"]  # the front goes out and comes back; the rear, 1.4 m from the axle, stays in
+    assert set(kinds(events)) == {"lane_invasion"}
+
+
+def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
+    """A car that goes back from the start is measured there, and only its time runs out."""
+    places = [(1.0 - index / 4, 0.0) for index in range(100)]
+    judge = Judge(road, CAR, near_s_m=1.0, limit_s=1e-6)
+    events = []
+    for index, (s_m, lateral_m) in enumerate(places):
+        events += judge.judge(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
+    assert kinds(events) == ["timeout"]
+    assert judge.track(motion_at(road, -23.75)).progress_m == pytest.approx(-23.75)
+
+
+def test_a_route_is_completed_where_it_ends_to_the_step(road: Road) -> None:
+    """Steps of a centimetre across the end: the first at or beyond it completes."""
+    at_m = [122.0 + index / 100 for index in range(200)]
+    events = judged(road, [(s_m, 0.0) for s_m in at_m])
+    assert kinds(events) == ["completed"]
+    assert at_m[events[0].mono_ns // 1000] == pytest.approx(122.94)
+
+
+OPEN_RAIL = """
+title: open
+segments: [{length_m: 100}]
+rails: [{offset_m: -6, from_m: 40}]
+"""
+
+
+def test_grass_before_a_rail_is_off_road() -> None:
+    """A rail beyond the asphalt does not make the grass before it a road."""
+    road = parse_road(OPEN_RAIL, source="x")
+    assert kinds(judged(road, [(60.0, 0.0), (60.0, -2.0), (60.0, -3.0)])) == [
+        "lane_invasion",
+        "lane_invasion",
+        "off_road",
+    ]
+
+
+def test_asphalt_counts_where_it_is() -> None:
+    """A lay-by beside the lane is road between its stations and nowhere else."""
+    paved = "paved: [{left_m: 2.25, right_m: -2.25}, {left_m: -2.25, right_m: -6, from_m: 30, to_m: 60}]"
+    road = parse_road(f"title: x\nsegments: [{{length_m: 100}}]\n{paved}", source="x")
+    for s_m, off in ((20.0, True), (45.0, False), (70.0, True)):
+        assert ("off_road" in kinds(judged(road, [(s_m, -4.0)]))) == off
+
+
+def test_a_car_behind_a_rail_does_not_touch_it() -> None:
+    """Where the rail begins, a body that is wholly behind it passes; one that it meets in front has a collision."""
+    road = parse_road(OPEN_RAIL, source="x")
+    assert "collision" not in kinds(judged(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
+    assert "collision" in kinds(judged(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
+
+
+def test_one_contact_is_one_collision(road: Road) -> None:
+    """Touching and leaving a rail within half a second is one collision, after more than that it is another."""
+    judge = Judge(road, CAR, near_s_m=5.0)
+    at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
+    collisions = []
+    for at_ms in (0, 10, 20, 500, 1021, 1500):
+        judge.judge(off_rail, at_ms * 1_000_000 - 1)
+        events = judge.judge(at_rail, at_ms * 1_000_000)
+        collisions += [at_ms for event in events if event.kind == "collision"]
+    assert collisions == [0, 1021]
+
+
+def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> None:
+    """The front right corner in the right rail: its place on the body, its depth, and that out is to the left."""
+    judge = Judge(road, CAR, near_s_m=5.0)
+    judge.judge(motion_at(road, 5.0, -6.5, -0.5), 0)
+    (contact,) = judge.contacts
+    assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
+    corner_m = -6.5 - 0.93 * math.cos(0.5) - 3.89 * math.sin(0.5)
+    assert contact.depth_m == pytest.approx(-9.15 - corner_m)
+    assert math.remainder(contact.out_rad - road.start[2] - math.pi / 2, 2 * math.pi) == pytest.approx(0.0)
+    judge.judge(motion_at(road, 5.0), 1)
+    assert judge.contacts == ()
+
+
+ROADS = [load_road("a_key"), parse_road(OPEN_RAIL, source="x")]
+STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(ROADS), st.lists(STEPS, min_size=50, max_size=300), st.floats(0.0, 90.0), st.floats(-6.0, 6.0))
+def test_looking_only_when_needed_changes_no_verdict(
+    road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
+) -> None:
+    """However a car moves, its judge says the same as one that looks at the whole body in every step."""
+    lazy, eager = Judge(road, CAR, near_s_m=s_m), Judge(road, CAR, near_s_m=s_m)
+    turned_rad = 0.0
+    for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
+        s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad
+        motion = motion_at(road, s_m, lateral_m, turned_rad)
+        eager._quiet._room_m = 0.0
+        assert lazy.judge(motion, index) == eager.judge(motion, index)
+        assert (lazy.contacts == ()) == (eager.contacts == ())

@@ -1,9 +1,14 @@
+import itertools
 import math
+from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleEvent
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.road import Road, load_road, parse_road
 from lavt.vehicle.sim.simulator import Simulator, grid_ns
 from lavt.vehicle.vehicle import Vehicle
 
@@ -136,3 +141,104 @@ def test_a_good_driver_completes_the_route(road: Road) -> None:
     assert [event.kind for event in events] == ["completed"]
     assert worst_m < 0.5
     assert simulator.ground_truth().progress_m >= road.length_m
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(0, 400 * NS_PER_MS), max_size=30))
+def test_the_trajectory_does_not_depend_on_how_advance_is_called(pauses_ns: list[int]) -> None:
+    """However late and unevenly the physics is called, commands at the same times give the same drive to the bit."""
+    road = load_road("a_key")
+    one, other = simulator_on(road), simulator_on(road)
+    for index in range(20):
+        at_ns = START_NS + index * 150 * NS_PER_MS
+        for simulator in (one, other):
+            simulator.apply(Actuation(0.1 * math.sin(index), index % 3 / 2, 0.0), at_ns)
+    events, end_ns = one.advance(START_NS + 3 * NS_PER_S), START_NS + 3 * NS_PER_S
+    collected: list[VehicleEvent] = []
+    for at_ns in itertools.accumulate(pauses_ns, initial=START_NS):
+        collected += other.advance(min(at_ns, end_ns))
+    collected += other.advance(end_ns)
+    assert other.ground_truth() == one.ground_truth()
+    assert collected == events
+
+
+def test_dead_times_hold_commands_back_each_its_own(road: Road) -> None:
+    """Wheels begin to follow after their dead time, pedals after theirs, and then with their lags."""
+    car = replace(LINCOLN_MKZ, steering_dead_time_s=0.15, pedal_dead_time_s=0.05)
+    simulator = Simulator(road=road, seed=1, start_mono_ns=0, parameters=car)
+    simulator.apply(Actuation(0.02, 1.0, 0.0), 0)
+    seen = {}
+    for at_ms in (49, 60, 149, 160, 150 + 120):
+        simulator.advance(at_ms * NS_PER_MS)
+        seen[at_ms] = (simulator._car.motion.steering_rad, simulator._car.motion.throttle)
+    assert seen[49] == (0.0, 0.0)
+    assert seen[60][1] > 0.0
+    assert seen[149][0] == 0.0
+    assert seen[160][0] > 0.0
+    assert seen[270][0] == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
+
+
+def test_with_dead_time_commands_keep_their_order_and_distance(road: Road) -> None:
+    """A dead time only moves commands: the wheel does later exactly what it does without."""
+    late_ns = 250 * NS_PER_MS  # a whole number of steps
+    plain = Simulator(road=road, seed=1, start_mono_ns=0)
+    delayed = Simulator(
+        road=road, seed=1, start_mono_ns=0, parameters=replace(LINCOLN_MKZ, steering_dead_time_s=late_ns / NS_PER_S)
+    )
+    for index in range(50):
+        for simulator in (plain, delayed):
+            simulator.apply(Actuation(0.2 * math.sin(index / 5), 0.0, 1.0), index * 20 * NS_PER_MS)
+    for at_ms in range(0, 1000, 50):
+        plain.advance(at_ms * NS_PER_MS)
+        delayed.advance(at_ms * NS_PER_MS + late_ns)
+        assert delayed.state().steering_rad == plain.state().steering_rad
+
+
+RAILED = """
+title: straight, between a rail and a barrier
+segments: [{length_m: 300}]
+lanes: {widths_m: [3.5, 3.5, 3.5], driven: 1}
+rails: [{offset_m: -6}, {offset_m: 6, kind: barrier}]
+"""
+
+
+def into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
+    """Drive with constant wheel and throttle, collisions not ending it; tell the deepest any corner got into a rail."""
+    simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, goes_on=True)
+    simulator.apply(Actuation(steering_rad, 0.6, 0.0), 0)
+    events: list[VehicleEvent] = []
+    deepest_m = 0.0
+    for _ in range(round(240 * duration_s)):
+        events += simulator.advance(simulator.next_wake_ns())
+        deepest_m = max([deepest_m, *(contact.depth_m for contact in simulator._judge.contacts)])
+    return simulator, events, deepest_m
+
+
+@pytest.mark.parametrize(("steering_rad", "name"), [(0.03, "barrier"), (-0.03, "rail")])
+def test_a_car_that_goes_on_after_a_collision_slides_along(steering_rad: float, name: str) -> None:
+    """Steered at barrier or rail it has one collision, gets no deeper than a step takes it, lies along, and goes on."""
+    simulator, events, deepest_m = into_the_rail(steering_rad, 16.0)
+    hits = [event.detail for event in events if event.kind == "collision"]
+    assert len(hits) == 1
+    assert name in hits[0]
+    assert {event.kind for event in events} == {"lane_invasion", "collision"}
+    assert deepest_m < 0.02
+    truth = simulator.ground_truth()
+    assert abs(truth.cross_track_m) == pytest.approx(6.0 - LINCOLN_MKZ.body_width_m / 2, abs=0.02)
+    assert truth.heading_error_rad == pytest.approx(0.0, abs=0.01)
+    assert truth.progress_m > 80.0
+
+
+def test_a_rail_costs_speed() -> None:
+    """Pressed against the rail the car is slower than one that drives free for as long with the same throttle."""
+    pressed, _, _ = into_the_rail(-0.03, 10.0)
+    free, events, _ = into_the_rail(0.0, 10.0)
+    assert "collision" not in {event.kind for event in events}
+    assert pressed.state().speed_mps < 0.8 * free.state().speed_mps
+
+
+def test_a_crash_at_a_large_angle_stops_a_car_that_goes_on() -> None:
+    """At 45 degrees into the barrier hardly any speed is left, and the car does not bounce back."""
+    simulator, events, _ = into_the_rail(0.4, 8.0)
+    assert "collision" in {event.kind for event in events}
+    assert 0.0 <= simulator.state().speed_mps < 0.3

@@ -128,37 +128,38 @@ class Car:
     def slide(self, contact: Contact) -> None:
         """Put the car out of what it has got into, and take away its motion into it, with friction along it.
 
-        An inelastic impulse on a rigid body at the point of contact, in the plane; friction is Coulomb's.
+        Inelastic impulses on a rigid body at the point of contact, in the plane: first friction, Coulomb's, then the
+        push that stops what motion into it is left.
         """
-        motion, parameters = self.motion, self.parameters
+        motion = self.motion
         motion.x_m += contact.depth_m * math.cos(contact.out_rad)
         motion.y_m += contact.depth_m * math.sin(contact.out_rad)
-        ahead_m, left_m = contact.ahead_m - self._to_rear_m, contact.left_m  # of the centre of gravity
+        point = (contact.ahead_m - self._to_rear_m, contact.left_m)  # from the centre of gravity
         out_rad = contact.out_rad - motion.heading_rad
         out = (math.cos(out_rad), math.sin(out_rad))
         along = (-out[1], out[0])
-        inward_mps = -self._speed_at(ahead_m, left_m, out)
-        if inward_mps <= 0.0:
+        most = RAIL_FRICTION * self._stopping(point, out)
+        if most <= 0.0:
             return
-        push = inward_mps / self._give(ahead_m, left_m, out)
-        hold = -self._speed_at(ahead_m, left_m, along) / self._give(ahead_m, left_m, along)
-        hold = min(max(hold, -RAIL_FRICTION * push), RAIL_FRICTION * push)
-        forward, sideways = push * out[0] + hold * along[0], push * out[1] + hold * along[1]
-        motion.speed_mps = max(0.0, motion.speed_mps + forward / parameters.mass_kg)
+        self._push(point, along, min(max(self._stopping(point, along), -most), most))
+        self._push(point, out, max(0.0, self._stopping(point, out)))
+        motion.speed_mps = max(0.0, motion.speed_mps)
+
+    def _stopping(self, point: tuple[float, float], direction: tuple[float, float]) -> float:
+        """Impulse (N s) that takes a point of the body its speed in a direction; both in the car's frame."""
+        motion, parameters = self.motion, self.parameters
+        forward_mps = motion.speed_mps - motion.yaw_rate_radps * point[1]
+        sideways_mps = motion.side_speed_mps + motion.yaw_rate_radps * point[0]
+        lever_m = point[0] * direction[1] - point[1] * direction[0]
+        gives = 1.0 / parameters.mass_kg + lever_m * lever_m / parameters.yaw_inertia_kgm2
+        return -(forward_mps * direction[0] + sideways_mps * direction[1]) / gives
+
+    def _push(self, point: tuple[float, float], direction: tuple[float, float], impulse: float) -> None:
+        motion, parameters = self.motion, self.parameters
+        forward, sideways = impulse * direction[0], impulse * direction[1]
+        motion.speed_mps += forward / parameters.mass_kg
         motion.side_speed_mps += sideways / parameters.mass_kg
-        motion.yaw_rate_radps += (ahead_m * sideways - left_m * forward) / parameters.yaw_inertia_kgm2
-
-    def _speed_at(self, ahead_m: float, left_m: float, direction: tuple[float, float]) -> float:
-        """Speed, in a direction of the car's frame, of a point of the body given from its centre of gravity."""
-        motion = self.motion
-        forward_mps = motion.speed_mps - motion.yaw_rate_radps * left_m
-        sideways_mps = motion.side_speed_mps + motion.yaw_rate_radps * ahead_m
-        return forward_mps * direction[0] + sideways_mps * direction[1]
-
-    def _give(self, ahead_m: float, left_m: float, direction: tuple[float, float]) -> float:
-        """Change of speed of that point for each newton second in the direction (1/kg)."""
-        lever_m = ahead_m * direction[1] - left_m * direction[0]
-        return 1.0 / self.parameters.mass_kg + lever_m * lever_m / self.parameters.yaw_inertia_kgm2
+        motion.yaw_rate_radps += (point[0] * sideways - point[1] * forward) / parameters.yaw_inertia_kgm2
 
     def _follow(self, wanted: Actuation) -> None:
         parameters, motion = self.parameters, self.motion

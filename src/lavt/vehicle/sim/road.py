@@ -112,8 +112,10 @@ def parse_road(text: str, source: str) -> Road:
     read = read_road_file(text, source)
     if isinstance(read, RoadFile):
         return _whole(read)
-    of = _beside(source, read.part_of)
-    of_file = read_road_file(*_text_of(of))
+    try:
+        of_file = read_road_file(*_text_of(_beside(source, read.part_of)))
+    except UserError as error:
+        raise UserError(f"{source} is a part of {read.part_of}: {error}") from error
     if not isinstance(of_file, RoadFile):
         raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole as part_of")
     whole = _whole(of_file)

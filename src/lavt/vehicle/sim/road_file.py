@@ -21,6 +21,9 @@ SOLID_M = 0.125
 TIGHTEST_PER_M = 0.2
 """A car with a turning circle of 5 m can just follow."""
 
+SHORTEST_M = 10.0
+"""Of a route: cars start up to 2 m into it."""
+
 INNER_SHARE = 0.1
 """The inner edge of the road must keep this share of the centre's length in a curve."""
 
@@ -28,6 +31,7 @@ Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-100_00
 Offset = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-200, le=200)]
 Station = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-20_000, le=20_000)]
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20_000)]
+RouteLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SHORTEST_M, le=20_000)]
 RunLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=2_000)]
 Width = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20)]
 Curvature = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-TIGHTEST_PER_M, le=TIGHTEST_PER_M)]
@@ -98,7 +102,7 @@ class PartFile(_Keys):
     title: Title
     part_of: Annotated[str, Field(strict=True, min_length=1)]
     from_m: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=20_000)]
-    length_m: Length
+    length_m: RouteLength
 
 
 class RoadFile(_Keys):
@@ -106,7 +110,7 @@ class RoadFile(_Keys):
 
     title: Title
     segments: Annotated[list[_SegmentKeys], Field(min_length=1, max_length=1000)]
-    length_m: Length | None = None
+    length_m: RouteLength | None = None
     origin: _OriginKeys = _OriginKeys()
     run_in_m: RunLength = 20.0
     run_out_m: RunLength = 100.0
@@ -200,11 +204,16 @@ def _problems(road: RoadFile) -> Iterable[str]:
             yield f"{name} goes from {each.from_m} m to {each.to_m} m: from_m must be less than to_m"
         if each.to_m <= -road.run_in_m or each.from_m >= road.laid_m + road.run_out_m:
             yield f"{name} is not on the road, which lies from {-road.run_in_m} m to {road.laid_m + road.run_out_m} m"
+    for index, rail in enumerate(road.rails):
+        if abs(rail.offset_m) <= lanes.widths_m[lanes.driven] / 2:
+            yield f"rails.{index} stands in the driven lane, at {rail.offset_m} m: move it out"
     for strip in road.all_paved:
         if strip.left_m <= strip.right_m:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
     if road.laid_m > 20_000:
         yield f"the segments are {road.laid_m:.0f} m long: 20 km are enough"
+    elif road.route_m < SHORTEST_M:
+        yield f"the segments are only {road.laid_m:g} m long: a route has at least {SHORTEST_M:g} m"
     elif road.route_m > road.laid_m:
         yield f"length_m is {road.route_m}, but the segments are only {road.laid_m:.3f} m long: add to them"
     yield from _too_tight(road)
@@ -254,7 +263,7 @@ def _not_paved(road: RoadFile) -> Iterable[str]:
 
 def _sentence(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
     """Say in words what is wrong with one value."""
-    location = [str(part) for part in problem["loc"]]
+    location = [str(part)[:60] for part in problem["loc"]]
     where = ".".join(location)
     if problem["type"] == "extra_forbidden":
         known = _known(kind, problem["loc"][:-1])
@@ -263,8 +272,17 @@ def _sentence(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
         return f"unknown key {where!r}: {hint}"
     if problem["type"] == "missing":
         return f"{where!r} is missing: give it"
-    shown = repr(problem["input"])
-    return f"{where!r}: {problem['msg']}, not {shown if len(shown) <= 60 else shown[:57] + '...'}"
+    if problem["type"] == "model_type":
+        return f"{where!r} must hold keys and values, not {_shown(problem['input'])}"
+    return f"{where!r}: {problem['msg']}, not {_shown(problem['input'])}"
+
+
+def _shown(value: Any) -> str:
+    """Show a value, or of what kind it is: lists may be made of themselves, and numbers have thousands of digits."""
+    if not isinstance(value, str | int | float | None) or (isinstance(value, int) and value.bit_length() > 64):
+        return f"this {type(value).__name__}"
+    shown = repr(value)
+    return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
 _INNER: dict[str, type[BaseModel]] = {

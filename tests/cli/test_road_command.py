@@ -1,0 +1,71 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from lavt.cli.main import app
+from lavt.config import RunConfig, VehicleConfig
+from lavt.domain import CameraModel
+from lavt.errors import UserError
+from lavt.experiment.plan import plan_run
+from lavt.vehicle.sim.drawing import VIEWS, draw_road
+from lavt.vehicle.sim.road import load_road
+
+BEND = """
+title: Test bend
+segments: [{length_m: 20}, {length_m: 30, end_curvature_per_m: 0.02}]
+rails: [{offset_m: -4, kind: barrier, to_m: 30}]
+"""
+
+
+@pytest.fixture
+def bend(tmp_path: Path) -> Path:
+    path = tmp_path / "bend.yaml"
+    path.write_text(BEND)
+    return path
+
+
+def test_a_road_of_ones_own_is_drawn_into_a_picture(bend: Path, tmp_path: Path) -> None:
+    """`lavt road draw FILE --out PNG` says where the picture is, and it is a picture with asphalt and grass in it."""
+    out = tmp_path / "new" / "bend.png"
+    result = CliRunner().invoke(app, ["road", "draw", str(bend), "--out", str(out)])
+    assert (result.exit_code, result.stdout) == (0, f"the picture is {out}\n")
+    picture = cv2.imread(str(out))
+    assert picture is not None
+    for colour in ((0x96, 0x90, 0x8D), (0xD5, 0xE8, 0xDF)):
+        assert (np.abs(picture.astype(int) - colour).max(axis=-1) < 3).sum() > 1000
+
+
+def test_a_drawing_shows_the_road_to_scale_its_curvature_and_what_the_driver_sees() -> None:
+    """Above all has equal axes and holds every station of the route; the views are the camera's pictures."""
+    road = load_road("a_key")
+    figure = draw_road(road, model=CameraModel(), scenery="none")
+    above, detail, curvature, *views = figure.axes
+    assert above.get_aspect() == detail.get_aspect() == 1.0
+    (low_x, high_x), (low_y, high_y) = above.get_xlim(), above.get_ylim()
+    places = road.across(np.linspace(0.0, road.length_m, 50), 0.0)
+    assert ((places > (low_x, low_y)) & (places < (high_x, high_y))).all()
+    assert curvature.lines[0].get_ydata(orig=True).min() == pytest.approx(-0.02394289)  # type: ignore[union-attr]
+    assert len(views) == VIEWS
+    assert [axes.images[0].get_size() for axes in views] == [(480, 640)] * VIEWS
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), [(["nowhere"], "no road 'nowhere'"), (["a_key", "--out", "x.jpg"], "end with .png")]
+)
+def test_what_cannot_be_drawn_is_refused(arguments: list[str], said: str) -> None:
+    """A road that does not exist and a picture that is no PNG are the user's errors."""
+    result = CliRunner().invoke(app, ["road", "draw", *arguments])
+    assert isinstance(result.exception, UserError)
+    assert said in str(result.exception)
+
+
+def test_a_run_takes_the_path_of_a_road(bend: Path) -> None:
+    """`vehicle.route` may be a path; a file that is not a road is refused before anything is driven."""
+    planned = plan_run(RunConfig(vehicle=VehicleConfig(route=str(bend))))
+    assert planned.identity["route"] == str(bend)
+    bend.write_text("title: x")
+    with pytest.raises(UserError, match="'segments' is missing"):
+        plan_run(RunConfig(vehicle=VehicleConfig(route=str(bend), scenery="none")))
