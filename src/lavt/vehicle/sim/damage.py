@@ -59,7 +59,7 @@ def _repairs(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
         begin_m = random.uniform(first_m, last_m)
         end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
-        right_m = random.uniform(strip.right_m, strip.left_m - 2.0)
+        right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
         left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
         found[sorted(found)[int(random.integers(len(found)))]].append(along(road, left_m, right_m, begin_m, end_m))
         edges += [along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]

@@ -68,6 +68,10 @@ class Ground:
                 cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, window[part])
         return window
 
+    def room(self, level: int) -> bool:
+        """Whether one more tile of a scale can be kept without giving up another."""
+        return len(self._tiles[level]) < _KEPT_TILES[level]
+
     def tile(self, level: int, column: int, row: int) -> Picture:
         """Give one tile, painted now if it is not there."""
         tiles = self._tiles[level]

@@ -135,7 +135,7 @@ class Renderer:
     def _prepare_ground(self, view: View) -> None:
         for band in self._bands[_KEPT_FROM_LEVEL:]:
             low = band.low_tile(view)
-            for index in range(band.tiles**2):
+            for index in range(band.tiles**2 if self._ground.room(band.level) else 0):
                 self._ground.tile(band.level, low[0] + index % band.tiles, low[1] + index // band.tiles)
 
     def _add_haze(self) -> None:

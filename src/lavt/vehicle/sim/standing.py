@@ -190,7 +190,9 @@ def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> Floa
     middle, _, half_width_m = _middle(road)
     low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
     places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
-    distance = np.sqrt(((places[:, None] - middle[None]) ** 2).sum(axis=-1)).min(axis=1)
+    distance = np.full(len(places), np.inf)
+    for x_m, y_m in middle:  # point after point: a table of all distances does not fit a long road
+        np.minimum(distance, np.hypot(places[:, 0] - x_m, places[:, 1] - y_m), out=distance)
     return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
 
 
