@@ -6,9 +6,11 @@ A tile is a function of its place alone, so that what the camera sees does not d
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
@@ -38,7 +40,9 @@ class Ground:
 
     def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        self._lit, self._dimmed = _tables(light)
+        # Factors in 255ths: a surface in the sun, and which share of that is gone in the deepest shadow.
+        self._lit = _bytes(np.array(light.lit))
+        self._dimmed = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
         self._gravel, self._asphalt = (
             join(
@@ -95,10 +99,10 @@ class Ground:
         else:
             picture = _laid(self._paint_verge(level, square), self._paint_asphalt(level, square), asphalt)
         shade = None if self._shadows is None else self._shadows.mask(square)
-        lit = np.asarray(cv2.LUT(picture, self._lit), dtype=np.uint8)
+        lit = _coloured(picture, self._lit)
         if shade is None:
             return lit
-        gone = cv2.multiply(lit, cv2.LUT(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
+        gone = cv2.multiply(lit, _coloured(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
         return np.asarray(cv2.subtract(lit, gone), dtype=np.uint8)
 
     def _paint_verge(self, level: int, square: Square) -> Picture:
@@ -124,21 +128,27 @@ class Ground:
             paint = places.mask(square)
             if paint is not None:
                 alpha = np.asarray(cv2.multiply(paint, _cut(textures.wear, square), scale=thinness / 255), np.uint8)
-                over = np.empty_like(picture)
-                over[:] = _PAINT[colour]
-                picture = _laid(picture, over, alpha)
+                cover = cv2.merge((alpha, alpha, alpha))
+                kept = cv2.multiply(picture, cv2.bitwise_not(cover), scale=1 / 255)
+                picture = np.asarray(cv2.add(kept, _coloured(cover, _PAINT[colour])), dtype=np.uint8)
         return picture
 
 
-def _tables(light: Light) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Look-up tables (1, 256, 3): a surface in the sun, and which share of that is gone for each depth of shadow."""
-    levels = np.arange(256.0)[None, :, None]
-    gone = 1.0 - np.array(light.shade) / np.array(light.lit)
-    return _bytes(levels * np.array(light.lit)), _bytes(levels * gone)
+def _bytes(factors: FloatArray) -> tuple[int, ...]:
+    return tuple(np.clip(np.rint(factors * 255.0), 0, 255).astype(int).tolist())
 
 
-def _bytes(values: FloatArray) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+def _coloured(picture: MatLike, colour: tuple[int, ...]) -> Picture:
+    """Multiply every texel by a colour, in 255ths."""
+    return np.asarray(cv2.multiply(picture, _flat(picture.shape[0], colour), scale=1 / 255), dtype=np.uint8)
+
+
+@lru_cache(maxsize=32)
+def _flat(pixels: int, colour: tuple[int, ...]) -> Picture:
+    """Give a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
+    flat = np.empty((pixels, pixels, 3), dtype=np.uint8)
+    flat[:] = colour
+    return flat
 
 
 def _cut(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:

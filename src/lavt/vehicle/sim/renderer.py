@@ -123,7 +123,9 @@ class Renderer:
             cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
             return
         lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        cv2.resize(lines, rows.shape[1::-1], rows, interpolation=cv2.INTER_AREA)
+        # In NumPy: OpenCV's reduction by area takes longer than the warp.
+        light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
+        rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
 
     def _window(self, band: Band, low: tuple[int, int]) -> Picture:
         held = self._windows[band.level]
