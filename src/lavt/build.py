@@ -44,7 +44,7 @@ from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.udp_link import look_up
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
-from lavt.vehicle.camera import Camera, FrameTimes
+from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
 from lavt.vehicle.sim.camera import SimCamera
 from lavt.vehicle.sim.cars import named_car
 from lavt.vehicle.sim.dynamics import CarParameters
@@ -144,7 +144,7 @@ def camera_model(config: CameraConfig) -> CameraModel:
     """Geometry of the configured camera."""
     return CameraModel(
         config.width_px, config.height_px, math.radians(config.field_of_view_deg), config.x_m, config.z_m,
-        math.radians(config.pitch_deg),
+        math.radians(config.pitch_deg), config.y_m, math.radians(config.yaw_deg), math.radians(config.roll_deg),
     )  # fmt: skip
 
 
@@ -170,6 +170,9 @@ def build_simulator(config: ServerConfig) -> Plant:
         road=road,
         seed=config.seed,
         scenery=config.vehicle.scenery,
+        light=config.vehicle.light,
+        exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
     camera.prepare()
     return _simulated(config, road, camera)
@@ -191,6 +194,8 @@ def build_unpictured(config: ServerConfig) -> Plant:
         near_m=GRID.near_m,
         far_m=GRID.far_m,
         half_width_m=GRID.half_width_m,
+        exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
     return _simulated(config, road, camera)
 
@@ -327,7 +332,7 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
 def looks_of(camera: Camera, start_ns: int) -> list[FrameTimes]:
     """Tell when the vehicle's pose is needed: when the shutter opens and, where the camera has an exposure, closes."""
     opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
-    exposure_ns = getattr(camera, "exposure_ns", 0)
+    exposure_ns = camera.exposure_ns if isinstance(camera, TimedCamera) else 0
     return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]
 
 

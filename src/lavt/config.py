@@ -34,6 +34,8 @@ class VehicleConfig(Section):
     route: str = "a_key"
     """A road that comes with LAVT, or the path of a road's YAML file (`docs/roads.md`)."""
     scenery: Literal["full", "light", "none"] = "full"
+    light: Literal["noon", "low_sun", "overcast"] = "noon"
+    """The simulator's: where the sun stands and what the sky does, see `docs/camera.md`."""
     car: str = "lincoln_mkz"
     steering_dead_time_ms: float | None = Field(None, ge=0, le=2000)
     """From a command until the wheels begin to follow; like all lags here, the car's own where nothing is given."""
@@ -55,8 +57,26 @@ class CameraConfig(Section):
     rate_hz: float = Field(30.0, gt=0, le=120)
     field_of_view_deg: float = Field(90.0, gt=10, lt=150)
     x_m: float = 1.6
+    y_m: float = Field(0.0, ge=-5, le=5)
     z_m: float = Field(1.4, gt=0)
+    yaw_deg: float = Field(0.0, ge=-180, le=180)
+    """Positive to the left."""
     pitch_deg: float = Field(0.0, ge=-20, le=45)
+    """Positive downwards."""
+    roll_deg: float = Field(0.0, ge=-45, le=45)
+    """Positive leaning to the right."""
+    exposure_ms: float = Field(0.0, ge=0, le=500)
+    """A simulated camera's: how long the shutter is open; 0 is a moment."""
+    sensor_delay_ms: float = Field(0.0, ge=0, le=500)
+    """A simulated camera's: from the end of the exposure to the picture being there."""
+
+    @field_validator("exposure_ms")
+    @classmethod
+    def _fits(cls, exposure_ms: float, info: Any) -> float:
+        period_ms = 1000.0 / info.data.get("rate_hz", 1.0)
+        if exposure_ms > period_ms:
+            raise ValueError(f"must be at most the time between two frames, {period_ms:.3g} ms at camera.rate_hz")
+        return exposure_ms
 
 
 class VideoConfig(Section):

@@ -104,9 +104,11 @@ class VehicleEvent:
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture, no roll and no yaw.
+    """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture.
 
-    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal.
+    The pose is in the vehicle's frame, turned first by `yaw_rad` (positive to the left), then by `pitch_rad` (positive
+    downwards), then by `roll_rad` (positive leaning to the right: the horizon turns anticlockwise in the picture). The
+    field of view is horizontal.
     """
 
     width_px: int = 640
@@ -115,6 +117,9 @@ class CameraModel:
     x_m: float = 1.6
     z_m: float = 1.4
     pitch_rad: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    roll_rad: float = 0.0
 
     @property
     def focal_px(self) -> float:

@@ -77,6 +77,13 @@ BAD_RUNS = {
     "unknown key": (["--set", "vehicle.rute=a_key"], "did you mean 'route'?"),
     "wrong type": (["--set", "seed=one"], "'seed'"),
     "out of range": (["--set", "camera.rate_hz=0"], "'camera.rate_hz'"),
+    "exposure longer than a frame": (
+        ["--set", "camera.exposure_ms=34"],
+        "at most the time between two frames",
+    ),
+    "exposure of less than nothing": (["--set", "camera.exposure_ms=-1"], "'camera.exposure_ms'"),
+    "endless sensor delay": (["--set", "camera.sensor_delay_ms=5000"], "'camera.sensor_delay_ms'"),
+    "no such light": (["--set", "vehicle.light=moon"], "'vehicle.light'"),
     "not a change": (["--set", "seed"], "a.b=value"),
     "not YAML": (["--set", "seed=["], "not YAML"),
     "unknown condition": (["--set", "network.condition=L9"], "L0, L1, L2, L3, L4, L5"),

@@ -15,12 +15,14 @@ from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathServer
-from lavt.vehicle.camera import Camera, CapturedFrame
+from lavt.vehicle.camera import Camera, CapturedFrame, TimedCamera
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
 """No more than one keyframe on request in this time, so that requests cannot fill the link."""
 REMEMBERED_STAMPS = 512
 """No stamp is one of so many before: at 60 Hz more than the 5 s for which the safety of the vehicle knows them."""
+REMEMBERED_POSES = 512
+"""At 240 Hz twice the longest that a picture may take from the opening of the shutter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,9 @@ class Encoded:
 class CameraNode:
     """Takes a picture whenever one is due, and sends it to whoever has proven to be there.
 
-    Late wakes skip frames and count them; a picture is taken at the time it was due. `send_to` names plain receivers.
+    A frame is due when its shutter opens; the node wakes for it when its picture is there, which a `TimedCamera` says
+    and any other camera is taken to do at once. Late wakes skip frames and count them; a picture is taken at the time
+    it was due. `send_to` names plain receivers.
     """
 
     name = "camera"
@@ -64,12 +68,15 @@ class CameraNode:
         self._counts: Counter[str] = Counter()
         self._camera = camera
         self._pictures = pictures
+        self._there_after_ns = 0
+        if isinstance(camera, TimedCamera):
+            self._there_after_ns = camera.exposure_ns + camera.sensor_delay_ns
         self._packetizer = packetizer
         self._path = path
         self._start_ns = start_ns + camera.phase_ns
         self._send_to = tuple(send_to)
         self._next_frame = 0
-        self._poses: deque[Pose] = deque(maxlen=32)
+        self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
         self._keyframe_wanted = False
         self._keyframe_ns = 0
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
@@ -100,21 +107,24 @@ class CameraNode:
         }
 
     def next_wake_ns(self) -> int:
-        """When the next frame is due."""
-        return self._due_ns(self._next_frame)
+        """When the next picture is there."""
+        return self._due_ns(self._next_frame) + self._there_after_ns
 
     def _due_ns(self, number: int) -> int:
         return self._start_ns + round(number * NS_PER_S / self._camera.rate_hz)
 
     def _capture(self, _message: Message, now: Now) -> CapturedFrame | None:
         number = self._next_frame
-        while self._due_ns(number + 1) <= now.mono_ns:
+        while self._due_ns(number + 1) + self._there_after_ns <= now.mono_ns:
             number += 1
         self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame = number + 1
         due_ns = self._due_ns(number)
-        pose = next((pose for pose in reversed(self._poses) if pose.mono_ns <= due_ns), None)
-        frame = self._camera.capture(number, due_ns, pose)
+        if isinstance(self._camera, TimedCamera):
+            frame = self._camera.expose(number, due_ns, self._poses)
+        else:
+            pose = next((pose for pose in reversed(self._poses) if pose.mono_ns <= due_ns), None)
+            frame = self._camera.capture(number, due_ns, pose)
         if frame is None:
             self._counts["frames_missing"] += 1
         return frame

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
 
@@ -51,5 +52,27 @@ class Camera(Protocol):
         """Give frame `number`, taken at `at_ns`; None when there is no picture.
 
         `pose` is the newest pose at or before `at_ns`; only a simulated camera has to do with it.
+        """
+        ...
+
+
+@runtime_checkable
+class TimedCamera(Camera, Protocol):
+    """A camera that knows how long its shutter is open and how long its pictures take; the others need not."""
+
+    @property
+    def exposure_ns(self) -> int:
+        """How long the shutter is open; 0 is a moment."""
+        ...
+
+    @property
+    def sensor_delay_ns(self) -> int:
+        """From the end of the exposure to the picture being there."""
+        ...
+
+    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+        """Give frame `number`, whose shutter opened at `begin_ns`; asked when its picture is there; None without one.
+
+        `poses` are those known by then, oldest first; only a simulated camera has to do with them.
         """
         ...

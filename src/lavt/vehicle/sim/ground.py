@@ -1,4 +1,4 @@
-"""The ground seen from above, painted in square tiles on a world grid, at three scales.
+"""The ground seen from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
 
 A tile is a function of its place alone, so that what the camera sees does not depend on where the car has been.
 """
@@ -6,84 +6,83 @@ A tile is a function of its place alone, so that what the camera sees does not d
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
+from lavt.vehicle.sim.damage import damages
+from lavt.vehicle.sim.light import Light
 from lavt.vehicle.sim.road import Road
-from lavt.vehicle.sim.textures import SCALES_M, Grey, all_textures
+from lavt.vehicle.sim.shadows import Shadows
+from lavt.vehicle.sim.strips import OVERLAP_M, Grey, Square, Strips, along, join, pieces
+from lavt.vehicle.sim.textures import SCALES_M, all_textures
 
-TILE_M = (16.0, 32.0, 64.0)
+TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """Edge of a tile at each scale."""
 
 _MARK_M = 0.125
-_KEPT_TILES = (128, 512, 512)
-_CHUNK_M = 8.0
-_OVERLAP_M = 0.03
+_KEPT_TILES = (40, 60, 160, 400, 400)
+"""The two finest scales are painted on the way, a few tiles at a time; the others are kept for a whole road."""
 _GRAVEL_M = 1.6
-_SUBPIXEL_BITS = 4
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}
-_TRACK_PROFILE = ((1.0, 3), (0.7, 5), (0.4, 7))
+_TRACK_PROFILE = ((1.1, 4), (0.8, 8), (0.5, 12))
 """Wheel tracks are darker than the rest of a lane: width (m) and by how many grey levels, widest first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Strips:
-    """Quadrilaterals on the ground (n, 4, 2) in metres, with bounding boxes (n, 4): low x, low y, high x, high y."""
-
-    corners_m: FloatArray
-    boxes_m: FloatArray
-
-    def near(self, left_m: float, low_m: float, size_m: float) -> FloatArray:
-        """Those that touch the square with the corner (left, low)."""
-        boxes = self.boxes_m
-        touch = (boxes[:, 0] <= left_m + size_m) & (boxes[:, 2] >= left_m)
-        touch &= (boxes[:, 1] <= low_m + size_m) & (boxes[:, 3] >= low_m)
-        return self.corners_m[touch]
+_OIL = (0.7, 6)
+"""The middle of a lane is, too."""
 
 
 class Ground:
-    """Tiles of one road, painted when they are first asked for."""
+    """Tiles of one road in one light, painted when they are first asked for."""
 
-    def __init__(self, road: Road) -> None:
+    def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        self._gravel = _join(
-            [
-                _strips(road, strip.left_m + _GRAVEL_M, strip.right_m - _GRAVEL_M, strip.from_m, strip.to_m)
-                for strip in road.paved
-            ]
+        # Factors in 255ths: a surface in the sun, and which share of that is gone in the deepest shadow.
+        self._lit = _bytes(np.array(light.lit))
+        self._dimmed = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
+        self._shadows = shadows
+        self._gravel, self._asphalt = (
+            join(
+                [
+                    along(road, each.left_m + wide_m, each.right_m - wide_m, each.from_m, each.to_m)
+                    for each in road.paved
+                ]
+            )
+            for wide_m in (_GRAVEL_M, 0.0)
         )
-        self._asphalt = _join(
-            [_strips(road, strip.left_m, strip.right_m, strip.from_m, strip.to_m) for strip in road.paved]
-        )
-        edges = np.array(road.lanes.edges_m)
-        tracks = [centre + side for centre in (edges[1:] + edges[:-1]) / 2 for side in (-0.85, 0.85)]
-        self._tracks = [
-            (_join([_strips(road, at + width_m / 2, at - width_m / 2) for at in tracks]), grey)
-            for width_m, grey in _TRACK_PROFILE
-        ]
+        self._tracks = _tracks(road)
+        self._damages = damages(road)
         self._marks = {colour: _marks(road, colour) for colour in _PAINT}
 
     def window(self, level: int, low: tuple[int, int], count: int) -> Picture:
-        """Paint `count` x `count` tiles from the tile index `low` (x, y) on.
+        """Paint `count` x `count` tiles from the tile index `low` (x, y) on, with a fourth channel that says nothing.
 
-        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner.
+        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. Four bytes a
+        texel, because OpenCV warps them in less than half the time of three.
         """
-        rows = [
-            np.hstack([self._tile(level, low[0] + column, low[1] + row) for column in range(count)])
-            for row in range(count)
-        ]
-        return np.vstack(rows)
+        pixels = round(TILE_M[level] / SCALES_M[level])
+        window = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
+        for row in range(count):
+            for column in range(count):
+                tile = self.tile(level, low[0] + column, low[1] + row)
+                part = np.s_[row * pixels : (row + 1) * pixels, column * pixels : (column + 1) * pixels]
+                cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, window[part])
+        return window
 
-    def _tile(self, level: int, column: int, row: int) -> Picture:
+    def room(self, level: int) -> bool:
+        """Whether one more tile of a scale can be kept without giving up another."""
+        return len(self._tiles[level]) < _KEPT_TILES[level]
+
+    def tile(self, level: int, column: int, row: int) -> Picture:
+        """Give one tile, painted now if it is not there."""
         tiles = self._tiles[level]
         tile = tiles.get((column, row))
         if tile is None:
-            tile = self._paint(level, column, row)
+            edge_m = TILE_M[level]
+            tile = self._paint(level, Square(column * edge_m, row * edge_m, edge_m, SCALES_M[level]))
             tiles[(column, row)] = tile
             if len(tiles) > _KEPT_TILES[level]:
                 tiles.popitem(last=False)
@@ -91,94 +90,88 @@ class Ground:
             tiles.move_to_end((column, row))
         return tile
 
-    def _paint(self, level: int, column: int, row: int) -> Picture:
-        place = _Place(level, column * TILE_M[level], row * TILE_M[level])
-        textures = all_textures()[level]
-        asphalt = place.mask(self._asphalt)
-        if asphalt is None or asphalt.min() < 255:
-            picture = _mottled(place.surface(textures.grass), place)
-            gravel = place.mask(self._gravel)
-            if gravel is not None:
-                picture = _blend(picture, place.surface(textures.gravel), gravel)
+    def _paint(self, level: int, square: Square) -> Picture:
+        asphalt = self._asphalt.mask(square)
         if asphalt is None:
-            return picture
-        shade = np.zeros_like(asphalt)
-        for strips, depth in self._tracks:
-            place.fill(shade, strips, depth)
-        grey = np.asarray(cv2.subtract(place.surface(textures.asphalt), shade), dtype=np.uint8)
-        road = np.dstack([grey, grey, grey - 2])
-        picture = road if asphalt.min() == 255 else _blend(picture, road, asphalt)
-        # A mark thinner than a texel is still drawn about one texel wide: let as much of the road through.
-        thinness = min(1.0, _MARK_M * 1.3 / SCALES_M[level])
-        for colour, strips in self._marks.items():
-            paint = place.mask(strips)
+            picture = self._paint_verge(level, square)
+        elif asphalt.min() == 255:
+            picture = self._paint_asphalt(level, square)
+        else:
+            picture = _laid(self._paint_verge(level, square), self._paint_asphalt(level, square), asphalt)
+        shade = None if self._shadows is None else self._shadows.mask(square)
+        lit = _coloured(picture, self._lit)
+        if shade is None:
+            return lit
+        gone = cv2.multiply(lit, _coloured(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
+        return np.asarray(cv2.subtract(lit, gone), dtype=np.uint8)
+
+    def _paint_verge(self, level: int, square: Square) -> Picture:
+        textures = all_textures()[level]
+        grass = _mottled(_cut(textures.grass, square), square)
+        gravel = self._gravel.mask(square)
+        return grass if gravel is None else _laid(grass, _cut(textures.gravel, square), gravel)
+
+    def _paint_asphalt(self, level: int, square: Square) -> Picture:
+        textures, scale_m = all_textures()[level], SCALES_M[level]
+        darker = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
+        for places, grey in self._tracks:
+            places.fill(darker, square, grey)
+        for damage in self._damages:
+            # What is thinner than a texel is still drawn about one texel wide: let as much of the road through.
+            grey = round(damage.grey * min(1.0, damage.width_m / scale_m))
+            if grey:
+                damage.places.fill(darker, square, grey)
+        worn = np.asarray(cv2.subtract(_cut(textures.asphalt, square), darker), dtype=np.uint8)
+        picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
+        thinness = min(1.0, _MARK_M * 1.3 / scale_m)
+        for colour, places in self._marks.items():
+            paint = places.mask(square)
             if paint is not None:
-                wear = place.surface(textures.wear)
-                alpha = np.asarray(cv2.multiply(paint, wear, scale=thinness / 255), dtype=np.uint8)
-                picture = _blend(picture, np.array(_PAINT[colour], dtype=np.uint8), alpha)
+                alpha = np.asarray(cv2.multiply(paint, _cut(textures.wear, square), scale=thinness / 255), np.uint8)
+                cover = cv2.merge((alpha, alpha, alpha))
+                kept = cv2.multiply(picture, cv2.bitwise_not(cover), scale=1 / 255)
+                picture = np.asarray(cv2.add(kept, _coloured(cover, _PAINT[colour])), dtype=np.uint8)
         return picture
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a tile is: its scale and its corner."""
-
-    level: int
-    left_m: float
-    low_m: float
-
-    @property
-    def pixels(self) -> int:
-        return round(TILE_M[self.level] / SCALES_M[self.level])
-
-    def surface(self, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Cut the tile's part of a pattern; a period is a whole number of tiles or a tile one of periods."""
-        pixels, period = self.pixels, len(texture)
-        if pixels > period:
-            count = pixels // period
-            return np.tile(texture, (count, count, 1)[: texture.ndim])
-        row = round(self.low_m / SCALES_M[self.level]) % period
-        column = round(self.left_m / SCALES_M[self.level]) % period
-        return texture[row : row + pixels, column : column + pixels]
-
-    def mask(self, strips: Strips) -> Grey | None:
-        """Make a mask of the strips; None when none is in the tile."""
-        mask = np.zeros((self.pixels, self.pixels), dtype=np.uint8)
-        self.fill(mask, strips, 255)
-        return mask if mask.any() else None
-
-    def fill(self, mask: Grey, strips: Strips, value: int) -> None:
-        """Paint the strips into `mask`."""
-        corners_m = strips.near(self.left_m, self.low_m, TILE_M[self.level])
-        corners_px = (corners_m - np.array([self.left_m, self.low_m])) / SCALES_M[self.level] - 0.5
-        for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
-            cv2.fillConvexPoly(mask, polygon, (value,), lineType=cv2.LINE_AA, shift=_SUBPIXEL_BITS)
+def _bytes(factors: FloatArray) -> tuple[int, ...]:
+    return tuple(np.clip(np.rint(factors * 255.0), 0, 255).astype(int).tolist())
 
 
-def _strips(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
-    """Lay a strip along the road between two lateral offsets, cut into short pieces."""
-    first_m, last_m = max(from_m, road.first_m), min(to_m, road.last_m)
-    cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _CHUNK_M * 4) + 1))
-    return _pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + _OVERLAP_M)
+def _coloured(picture: MatLike, colour: tuple[int, ...]) -> Picture:
+    """Multiply every texel by a colour, in 255ths."""
+    return np.asarray(cv2.multiply(picture, _flat(picture.shape[0], colour), scale=1 / 255), dtype=np.uint8)
 
 
-def _pieces(road: Road, left_m: float, right_m: float, begin_m: FloatArray, end_m: FloatArray) -> Strips:
-    corners = np.stack(
-        [
-            road.across(begin_m, left_m),
-            road.across(begin_m, right_m),
-            road.across(end_m, right_m),
-            road.across(end_m, left_m),
-        ],
-        axis=1,
-    )
-    return Strips(corners, np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1))
+@lru_cache(maxsize=32)
+def _flat(pixels: int, colour: tuple[int, ...]) -> Picture:
+    """Give a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
+    flat = np.empty((pixels, pixels, 3), dtype=np.uint8)
+    flat[:] = colour
+    return flat
 
 
-def _join(strips: Sequence[Strips]) -> Strips:
-    return Strips(
-        np.concatenate([strip.corners_m for strip in strips]), np.concatenate([strip.boxes_m for strip in strips])
-    )
+def _cut(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
+    """Cut the square's part of a pattern; a period is a whole number of tiles or a tile one of periods."""
+    pixels, period = square.pixels, len(texture)
+    if pixels > period:
+        count = pixels // period
+        return np.tile(texture, (count, count, 1)[: texture.ndim])
+    row = round(square.low_m / square.scale_m) % period
+    column = round(square.left_m / square.scale_m) % period
+    return texture[row : row + pixels, column : column + pixels]
+
+
+def _tracks(road: Road) -> list[tuple[Strips, int]]:
+    """Where wheels run, and where oil drips, in every lane of the driven direction."""
+    edges = np.array(road.lanes.edges_m)
+    centres = (edges[1:] + edges[:-1]) / 2
+    wheels = [centre + side for centre in centres for side in (-0.85, 0.85)]
+    ways = [(centres, *_OIL)] + [(wheels, width_m, grey) for width_m, grey in _TRACK_PROFILE]
+    return [
+        (join([along(road, at + width_m / 2, at - width_m / 2) for at in offsets]), grey)
+        for offsets, width_m, grey in ways
+    ]
 
 
 def _marks(road: Road, colour: str) -> Strips:
@@ -188,30 +181,28 @@ def _marks(road: Road, colour: str) -> Strips:
             continue
         left_m, right_m = mark.offset_m + mark.width_m / 2, mark.offset_m - mark.width_m / 2
         if mark.kind == "solid":
-            found.append(_strips(road, left_m, right_m, mark.from_m, mark.to_m))
+            found.append(along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
         begin = mark.dashes_m(road.first_m, road.last_m)
         # Two halves a dash, so that it bends with the road.
         halves = np.concatenate([begin, begin + mark.dash_m / 2])
-        found.append(_pieces(road, left_m, right_m, halves, halves + mark.dash_m / 2 + _OVERLAP_M))
-    return _join(found) if found else Strips(np.empty((0, 4, 2)), np.empty((0, 4)))
+        found.append(pieces(road, left_m, right_m, halves, halves + mark.dash_m / 2 + OVERLAP_M))
+    return join(found)
 
 
-def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
-    """Lay `over`, a picture or one colour, over `under`."""
-    weight = alpha.astype(np.uint16)[..., None]
-    weight += weight >> 7  # 255 becomes 256, so that full paint is full
-    mixed = over * weight
-    mixed += under * (256 - weight)
-    mixed >>= 8
-    return mixed.astype(np.uint8)
+def _laid(under: Picture, over: Picture, alpha: Grey) -> Picture:
+    """Lay a picture over another."""
+    cover = cv2.merge((alpha, alpha, alpha))
+    kept = cv2.multiply(under, cv2.bitwise_not(cover), scale=1 / 255)
+    return np.asarray(cv2.add(cv2.multiply(over, cover, scale=1 / 255), kept), dtype=np.uint8)
 
 
-def _mottled(grass: Picture, place: _Place) -> Picture:
+def _mottled(grass: Picture, square: Square) -> Picture:
     """Lay large patches over the grass, of lengths that do not fit its period: the eye must not see it repeat."""
-    count = 32
-    middle_m = (np.arange(count) + 0.5) * TILE_M[place.level] / count
-    x_m, y_m = place.left_m + middle_m, (place.low_m + middle_m)[:, None]
-    light = 1.0 + 0.06 * np.sin(0.071 * x_m + 0.113 * y_m) + 0.05 * np.sin(0.157 * x_m - 0.093 * y_m + 1.0)
-    fine = np.asarray(cv2.resize(light.astype(np.float32), grass.shape[1::-1], interpolation=cv2.INTER_LINEAR))
-    return np.asarray(np.clip(grass * fine[..., None], 0, 255), dtype=np.uint8)
+    count = 16
+    middle_m = (np.arange(count) + 0.5) * square.edge_m / count
+    x_m, y_m = square.left_m + middle_m, (square.low_m + middle_m)[:, None]
+    light = 0.92 + 0.09 * np.sin(0.071 * x_m + 0.113 * y_m) + 0.07 * np.sin(0.157 * x_m - 0.093 * y_m + 1.0)
+    levels = np.rint(light * 200.0).astype(np.uint8)
+    fine = cv2.resize(cv2.merge((levels, levels, levels)), grass.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.multiply(grass, fine, scale=1 / 200), dtype=np.uint8)

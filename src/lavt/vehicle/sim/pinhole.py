@@ -7,7 +7,7 @@ Pixel coordinates are those of OpenCV: the middle of the top left pixel is (0, 0
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,39 +25,71 @@ class View:
 
     def project(self, points_m: FloatArray) -> FloatArray:
         """Picture coordinates and depth (u px, v px, m) of world points (..., 3); the depth may be negative."""
+        model = self.model
         cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)
-        pitch_cosine, pitch_sine = math.cos(self.model.pitch_rad), math.sin(self.model.pitch_rad)
-        dx, dy = points_m[..., 0] - self.x_m, points_m[..., 1] - self.y_m
-        ahead, left, up = dx * cosine + dy * sine, dy * cosine - dx * sine, points_m[..., 2] - self.model.z_m
-        depth = ahead * pitch_cosine - up * pitch_sine
-        down = -ahead * pitch_sine - up * pitch_cosine
-        u_px, v_px = principal_point(self.model)
-        scale = self.model.focal_px / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-        return np.stack([u_px - left * scale, v_px + down * scale, depth], axis=-1)
+        pitch_cosine, pitch_sine = math.cos(model.pitch_rad), math.sin(model.pitch_rad)
+        u_px, v_px = principal_point(model)
+        # Right, down and depth of a point less the camera, each a row; then turned by the roll, times the focal length.
+        camera_from_world = np.array(
+            [
+                [sine, -cosine, 0.0],
+                [-cosine * pitch_sine, -sine * pitch_sine, -pitch_cosine],
+                [cosine * pitch_cosine, sine * pitch_cosine, -pitch_sine],
+            ]
+        )
+        camera_from_world[:2] = rolled(model.roll_rad) @ camera_from_world[:2] * model.focal_px
+        points = (points_m - np.array([self.x_m, self.y_m, model.z_m])) @ camera_from_world.T
+        depth = points[..., 2:]
+        points[..., :2] /= np.where(np.abs(depth) < 1e-6, 1e-6, depth)
+        points[..., :2] += (u_px, v_px)
+        return np.asarray(points)
 
     def ground_from_picture(self) -> FloatArray:
-        """3 x 3 homography from picture (u, v, 1) to the world's ground (x, y, 1), for rows below the horizon."""
+        """3 x 3 homography from picture (u, v, 1) to the world's ground (x, y, 1), for what is below the horizon."""
         model = self.model
         focal_px, pitch_cosine, pitch_sine = model.focal_px, math.cos(model.pitch_rad), math.sin(model.pitch_rad)
-        u_px, v_px = principal_point(model)
         # Along the ray of a pixel: ahead, left and down for each metre of depth; the ground is z_m below the camera.
-        ahead = np.array([0.0, -pitch_sine / focal_px, pitch_cosine + v_px * pitch_sine / focal_px])
-        left = np.array([-1.0 / focal_px, 0.0, u_px / focal_px])
-        down = np.array([0.0, pitch_cosine / focal_px, pitch_sine - v_px * pitch_cosine / focal_px])
+        ahead = np.array([0.0, -pitch_sine / focal_px, pitch_cosine])
+        left = np.array([-1.0 / focal_px, 0.0, 0.0])
+        down = np.array([0.0, pitch_cosine / focal_px, pitch_sine])
         cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)
-        return np.stack(
+        ground_from_level = np.stack(
             [
                 model.z_m * (cosine * ahead - sine * left) + self.x_m * down,
                 model.z_m * (sine * ahead + cosine * left) + self.y_m * down,
                 down,
             ]
         )
+        u_px, v_px = principal_point(model)
+        level_from_picture = np.eye(3)
+        level_from_picture[:2, :2] = rolled(-model.roll_rad)
+        level_from_picture[:2, 2] = level_from_picture[:2, :2] @ np.array([-u_px, -v_px])
+        return np.asarray(ground_from_level @ level_from_picture)
 
 
 def view_from(model: CameraModel, pose: Pose) -> View:
     """Place the camera of a vehicle at `pose`."""
     cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-    return View(model, pose.x_m + model.x_m * cosine, pose.y_m + model.x_m * sine, pose.heading_rad)
+    x_m = pose.x_m + model.x_m * cosine - model.y_m * sine
+    y_m = pose.y_m + model.x_m * sine + model.y_m * cosine
+    return View(model, x_m, y_m, pose.heading_rad + model.yaw_rad)
+
+
+def rolled(roll_rad: float) -> FloatArray:
+    """Turn picture coordinates (right, down) from a level camera's to those of one that leans right by `roll_rad`."""
+    cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
+    return np.array([[cosine, sine], [-sine, cosine]])
+
+
+def levelled(model: CameraModel) -> CameraModel:
+    """Give a camera without roll, of the same focal length, whose picture holds all that `model` sees."""
+    if model.roll_rad == 0.0:
+        return model
+    cosine, sine = abs(math.cos(model.roll_rad)), abs(math.sin(model.roll_rad))
+    width_px = 2 * math.ceil((model.width_px * cosine + model.height_px * sine) / 2 + 1)
+    height_px = 2 * math.ceil((model.width_px * sine + model.height_px * cosine) / 2 + 1)
+    field_of_view_rad = 2 * math.atan(width_px / 2 / model.focal_px)
+    return replace(model, width_px=width_px, height_px=height_px, field_of_view_rad=field_of_view_rad, roll_rad=0.0)
 
 
 def principal_point(model: CameraModel) -> tuple[float, float]:
@@ -66,12 +98,12 @@ def principal_point(model: CameraModel) -> tuple[float, float]:
 
 
 def horizon_row(model: CameraModel) -> float:
-    """Picture row (v, px) of the horizon."""
+    """Picture row (v, px) of the horizon, for a camera without roll."""
     return principal_point(model)[1] - model.focal_px * math.tan(model.pitch_rad)
 
 
 def row_of_depth(model: CameraModel, ahead_m: float) -> int:
-    """First picture row whose ground is no more than `ahead_m` ahead of the camera, kept within the picture."""
+    """First row whose ground is no more than `ahead_m` ahead, kept within the picture; for a camera without roll."""
     angle_rad = math.atan2(model.z_m, ahead_m) - model.pitch_rad
     row = math.ceil(principal_point(model)[1] + model.focal_px * math.tan(angle_rad))
     return min(max(row, 0), model.height_px)

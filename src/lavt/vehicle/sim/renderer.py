@@ -1,13 +1,15 @@
 """Pictures of a road for a camera on a car, made on the CPU.
 
-The ground is warped from tiles seen from above, in three bands of rows, finer ones nearer (a clipmap); sky and hills
-are cut from a panorama; what stands upright is drawn from far to near; the sensor adds its noise. A frame depends on
-the pose, the frame's number and the seed alone: equal to the byte for equal versions and processor features.
+The ground is warped from tiles seen from above, in five bands of rows (`bands`); sky and hills are cut from a panorama;
+what stands upright is drawn from far to near; the sensor adds its noise. A frame depends on the poses, the frame's
+number and the seed alone: equal to the byte for equal versions and processor features.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -15,91 +17,167 @@ import numpy as np
 
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.streams import stream
-from lavt.vehicle.sim.ground import TILE_M, Ground
-from lavt.vehicle.sim.panorama import HAZE, Panorama
-from lavt.vehicle.sim.pinhole import View, row_of_depth, view_from
+from lavt.vehicle.sim.bands import Band, bands_of
+from lavt.vehicle.sim.ground import Ground
+from lavt.vehicle.sim.light import LIGHTS, LightName
+from lavt.vehicle.sim.panorama import Panorama
+from lavt.vehicle.sim.pinhole import View, levelled, principal_point, rolled, view_from
 from lavt.vehicle.sim.road import Road
-from lavt.vehicle.sim.scenery import Scenery
-from lavt.vehicle.sim.textures import SCALES_M
+from lavt.vehicle.sim.scenery import HAZE_M, Scenery
+from lavt.vehicle.sim.shadows import Shadows
+from lavt.vehicle.sim.standing import standing
 
 SceneryKind = Literal["full", "light", "none"]
-"""full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails either."""
+"""full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails and no shadows either."""
 
-BAND_FAR_M = (12.0, 30.0, 160.0)
-"""How far ahead of the camera each scale of the ground serves."""
+MOST_PARTS, MOST_INSTANTS = 8, 16
+"""An exposure is drawn in so many parts at most, the near ground in each from so many instants at most."""
 
+_STEP_PX = 3.0
+_NEAR_BANDS = 2
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
-_HAZE_M = 240.0
+_CLEAR_M = 11.0
+_KEPT_FROM_LEVEL = 2
+_SWERVE_M = 6.0
+_SWERVE_RAD = 0.6
 
 
 class Renderer:
-    """Draws one road for one camera model."""
+    """Draws one road in one light for one camera model."""
 
-    def __init__(self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind) -> None:
+    def __init__(
+        self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
+    ) -> None:
         cv2.setNumThreads(1)  # with more the split of the work, and with it the last bit, may change
         self._road, self._model, self._seed = road, model, seed
-        self._ground = Ground(road)
-        self._bands = _bands(model)
-        sky_rows = self._bands[-1].first_row
-        self._panorama = Panorama(model, sky_rows, plain=scenery != "full")
-        self._scenery = None if scenery == "none" else Scenery(road, trees=scenery == "full")
+        self._level = levelled(model)
+        self._ground, self._scenery = world(road, scenery, light)
+        self._bands = bands_of(self._level)
+        self._panorama = Panorama(self._level, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
         self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
+        self._canvas = np.empty((self._level.height_px, self._level.width_px, 4), dtype=np.uint8)
+        self._kept, self._haze = _haze(self._level, self._bands, LIGHTS[light].haze)
         self._noise = _noise(model)
 
     def prepare(self) -> None:
-        """Look along the route beforehand, so that no frame has to wait for the ground to be painted."""
-        for s_m in np.arange(0.0, self._road.length_m + 10.0, 4.0):
-            x_m, y_m, heading_rad, _ = (float(value) for value in self._road.point(s_m))
-            self.render(Pose(0, x_m, y_m, heading_rad), 0)
+        """Do beforehand what would make a frame late: the coarse ground along the route, and the first picture."""
+        for s_m in np.arange(0.0, self._road.length_m + 16.0, 16.0):
+            heading_rad = float(self._road.point(s_m)[2])
+            for lateral_m in (-_SWERVE_M, 0.0, _SWERVE_M):
+                x_m, y_m = self._road.across(s_m, lateral_m).tolist()
+                for turned_rad in (-_SWERVE_RAD, 0.0, _SWERVE_RAD):
+                    self._prepare_ground(view_from(self._level, Pose(0, x_m, y_m, heading_rad + turned_rad)))
+        if self._scenery is not None:
+            self._scenery.prepare()
+        self.render(Pose(0, *self._road.start), 0)
 
     def render(self, pose: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen by a vehicle at `pose`; a new array each time."""
-        model = self._model
-        picture = np.empty((model.height_px, model.width_px, 3), dtype=np.uint8)
-        view = view_from(model, pose)
-        self._panorama.cut(view.heading_rad, picture[: self._bands[-1].first_row])
-        homography = view.ground_from_picture()
-        for level, band in enumerate(self._bands):
-            self._warp(level, band, view, homography, picture)
-        self._add_haze(picture)
-        if self._scenery is not None:
-            self._scenery.draw(view, picture)
+        """Draw frame `number` as seen in one moment by a vehicle at `pose`; a new array each time."""
+        picture = self._drawn(pose)
         self._add_noise(picture, number)
         return picture
 
-    def _warp(self, level: int, band: Band, view: View, homography: FloatArray, picture: Picture) -> None:
-        rows = picture[band.first_row : band.end_row]
+    def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
+        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open.
+
+        The exposure is cut into parts, within which nothing but the near ground moves much; in each part that is seen
+        from several instants.
+        """
+        parts = _count(self._moved_px(begin, end, self._bands[_NEAR_BANDS].end_row), MOST_PARTS)
+        instants = _count(self._moved_px(begin, end, self._level.height_px - 1) / parts, MOST_INSTANTS)
+        light = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
+        for part in range(parts):
+            shares = (part + (np.arange(instants) + 0.5) / instants) / parts
+            near = [_between(begin, end, share) for share in shares.tolist()]
+            light += self._drawn(_between(begin, end, (part + 0.5) / parts), near)
+        picture = ((light + parts // 2) // parts).astype(np.uint8)
+        self._add_noise(picture, number)
+        return picture
+
+    def _drawn(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
+        """Draw the world without noise, from `pose`; the near ground as the mean of what is seen from `near`."""
+        view = view_from(self._level, pose)
+        self._panorama.cut(view.heading_rad, self._canvas[: self._bands[-1].first_row])
+        blurred = len(near) > 1
+        homography = view.ground_from_picture()
+        for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
+            self._warp(band, view, homography)
+        if blurred:
+            self._blur_near([view_from(self._level, each) for each in near])
+        self._add_haze()
+        picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
+        if self._scenery is not None:
+            self._scenery.draw(view, picture)
+        return picture if self._level is self._model else self._rolled(picture)
+
+    def _warp(self, band: Band, view: View, homography: FloatArray) -> None:
+        rows = self._canvas[band.first_row : band.end_row]
         if not len(rows):
             return
         low = band.low_tile(view)
-        scale_m, tile_m = SCALES_M[level], TILE_M[level]
-        texel_from_ground = np.array(
-            [
-                [1 / scale_m, 0, -low[0] * tile_m / scale_m - 0.5],
-                [0, 1 / scale_m, -low[1] * tile_m / scale_m - 0.5],
-                [0, 0, 1],
-            ]
-        )
-        picture_from_band = np.array([[1.0, 0, 0], [0, 1, band.first_row], [0, 0, 1]])
-        matrix = texel_from_ground @ homography @ picture_from_band
-        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
-        window = self._window(level, low)
-        cv2.warpPerspective(window, matrix, (rows.shape[1], rows.shape[0]), rows, flags, cv2.BORDER_REPLICATE)
+        matrix = band.texel_from_ground(low) @ homography @ band.picture_from_lines
+        flags, size = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR, (rows.shape[1], rows.shape[0] * band.lines)
+        window = self._window(band, low)
+        if band.lines == 1:
+            cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
+            return
+        lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        # In NumPy: OpenCV's reduction by area takes longer than the warp.
+        light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
+        rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
 
-    def _window(self, level: int, low: tuple[int, int]) -> Picture:
-        held = self._windows[level]
+    def _window(self, band: Band, low: tuple[int, int]) -> Picture:
+        held = self._windows[band.level]
         if held is None or held[0] != low:
-            held = (low, self._ground.window(level, low, self._bands[level].tiles))
-            self._windows[level] = held
+            held = (low, self._ground.window(band.level, low, band.tiles))
+            self._windows[band.level] = held
         return held[1]
 
-    def _add_haze(self, picture: Picture) -> None:
-        band = self._bands[-1]
-        rows = picture[band.first_row : band.end_row]
-        depth_m = self._model.z_m / np.maximum(np.tan(_row_angles(self._model)[band.first_row : band.end_row]), 1e-6)
-        share = (1.0 - np.exp(-depth_m / _HAZE_M))[:, None, None]
-        rows[:] = (rows * (1 - share) + np.array(HAZE) * share + 0.5).astype(np.uint8)
+    def _prepare_ground(self, view: View) -> None:
+        for band in self._bands[_KEPT_FROM_LEVEL:]:
+            low = band.low_tile(view)
+            for index in range(band.tiles**2 if self._ground.room(band.level) else 0):
+                self._ground.tile(band.level, low[0] + index % band.tiles, low[1] + index // band.tiles)
+
+    def _add_haze(self) -> None:
+        rows = self._canvas[self._bands[-1].first_row :][: len(self._kept)]
+        if len(rows):
+            cv2.multiply(rows, self._kept, rows, 1 / 255)
+            cv2.add(rows, self._haze, rows)
+
+    def _rolled(self, level: Picture) -> Picture:
+        model = self._model
+        level_from_picture = np.empty((2, 3))
+        level_from_picture[:, :2] = rolled(-model.roll_rad)
+        level_from_picture[:, 2] = np.array(principal_point(self._level)) - level_from_picture[:, :2] @ np.array(
+            principal_point(model)
+        )
+        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+        turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
+        return np.asarray(turned, dtype=np.uint8)
+
+    def _blur_near(self, views: Sequence[View]) -> None:
+        rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
+        light = np.zeros(rows.shape, dtype=np.uint16)
+        for view in views:
+            homography = view.ground_from_picture()
+            for band in self._bands[:_NEAR_BANDS]:
+                self._warp(band, view, homography)
+            light += rows
+        rows[:] = (light + len(views) // 2) // len(views)
+
+    def _moved_px(self, begin: Pose, end: Pose, row: int) -> float:
+        """How far the ground in the corners of a row moves in the picture, or the horizon if that is more."""
+        model = self._level
+        first, last = view_from(model, begin), view_from(model, end)
+        pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
+        ground = pixels @ first.ground_from_picture().T
+        turned_px = model.focal_px * abs(math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi))
+        if (ground[:, 2] <= 0.0).any():
+            return turned_px  # the row is above the horizon
+        places = np.column_stack([ground[:, :2] / ground[:, 2:], np.zeros(2)])
+        return max(float(np.hypot(*(last.project(places) - pixels)[:, :2].T).max()), turned_px)
 
     def _add_noise(self, picture: Picture, number: int) -> None:
         down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
@@ -108,41 +186,41 @@ class Renderer:
         cv2.subtract(picture, self._noise[1][part], picture)
 
 
-class Band:
-    """The rows of the picture that one scale of the ground serves, and the square of tiles that they see."""
-
-    def __init__(self, model: CameraModel, level: int) -> None:
-        far_m = BAND_FAR_M[level]
-        near_m = BAND_FAR_M[level - 1] if level else 0.0
-        self.first_row = row_of_depth(model, far_m)
-        self.end_row = row_of_depth(model, near_m) if level else model.height_px
-        self._tile_m = TILE_M[level]
-        # The square is laid around a point ahead of the camera, from which everything in the rows is within reach.
-        self._ahead_m = (near_m + far_m) / 2
-        beside_m = far_m * model.width_px / 2 / model.focal_px * math.hypot(1.0, math.tan(model.pitch_rad))
-        reach_m = math.hypot(far_m - self._ahead_m, beside_m)
-        self._around = math.ceil(reach_m / self._tile_m)
-
-    @property
-    def tiles(self) -> int:
-        """How many tiles an edge of the square has."""
-        return 2 * self._around + 1
-
-    def low_tile(self, view: View) -> tuple[int, int]:
-        """Index (x, y) of the square's first tile."""
-        x_m = view.x_m + self._ahead_m * math.cos(view.heading_rad)
-        y_m = view.y_m + self._ahead_m * math.sin(view.heading_rad)
-        return math.floor(x_m / self._tile_m) - self._around, math.floor(y_m / self._tile_m) - self._around
+@lru_cache(maxsize=2)
+def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
+    """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
+    light = LIGHTS[light_name]
+    if scenery == "none":
+        return Ground(road, light, None), None
+    things = standing(road, trees=scenery == "full")
+    shadows = Shadows(things, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
+    return Ground(road, light, shadows), Scenery(things, light)
 
 
-def _bands(model: CameraModel) -> tuple[Band, ...]:
-    return tuple(Band(model, level) for level in range(len(SCALES_M)))
+def _count(moved_px: float, most: int) -> int:
+    return min(max(math.ceil(moved_px / _STEP_PX), 1), most)
 
 
-def _row_angles(model: CameraModel) -> FloatArray:
-    """Angle below the horizon at which each row of the picture looks, in its middle."""
-    rows = np.arange(model.height_px) - (model.height_px - 1) / 2
-    return np.asarray(np.arctan(rows / model.focal_px) + model.pitch_rad)
+def _between(begin: Pose, end: Pose, share: float) -> Pose:
+    turn_rad = math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi)
+    return Pose(
+        begin.mono_ns + round((end.mono_ns - begin.mono_ns) * share),
+        begin.x_m + (end.x_m - begin.x_m) * share,
+        begin.y_m + (end.y_m - begin.y_m) * share,
+        begin.heading_rad + turn_rad * share,
+    )
+
+
+def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
+    """What haze leaves of the ground's far rows (255ths), and what it adds: (rows, columns, 4) each."""
+    rows = np.arange(bands[-1].first_row, bands[1].first_row)
+    angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
+    depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
+    share = np.broadcast_to(
+        (1.0 - np.exp(-np.maximum(depth_m - _CLEAR_M, 0.0) / HAZE_M))[:, None, None], (len(rows), model.width_px, 4)
+    )
+    added = share * np.array([*colour, 0.0])
+    return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
 
 
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:

@@ -17,7 +17,7 @@ from lavt.domain import FloatArray, Picture
 from lavt.streams import stream
 
 PERIOD_M = 32.0
-SCALES_M = (0.02, 0.08, 0.32)
+SCALES_M = (0.02, 0.04, 0.08, 0.16, 0.32)
 """Metres a texel, finest first."""
 
 Grey = NDArray[np.uint8]
@@ -85,7 +85,7 @@ def _finest() -> Textures:
     pebbles = 1.0 + 0.07 * stones + 0.10 * grain + 0.04 * tufts
     gravel = np.array([98, 112, 122], dtype=np.float32) * pebbles[..., None]
     chips = 0.9 * stones + 0.6 * grain + 1.3 * seamless_noise("chips", size, 160)
-    wear = 205 + 26 * np.clip(-1.1 - 0.5 * chips, -4.0, 0.6) + 8 * patches
+    wear = 204 + 32 * np.clip(-0.9 - 0.75 * chips, -4.4, 0.5) + 11 * patches
     return Textures(_bytes(np.maximum(asphalt, 30)), _bytes(grass), _bytes(gravel), _bytes(wear))
 
 

@@ -1,0 +1,80 @@
+"""Measures what rendering costs: CPU time of frames over whole drives, in the lane and swerving, and memory.
+
+A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad. A hitch is the longest frame of a drive.
+
+    python benchmarks/render_times.py [--route b] [--drives 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time  # noqa: TID251 (CPU time is what is measured)
+from statistics import median
+
+import numpy as np
+
+from lavt.domain import CameraModel, FloatArray, Pose
+from lavt.vehicle.sim import renderer
+from lavt.vehicle.sim.light import LightName
+from lavt.vehicle.sim.renderer import Renderer, SceneryKind
+from lavt.vehicle.sim.road import Road, load_road
+
+FRAME_M = 8.33 / 30
+SWERVE_M, SWERVE_RAD, SWERVE_EVERY_M = 6.0, 0.6, 56.0
+VGA, HD = CameraModel(), CameraModel(1280, 720)
+CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
+    (VGA, "full", "noon", False),
+    (VGA, "full", "low_sun", False),
+    (VGA, "full", "overcast", False),
+    (VGA, "light", "noon", False),
+    (VGA, "none", "noon", False),
+    (VGA, "full", "low_sun", True),
+    (HD, "full", "noon", False),
+    (HD, "full", "low_sun", True),
+)
+
+
+def drive(road: Road, drawing: Renderer, *, swerving: bool) -> FloatArray:
+    """CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
+    times = []
+    for number, s_m in enumerate(np.arange(0.0, road.length_m, FRAME_M)):
+        phase = 2 * np.pi * s_m / SWERVE_EVERY_M if swerving else 0.0
+        x_m, y_m = road.across(s_m, SWERVE_M * np.sin(phase)).tolist()
+        turned_rad = SWERVE_RAD * float(np.cos(phase)) if swerving else 0.0
+        pose = Pose(0, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
+        begin_s = time.process_time()
+        drawing.render(pose, number)
+        times.append((time.process_time() - begin_s) * 1000)
+    return np.array(times)
+
+
+def main() -> None:
+    """Print a table; of several drives the medians, so that one disturbance by other programs does not count."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--route", default="b")
+    parser.add_argument("--drives", type=int, default=3)
+    asked = parser.parse_args()
+    road = load_road(asked.route)
+    print("picture    scenery  light     drive     prepare s  median ms  p99 ms  longest ms  memory MB")
+    for model, scenery, light, swerving in CASES:
+        found = []
+        for _ in range(asked.drives):
+            renderer.world.cache_clear()
+            begin_s = time.process_time()
+            drawing = Renderer(road, model, seed=1, scenery=scenery, light=light)
+            drawing.prepare()
+            prepare_s = time.process_time() - begin_s
+            times = drive(road, drawing, swerving=swerving)
+            found.append((prepare_s, float(np.median(times)), float(np.percentile(times, 99)), float(times.max())))
+        prepare_s, middle_ms, p99_ms, longest_ms = (median(column) for column in zip(*found, strict=True))
+        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+        size, way = f"{model.width_px}x{model.height_px}", "swerving" if swerving else "in lane"
+        print(
+            f"{size:9}  {scenery:7}  {light:8}  {way:8}  {prepare_s:9.2f}  {middle_ms:9.2f}  {p99_ms:6.1f}"
+            f"  {longest_ms:10.1f}  {memory_mb:9.0f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

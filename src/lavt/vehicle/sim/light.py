@@ -1,0 +1,111 @@
+"""The lights a road can be seen in: where the sun stands, and the colours of sun, shade, sky and haze.
+
+Surfaces have the colours they show in the noon sun. A light multiplies these, once for what the sun reaches and once
+for what lies in the shade; the figures include what a camera's exposure control makes of the scene, which is why an
+overcast day is not much darker than a sunny one. All of them are our choice.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lavt.domain import FloatArray
+
+LightName = Literal["noon", "low_sun", "overcast"]
+
+Colour = tuple[float, float, float]
+"""Blue, green, red: 0 to 255 of what is seen, a factor of what is light."""
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """One light; angles are the sun's, in the world's frame, `azimuth_rad` from x towards y."""
+
+    azimuth_rad: float
+    elevation_rad: float
+    lit: Colour
+    """What the sun makes of level ground."""
+    shade: Colour
+    """What is left of it in the shade."""
+    zenith: Colour
+    haze: Colour
+    """The colour of the sky at the horizon and of everything far away."""
+    glow: Colour
+    """What the sky has more of around the sun."""
+    cloud: Colour
+    cloud_cover: float
+    """Share of the sky, about."""
+    shadows: bool
+    clouds_shade: bool
+    """Whether clouds throw shadows on the ground around the road."""
+
+    @property
+    def towards_sun(self) -> FloatArray:
+        """Unit vector (3,) that points at the sun."""
+        flat = math.cos(self.elevation_rad)
+        return np.array(
+            [flat * math.cos(self.azimuth_rad), flat * math.sin(self.azimuth_rad), math.sin(self.elevation_rad)]
+        )
+
+    @property
+    def shadow_m(self) -> FloatArray:
+        """Where the shadow of a point 1 m above the ground falls (x, y), from the point's foot."""
+        towards = self.towards_sun
+        return np.asarray(-towards[:2] / towards[2])
+
+    def upright(self, normals: FloatArray) -> FloatArray:
+        """Factors (n, 3) for upright faces with level unit normals (n, 2): those turned away are shaded."""
+        lit, shade = np.array(self.lit), np.array(self.shade)
+        if not self.shadows:
+            return np.broadcast_to(lit, (len(normals), 3))
+        # The ground shows `lit` under the sine of the elevation; a face under the cosine of its angle. A camera's curve
+        # flattens the ratio, and a face that looks at the sun is no brighter than half as much again.
+        facing = np.clip(normals @ self.towards_sun[:2], 0.0, None) / max(math.sin(self.elevation_rad), 0.5)
+        return np.asarray(shade + (lit - shade) * np.minimum(facing + 0.15, 1.5)[:, None])
+
+
+LIGHTS: dict[LightName, Light] = {
+    "noon": Light(
+        azimuth_rad=math.radians(40.0),
+        elevation_rad=math.radians(56.0),
+        lit=(1.0, 1.0, 1.0),
+        shade=(0.55, 0.47, 0.42),
+        zenith=(208.0, 142.0, 78.0),
+        haze=(226.0, 214.0, 200.0),
+        glow=(20.0, 26.0, 30.0),
+        cloud=(250.0, 247.0, 245.0),
+        cloud_cover=0.36,
+        shadows=True,
+        clouds_shade=True,
+    ),
+    "low_sun": Light(
+        azimuth_rad=math.radians(112.0),
+        elevation_rad=math.radians(10.0),
+        lit=(0.68, 0.84, 1.0),
+        shade=(0.43, 0.40, 0.38),
+        zenith=(176.0, 128.0, 92.0),
+        haze=(158.0, 180.0, 214.0),
+        glow=(30.0, 70.0, 92.0),
+        cloud=(168.0, 186.0, 226.0),
+        cloud_cover=0.30,
+        shadows=True,
+        clouds_shade=False,
+    ),
+    "overcast": Light(
+        azimuth_rad=0.0,
+        elevation_rad=math.radians(60.0),
+        lit=(0.94, 0.91, 0.88),
+        shade=(0.94, 0.91, 0.88),
+        zenith=(204.0, 199.0, 194.0),
+        haze=(214.0, 210.0, 205.0),
+        glow=(0.0, 0.0, 0.0),
+        cloud=(186.0, 181.0, 176.0),
+        cloud_cover=0.75,
+        shadows=False,
+        clouds_shade=False,
+    ),
+}

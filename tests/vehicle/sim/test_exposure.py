@@ -1,0 +1,122 @@
+"""Exposure and sensor delay: when a frame is taken, when it is there, and what moves in between."""
+
+from __future__ import annotations
+
+from itertools import count, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.nodes.stand_ins import MONO_NS, at, give, of
+from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
+
+from lavt.config import RunConfig, load_config, shipped
+from lavt.domain import NS_PER_MS, NS_PER_S, Picture, Pose
+from lavt.experiment.plan import plan_run
+from lavt.experiment.record import read_record
+from lavt.experiment.virtual_run import build_loop, drive, read_costs
+from lavt.node import WAKE
+from lavt.nodes.camera import CameraNode
+from lavt.transport.h264 import Encoder
+from lavt.transport.pictures import VideoSender
+from lavt.transport.rtp import Packetizer
+from lavt.transport.video_path import PathServer
+from lavt.vehicle.sim.camera import SimCamera
+from lavt.vehicle.sim.camera import pose_at as pose_between
+from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.simulator import grid_ns
+
+STEP_NS = NS_PER_S // 240
+
+
+@pytest.fixture(scope="module")
+def road() -> Road:
+    return load_road("a_key")
+
+
+def node_of(camera: SimCamera) -> CameraNode:
+    numbers = count()
+    encoder = Encoder(MODEL.width_px, MODEL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=100)
+    path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
+    return CameraNode(camera, VideoSender(encoder), Packetizer(2, 0), path, start_ns=MONO_NS)
+
+
+@pytest.mark.parametrize(("exposure_ns", "delay_ns"), [(0, 0), (10_000_000, 0), (8_333_333, 41_000_001), (0, 5_000)])
+def test_a_frame_is_due_at_its_opening_and_there_after_the_delay(road: Road, exposure_ns: int, delay_ns: int) -> None:
+    """The node wakes when the picture is there: half the exposure and the delay after the middle of the exposure."""
+    camera = camera_on(road, scenery="none", exposure_ns=exposure_ns, sensor_delay_ns=delay_ns)
+    node = node_of(camera)
+    give(node, "pose", pose_at(road, 0.0, mono_ns=MONO_NS - 1), at(0))
+    for number in range(3):
+        opens_ns = MONO_NS + 5 + round(number * NS_PER_S / 30)
+        assert node.next_wake_ns() == opens_ns + exposure_ns + delay_ns
+        (frame,) = of(give(node, WAKE, None, at(node.next_wake_ns() - MONO_NS)), "frame")
+        assert frame.capture_ns == opens_ns + exposure_ns // 2
+        assert frame.stamped_mono_ns - frame.capture_ns == exposure_ns - exposure_ns // 2 + delay_ns
+
+
+def latencies_us(out: Path, *changes: str) -> list[int]:
+    """Drive two virtual seconds; capture to stamp of every frame, in microseconds."""
+    changes = ("vehicle.scenery=none", "record.video=false", *changes)
+    loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
+    drive(loop, limit_ns=2 * NS_PER_S)
+    frames = read_record(out / "server.mcap").table("frame")
+    late_ns = frames.ints("stamped_mono_ns") - frames.ints("capture_ns")
+    return [round(each / 1000) for each in late_ns.tolist()]
+
+
+def test_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
+    """In a drive it is half the exposure and the delay, and what drawing and checking cost, to the microsecond."""
+    (tmp_path / "run").mkdir()
+    late_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
+    costs_us = read_costs().hops_us["camera"]
+    assert len(late_us) > 50
+    assert {abs(each - round(31_500 + costs_us["capture"] + costs_us["check"])) for each in late_us} <= {0, 1}
+
+
+def sharpness(picture: Picture) -> float:
+    """Mean step from row to row in the lowest quarter of a picture, where the road passes fastest."""
+    part = picture[-120:].astype(float).mean(axis=2)
+    return float(np.abs(np.diff(part, axis=0)).mean())
+
+
+def test_what_moves_is_blurred_and_what_stands_is_not(road: Road) -> None:
+    """At 30 km/h a longer exposure smooths the near road more; a standing car's picture is that of a moment."""
+    moving = [pose_at(road, 8.33 * step / 240, mono_ns=grid_ns(step)) for step in range(10)]
+    steps = []
+    for exposure_ms in (0, 4, 16):
+        camera = camera_on(road, scenery="none", exposure_ns=exposure_ms * NS_PER_MS)
+        frame = camera.expose(3, grid_ns(3), moving)
+        assert frame is not None
+        steps.append(sharpness(frame.picture))
+    assert all(later < 0.85 * earlier for earlier, later in pairwise(steps))
+    standing = [pose_at(road, 5.0, mono_ns=grid_ns(step)) for step in range(10)]
+    frame = camera.expose(3, grid_ns(3), standing)
+    assert frame is not None
+    assert digest(frame.picture) == digest(picture_of(camera_on(road, scenery="none"), standing[0], 3))
+
+
+def test_an_exposure_of_nothing_is_the_moment(road: Road) -> None:
+    """With an exposure of 0 a frame is, to the byte, that of the newest pose at or before its time."""
+    poses = [pose_at(road, 0.1 * step, mono_ns=step * STEP_NS) for step in range(6)]
+    camera = camera_on(road)
+    frame = camera.expose(9, 3 * STEP_NS + 1, poses)
+    assert frame is not None
+    assert frame.capture_ns == 3 * STEP_NS + 1
+    assert digest(frame.picture) == digest(picture_of(camera_on(road), poses[3], 9))
+    assert camera.expose(9, -1, poses) is None
+
+
+def test_poses_are_read_between_those_known() -> None:
+    """Between two poses the car is between them, after the last it goes on for 20 ms, before all it is nowhere."""
+    poses = [Pose(0, 0.0, 0.0, 3.1), Pose(4_000_000, 4.0, 2.0, -3.1)]
+    assert pose_between(poses, -1) is None
+    assert pose_between(poses[:1], 9) == poses[0]
+    middle = pose_between(poses, 2_000_000)
+    assert middle is not None
+    assert (middle.x_m, middle.y_m) == (2.0, 1.0)
+    assert abs(middle.heading_rad) == pytest.approx(np.pi, abs=0.05)
+    ahead = pose_between(poses, 6_000_000)
+    assert ahead is not None
+    assert (ahead.x_m, ahead.y_m) == pytest.approx((6.0, 3.0))
+    assert pose_between(poses, 24_000_000) == pose_between(poses, 900_000_000)
