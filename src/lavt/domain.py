@@ -101,9 +101,10 @@ class VehicleEvent:
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture, no roll and no yaw.
+    """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture.
 
-    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal.
+    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal. Position y left
+    of the middle, yaw left positive, roll: right side down positive.
     """
 
     width_px: int = 640
@@ -112,6 +113,9 @@ class CameraModel:
     x_m: float = 1.6
     z_m: float = 1.4
     pitch_rad: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    roll_rad: float = 0.0
 
     @property
     def focal_px(self) -> float:

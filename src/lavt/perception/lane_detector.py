@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from lavt.domain import CameraModel, Lane, Picture
 from lavt.perception.bird_eye import GroundGrid, bird_eye
+from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_fit import LaneFit, Points, fit_lane, mark_points, sides_by_windows, sides_near, start_line
 from lavt.perception.lane_pixels import lane_pixels
 
@@ -29,9 +30,18 @@ class LaneDetector:
     speaks of the newest picture alone: with nothing in it the confidence is 0, and the lane is the one seen last.
     """
 
-    def __init__(self, model: CameraModel, grid: GroundGrid = GRID, lane_width_m: float = LANE_WIDTH_M) -> None:
-        self._shape = (model.height_px, model.width_px, 3)
-        self._view = bird_eye(model, grid)
+    def __init__(
+        self,
+        camera: CameraModel | CalibratedCamera,
+        grid: GroundGrid = GRID,
+        lane_width_m: float = LANE_WIDTH_M,
+        *,
+        stamped: bool = True,
+    ) -> None:
+        known = calibrated(camera) if isinstance(camera, CameraModel) else camera
+        self._shape = (known.height_px, known.width_px, 3)
+        self._scale = known.scale
+        self._view = bird_eye(known, grid, stamped=stamped)
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER
@@ -44,7 +54,7 @@ class LaneDetector:
         """Give the lane in the next picture, (height, width, 3) as the camera's model says; else ValueError."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
-        mask = self._view.from_above(lane_pixels(self._view.region(picture_bgr)))
+        mask = self._view.from_above(lane_pixels(self._view.region(picture_bgr), self._scale))
         points = mark_points(mask, self._view.grid)
         tracked = self._misses < FORGET_AFTER
         fit = self._near_last(points) if tracked else self._anywhere(points)
