@@ -103,8 +103,8 @@ class VehicleEvent:
 class CameraModel:
     """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture.
 
-    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal. Position y left
-    of the middle, yaw left positive, roll: right side down positive.
+    The pose is in the vehicle's frame; `pitch_rad` is positive downwards; the field of view is horizontal.
+    Position y left of the middle, yaw left positive, roll: right side down positive.
     """
 
     width_px: int = 640

@@ -127,7 +127,7 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
         homography = shift @ ground_to_picture(camera) @ grid.to_ground()
         return BirdEye(grid, top_px, bottom_px, homography, hidden)
     maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)
-    whole, fractions = cv2.convertMaps(maps, None, cv2.CV_16SC2)
+    whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
     return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), hidden)
 
 

@@ -31,8 +31,8 @@ picture once more.
 class CalibratedCamera:
     """A camera with its lens and its place on the vehicle.
 
-    `yaw_rad` is left positive, `pitch_rad` down positive, `roll_rad` positive with the right side down; the vehicle's axes
-    are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without any.
+    `yaw_rad` is left positive, `pitch_rad` down positive, `roll_rad` positive with the right side down; the
+    vehicle's axes are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without any.
     """
 
     width_px: int
@@ -121,7 +121,10 @@ def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray
 
 
 def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
-    """Tell which ground points the pixels (n, 2) of the distorted picture show: (n, 2) in metres, NaN above the horizon."""
+    """Tell which ground points the pixels (n, 2) of the distorted picture show.
+
+    (n, 2) in metres, NaN above the horizon.
+    """
     rays = np.column_stack([_straightened(camera, pixels), np.ones(len(pixels))])
     found = rays @ np.linalg.inv(ground_to_camera(camera)).T
     # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.

@@ -24,7 +24,7 @@ YELLOW_RED_OVER_BLUE = 55
 EDGE_AT_LEAST = 48
 """Of the 3 x 3 Sobel gradient along a row: 12 grey levels from one pixel to the one after the next."""
 AROUND_PX = (65, 5)
-"""Width and height of "around" for a focal length of 320 px: three times as wide as the nearest mark (20 px at 2 m)."""
+"""Width and height of "around" at a focal length of 320 px: three times as wide as the nearest mark (20 px at 2 m)."""
 MARK_PX = 21
 """Width for a focal length of 320 px within which an edge speaks for the inside of a mark."""
 
