@@ -8,11 +8,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from lavt.config import CameraConfig, ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.config import (
+    CalibrationConfig,
+    CameraConfig,
+    ClientCameraConfig,
+    ClientConfig,
+    ControllerConfig,
+    RunConfig,
+    SafetyConfig,
+    ServerConfig,
+    VehicleConfig,
+    parse_config,
+    read_yaml,
+)
 from lavt.control.drive_controller import make_controller
 from lavt.control.limiter import Limiter
 from lavt.control.limits import CLIENT_LIMITS, LIMITS, Limits
@@ -27,6 +40,7 @@ from lavt.nodes.clock_sync import ClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.receiver import ReceiverNode
 from lavt.nodes.reports import Route
+from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_detector import LaneDetector
 from lavt.streams import stream, stream_key
 from lavt.transport.h264 import Decoder, Encoder
@@ -131,6 +145,50 @@ def camera_model(config: CameraConfig) -> CameraModel:
         config.width_px, config.height_px, math.radians(config.field_of_view_deg), config.x_m, config.z_m,
         math.radians(config.pitch_deg),
     )  # fmt: skip
+
+
+def calibrated_camera(config: CalibrationConfig) -> CalibratedCamera:
+    """Give the camera of a calibration."""
+    middle_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
+    if config.field_of_view_deg is None:
+        focal_px = (config.fx_px or 0.0, config.fy_px or 0.0)
+        middle_px = (config.cx_px or 0.0, config.cy_px or 0.0)
+    else:
+        focal_px = (config.width_px / 2 / math.tan(math.radians(config.field_of_view_deg) / 2),) * 2
+    return CalibratedCamera(
+        config.width_px, config.height_px, focal_px, middle_px, config.x_m, config.y_m, config.z_m,
+        math.radians(config.yaw_deg), math.radians(config.pitch_deg), math.radians(config.roll_deg),
+        config.distortion, config.lens == "fisheye",
+    )  # fmt: skip
+
+
+def camera_of_file(path: Path) -> CalibratedCamera:
+    """Read a camera from a calibration, or take that of a run's or a client's config; raises `UserError`."""
+    data = read_yaml(path)
+    if not data.keys() & {*RunConfig.model_fields, *ClientConfig.model_fields}:
+        return calibrated_camera(parse_config(CalibrationConfig, data, str(path)))
+    section = data.get("camera", {})
+    if not isinstance(section, dict):
+        raise UserError(f"{path}: camera must hold keys and values, not {section!r}")
+    return client_camera(parse_config(ClientCameraConfig, section, f"{path}: camera"))
+
+
+def client_camera(config: ClientCameraConfig) -> CalibratedCamera:
+    """Give the camera as the client knows it: its calibration where there is one, else what the config says."""
+    if not config.calibration:
+        return calibrated(camera_model(config))
+    path = Path(config.calibration)
+    said = config.model_fields_set - {"calibration", "rate_hz", "width_px", "height_px"}
+    if said:
+        raise UserError(f"camera.calibration says everything: leave out camera.{', camera.'.join(sorted(said))}")
+    camera = calibrated_camera(parse_config(CalibrationConfig, read_yaml(path), str(path)))
+    sizes = {"width_px": camera.width_px, "height_px": camera.height_px}
+    for key in config.model_fields_set & sizes.keys():
+        if getattr(config, key) != sizes[key]:
+            raise UserError(
+                f"camera.{key} is {getattr(config, key)}, but {path} was made for {sizes[key]}: use its size"
+            )
+    return camera
 
 
 def build_simulator(config: ServerConfig) -> Plant:
@@ -252,8 +310,8 @@ def build_server(
 def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy) -> ClientNodes:
     """Make the client's nodes."""
     controller = config.controller
-    model = camera_model(config.camera)
-    detector = LaneDetector(model)
+    camera = client_camera(config.camera)
+    detector = LaneDetector(camera)
     lane_keeper = make_controller(controller.kind, controller.preset, controller.wheelbase_m)
     start = now()
     session = ClientSession(
@@ -271,7 +329,7 @@ def build_client(config: ClientConfig, now: Callable[[], Now], entropy: Entropy)
             lane_keeper,
             session,
             CLIENT_LIMITS,
-            picture_shape=(model.height_px, model.width_px, 3),
+            picture_shape=(camera.height_px, camera.width_px, 3),
         ),
         ClockSyncNode(start.mono_ns),
     )

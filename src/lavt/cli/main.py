@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import lavt
-from lavt.cli import client, console, demo, relay, report, router, run, server, stop, sweep
+from lavt.cli import client, console, demo, perception, relay, report, router, run, server, stop, sweep
 
 app = typer.Typer(
     name="lavt",
@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (demo, run, sweep, report, server, client, stop, router, relay):
+for command in (demo, run, sweep, report, server, client, stop, router, relay, perception):
     command.register(app)
 
 

@@ -52,9 +52,11 @@ class Sight:
     mask: Mask
     """The marks from above, (grid.rows, grid.columns)."""
     points: Points
-    start: tuple[float, float, float] | None
-    """Where the search began: None where the lane was followed, or where there was nothing to begin at."""
     sides: Sides
+    expected: tuple[float, float, float] | None
+    """The centre near which the lines were looked for; None where there was nothing to begin at."""
+    windows: tuple[tuple[float, float], ...]
+    """The sliding windows of a search, as `sides_by_windows` gives them; none where the lane was followed."""
     fit: LaneFit | None
     """The lane in this picture alone; None when there is none."""
 
@@ -96,8 +98,8 @@ class LaneDetector:
         mask = self.view.from_above(lane_pixels(self.view.region(picture_bgr), self._scale))
         points = mark_points(mask, self.view.grid)
         tracked = self._misses < FORGET_AFTER
-        start, sides, fit = self._near_last(points) if tracked else self._anywhere(points)
-        self.sight = Sight(mask, points, start, sides, fit)
+        self.sight = self._near_last(mask, points) if tracked else self._anywhere(mask, points)
+        fit = self.sight.fit
         if fit is None or fit.confidence < TRACK_CONFIDENCE:
             self._misses += 1
             self._lane = replace(self._lane, confidence=0.0 if fit is None else fit.confidence)
@@ -108,24 +110,23 @@ class LaneDetector:
                 self.forget()
         return self._lane
 
-    def _near_last(self, points: Points) -> Found:
+    def _near_last(self, mask: Mask, points: Points) -> Sight:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
-        return None, sides, fit_lane(points, sides, self.view.grid, self._lane.width_m)
+        fit = fit_lane(points, sides, self.view.grid, self._lane.width_m)
+        return Sight(mask, points, sides, self._lane.centre, (), fit)
 
-    def _anywhere(self, points: Points) -> Found:
+    def _anywhere(self, mask: Mask, points: Points) -> Sight:
         grid = self.view.grid
         start = start_line(points, grid, self._lane_width_m)
         if start is None:
-            return None, np.zeros(len(points.x_m), dtype=np.int8), None
-        sides = sides_by_windows(points, grid, start, self._lane_width_m)
+            return Sight(mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, (), None)
+        sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
         fit = fit_lane(points, sides, grid, self._lane_width_m)
         for _ in range(REFINED):
             if fit is not None:
                 fit = fit_lane(points, sides_near(points, fit.centre, fit.width_m), grid, fit.width_m)
-        return start, sides, fit if fit is not None and has_parallel(points, fit, grid) else None
-
-
-Found = tuple[tuple[float, float, float] | None, Sides, LaneFit | None]
+        found = fit if fit is not None and has_parallel(points, fit, grid) else None
+        return Sight(mask, points, sides, start, windows, found)
 
 
 def has_been_left(lane: Lane) -> bool:

@@ -113,18 +113,23 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
     return best
 
 
-def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float) -> Sides:
+def sides_by_windows(
+    points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float
+) -> tuple[Sides, tuple[tuple[float, float], ...]]:
     """Follow both lines from the near end with a pair of sliding windows that move as one.
 
-    They follow the centre `start`, moved by how far off it they were seen to be last.
+    They follow the centre `start`, moved by how far off it they were seen to be last. Gives the sides and, for each
+    pair, its near end (x) and how far left of `start` its middle is, in metres.
     """
     length_m, half_width_m = WINDOW_M
     offset_m = points.y_m - _along(points.x_m, start)[0]
     off_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
+    places = []
     for low_m in np.arange(grid.near_m, grid.far_m, length_m):
         inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
         seen_m = []
+        places.append((float(low_m), off_m))
         for side in (1, -1):
             line_m = off_m + side * width_m / 2
             caught = inside & (np.abs(offset_m - line_m) < half_width_m)
@@ -133,7 +138,7 @@ def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float
                 seen_m.append(float(np.mean(offset_m[caught])) - line_m)
         if seen_m:
             off_m += sum(seen_m) / len(seen_m)
-    return sides
+    return sides, tuple(places)
 
 
 def fit_lane(points: Points, sides: Sides, grid: GroundGrid, width_m: float) -> LaneFit | None:
