@@ -24,7 +24,6 @@ from lavt.vehicle.sim.road import Road, RoadMark, load_road
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
 Spoil = Callable[[Picture, np.random.Generator], Picture]
-Paint = Callable[[Picture, np.random.Generator], Picture]
 
 TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
     (38, 38, 40),
@@ -40,6 +39,8 @@ class Case:
     """A picture and the truth about it."""
 
     kind: str
+    before: Picture
+    """What was seen before: the road as it is, from the same place."""
     picture: Picture
     centre_m: FloatArray | None
     """y of the lane's centre at `AHEAD_M`; None where there is no lane to be seen."""
@@ -55,12 +56,16 @@ def _marks(keep: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road], Road
 
 ROADS: dict[str, Callable[[Road], Road]] = {
     "as it is": lambda road: road,
+    "one line only": _marks(lambda mark: replace(mark, kind="solid") if mark.offset_m == -1.75 else None),
     "left line missing": _marks(lambda mark: None if mark.offset_m > 0 else mark),
     "right line missing": _marks(lambda mark: None if mark.offset_m < 0 else mark),
     "all marks missing": _marks(lambda _: None),
     "solid lines": _marks(lambda mark: replace(mark, kind="solid")),
 }
-NO_LANE = {"all marks missing", "kerb only", "upside-down", "noise only", "coarse blocks", "grey", "blackout"}
+NO_LANE = {
+    "all marks missing", "kerb only", "diagonal only", "crosswalk only", "upside-down", "noise only", "coarse blocks",
+    "grey", "blackout",
+}  # fmt: skip
 """Kinds in which nobody could tell where the lane is."""
 
 
@@ -88,9 +93,16 @@ def tar_seams(picture: Picture, generator: np.random.Generator) -> Picture:
     return picture
 
 
-def old_yellow_lines(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Yellow lines of road works that lead aside over the lane."""
-    y, slope = generator.uniform(-2, 2), generator.choice([-0.2, 0.2])
+def old_yellow_line(picture: Picture, generator: np.random.Generator) -> Picture:
+    """One yellow line of road works that leads aside over the lane."""
+    y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
+    _strip(picture, [(3, y), (25, y + 22 * slope)], 0.12, YELLOW)
+    return picture
+
+
+def yellow_diversion(picture: Picture, generator: np.random.Generator) -> Picture:
+    """Two yellow lines 3 m apart that lead aside over the lane: a lane of their own, and who can tell which counts?"""
+    y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
     for offset in (0.0, 3.0):
         _strip(picture, [(3, y + offset), (25, y + offset + 22 * slope)], 0.12, YELLOW)
     return picture
@@ -147,9 +159,9 @@ def tree_shadows(picture: Picture, generator: np.random.Generator) -> Picture:
     return np.asarray(picture * (cv2.GaussianBlur(shade, (5, 5), 0) / 255.0), dtype=np.uint8)
 
 
-PAINT: dict[str, Paint] = {
+PAINT: dict[str, Spoil] = {
     each.__name__.replace("_", " "): each
-    for each in (tar_seams, old_yellow_lines, old_white_line, diagonal, crosswalk, arrow, tree_shadows)
+    for each in (tar_seams, old_yellow_line, yellow_diversion, old_white_line, diagonal, crosswalk, arrow, tree_shadows)
 }
 
 
@@ -257,7 +269,7 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
     x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
     heading = heading_rad + turned_rad
     place = np.array([x_m - offset_m * np.sin(heading_rad), y_m + offset_m * np.cos(heading_rad)])
-    stations = np.arange(s_m - 5, s_m + 30, 0.05)
+    stations = np.arange(s_m - 5, s_m + 30, 0.1)
     points = np.column_stack(road.point(stations)[:2]) - place
     ahead = points @ [np.cos(heading), np.sin(heading)]
     left = points @ [-np.sin(heading), np.cos(heading)]
@@ -266,25 +278,24 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
 
 def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[Case]:
     """Give `count` pictures of every kind, from random places of random routes: all repeats with the seed."""
-    kinds = [(kind, kind, None, None) for kind in ROADS]
-    kinds += [(kind, "as it is", paint, None) for kind, paint in PAINT.items()]  # type: ignore[misc]
-    kinds += [("kerb only", "all marks missing", kerb, None)]  # type: ignore[list-item]
-    kinds += [("diagonal only", "all marks missing", diagonal, None)]  # type: ignore[list-item]
-    kinds += [("crosswalk only", "all marks missing", crosswalk, None)]  # type: ignore[list-item]
-    kinds += [(kind, "as it is", None, spoil) for kind, spoil in SPOILT.items()]  # type: ignore[misc]
-    for kind, marks, paint, spoil in kinds:
+    kinds: list[tuple[str, str, Spoil | None]] = [(kind, kind, None) for kind in ROADS]
+    kinds += [(kind, "as it is", paint) for kind, paint in PAINT.items()]
+    kinds += [(f"{paint.__name__} only", "all marks missing", paint) for paint in (kerb, diagonal, crosswalk)]
+    kinds += [(kind, "as it is", spoil) for kind, spoil in SPOILT.items()]
+    for kind, marks, spoil in kinds:
         for number in range(count):
             generator = stream(seed, f"degraded {kind}", number)
-            road, renderer = _renderer(str(generator.choice(routes)), marks)
+            route = str(generator.choice(routes))
+            road, renderer = _renderer(route, marks)
             s_m = float(generator.uniform(0, road.length_m - 25))
             offset_m, turned_rad = float(generator.normal(0, 0.3)), float(generator.normal(0, 0.03))
             x_m, y_m = road.across(s_m, offset_m)
             heading_rad = float(road.point(s_m)[2]) + turned_rad
-            picture = renderer.render(Pose(0, float(x_m), float(y_m), heading_rad), number)
-            if paint is not None:
-                picture = paint(picture, generator)
+            pose = Pose(0, float(x_m), float(y_m), heading_rad)
+            before = _renderer(route, "as it is")[1].render(pose, number)
+            picture = before.copy() if marks == "as it is" else renderer.render(pose, number)
             if spoil is not None:
                 picture = spoil(picture, generator)
-            nothing = kind in NO_LANE or kind.endswith(" only")
+            nothing = kind in NO_LANE
             centre_m = None if nothing else _truth(road, s_m, offset_m, turned_rad)
-            yield Case(kind, picture, centre_m, road.lanes.widths_m[road.lanes.driven])
+            yield Case(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])

@@ -55,6 +55,7 @@ class Sight:
     sides: Sides
     expected: tuple[float, float, float] | None
     """The centre near which the lines were looked for; None where there was nothing to begin at."""
+    expected_width_m: float
     windows: tuple[tuple[float, float], ...]
     """The sliding windows of a search, as `sides_by_windows` gives them; none where the lane was followed."""
     fit: LaneFit | None
@@ -113,20 +114,20 @@ class LaneDetector:
     def _near_last(self, mask: Mask, points: Points) -> Sight:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
         fit = fit_lane(points, sides, self.view.grid, self._lane.width_m)
-        return Sight(mask, points, sides, self._lane.centre, (), fit)
+        return Sight(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
     def _anywhere(self, mask: Mask, points: Points) -> Sight:
         grid = self.view.grid
         start = start_line(points, grid, self._lane_width_m)
         if start is None:
-            return Sight(mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, (), None)
+            return Sight(mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None)
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
         fit = fit_lane(points, sides, grid, self._lane_width_m)
         for _ in range(REFINED):
             if fit is not None:
                 fit = fit_lane(points, sides_near(points, fit.centre, fit.width_m), grid, fit.width_m)
         found = fit if fit is not None and has_parallel(points, fit, grid) else None
-        return Sight(mask, points, sides, start, windows, found)
+        return Sight(mask, points, sides, start, self._lane_width_m, windows, found)
 
 
 def has_been_left(lane: Lane) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from lavt.domain import FloatArray, Lane, Picture
 from lavt.perception.bird_eye import BirdEye, GroundGrid
 from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
-from lavt.perception.lane_detector import LANE_WIDTH_M, TRACK_CONFIDENCE, LaneDetector, Sight
+from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector, Sight
 from lavt.perception.lane_fit import CORRIDOR_M, WINDOW_M
 from lavt.perception.lane_pixels import edge_pixels, grey_of, lane_pixels, white_pixels, yellow_pixels
 
@@ -125,14 +125,14 @@ def _points(sight: Sight, grid: GroundGrid) -> Picture:
     if not sight.windows:
         for side in (1, -1):
             for rim_m in (-CORRIDOR_M, CORRIDOR_M):
-                line = _parallel(sight.expected, side * LANE_WIDTH_M / 2 + rim_m, grid.near_m, grid.far_m)
+                line = _parallel(sight.expected, side * sight.expected_width_m / 2 + rim_m, grid.near_m, grid.far_m)
                 _curve(drawn, _cells(line, grid), EXPECTED, 1)
     length_m, half_width_m = WINDOW_M
     c0, c1, c2 = sight.expected
     for low_m, off_m in sight.windows:
         middle_m = low_m + length_m / 2
         for side in (1, -1):
-            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * LANE_WIDTH_M / 2
+            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * sight.expected_width_m / 2
             box = np.array([[low_m, y_m + half_width_m], [low_m + length_m, y_m - half_width_m]])
             first, second = np.round(_cells(box, grid)).astype(int).tolist()
             cv2.rectangle(drawn, first, second, EXPECTED, 1)
