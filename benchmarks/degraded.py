@@ -101,7 +101,7 @@ def old_yellow_line(picture: Picture, generator: np.random.Generator) -> Picture
 
 
 def yellow_diversion(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Two yellow lines 3 m apart that lead aside over the lane: a lane of their own, and who can tell which counts?"""
+    """Two yellow lines 3 m apart that lead aside over the lane, as a lane of their own: which counts, who knows."""
     y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
     for offset in (0.0, 3.0):
         _strip(picture, [(3, y + offset), (25, y + offset + 22 * slope)], 0.12, YELLOW)

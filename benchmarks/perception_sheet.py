@@ -3,7 +3,8 @@
     python -m benchmarks.perception_sheet [--count 25] [--picture docs/pictures/perception.jpg]
 
 Prints two tables over degraded pictures (`benchmarks/degraded.py`), by kind of picture and by confidence, each with
-the detector searching (the picture is its first) and following (it saw the road as it is before). Then the cost of a picture.
+the detector searching (the picture is its first) and following (it saw the road as it is before).
+Then the cost of a picture.
 """
 
 from __future__ import annotations

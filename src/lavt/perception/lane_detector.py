@@ -113,7 +113,7 @@ class LaneDetector:
 
     def _near_last(self, mask: Mask, points: Points) -> Sight:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
-        fit = fit_lane(points, sides, self.view.grid, self._lane.width_m)
+        fit = fit_lane(points, sides, self.view.grid, self._lane.width_m, self._lane.centre)
         return Sight(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
     def _anywhere(self, mask: Mask, points: Points) -> Sight:
@@ -122,12 +122,23 @@ class LaneDetector:
         if start is None:
             return Sight(mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None)
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        fit = fit_lane(points, sides, grid, self._lane_width_m)
+        # The windows follow any curve, also that of a line which leads aside; the start is rough, but of all the paint.
+        fits = (
+            self._refined(points, fit_lane(points, sides, grid, self._lane_width_m)),
+            self._refined(points, self._followed(points, start, self._lane_width_m)),
+        )
+        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid)]
+        found = max(lanes, key=lambda fit: fit.confidence, default=None)
+        return Sight(mask, points, sides, start, self._lane_width_m, windows, found)
+
+    def _followed(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
+        return fit_lane(points, sides_near(points, centre, width_m), self.view.grid, width_m, centre)
+
+    def _refined(self, points: Points, fit: LaneFit | None) -> LaneFit | None:
         for _ in range(REFINED):
             if fit is not None:
-                fit = fit_lane(points, sides_near(points, fit.centre, fit.width_m), grid, fit.width_m)
-        found = fit if fit is not None and has_parallel(points, fit, grid) else None
-        return Sight(mask, points, sides, start, self._lane_width_m, windows, found)
+                fit = self._followed(points, fit.centre, fit.width_m)
+        return fit
 
 
 def has_been_left(lane: Lane) -> bool:

@@ -141,14 +141,17 @@ def sides_by_windows(
     return sides, tuple(places)
 
 
-def fit_lane(points: Points, sides: Sides, grid: GroundGrid, width_m: float) -> LaneFit | None:
+def fit_lane(
+    points: Points, sides: Sides, grid: GroundGrid, width_m: float, expected: tuple[float, float, float] | None = None
+) -> LaneFit | None:
     """Fit a lane to the points of its lines, trusting less what lies off it, and fit again; None when there is none.
 
     `width_m` is the width expected; it is used where only one line is seen, or where what is seen is not a lane's.
+    `expected` is the centre expected, where one is.
     """
     of_lane = np.flatnonzero(sides)
     chosen, side = Points(points.x_m[of_lane], points.y_m[of_lane]), sides[of_lane]
-    fit = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0))
+    fit = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
     for doubted_m in DOUBTED_FROM_M:
         if fit is None:
             return None
