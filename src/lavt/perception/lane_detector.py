@@ -32,7 +32,7 @@ LANE_WIDTH_M = 3.5
 TRACK_CONFIDENCE = 0.2
 """A fit with less (one line over 40 % of the length) is not followed."""
 REFINED = 2
-"""Times that a lane found by windows is followed once more, as from picture to picture: a curve seen near leads far."""
+"""Times that a lane found is followed once more, as from picture to picture: a curve seen near leads far."""
 FORGET_AFTER = 3
 """Pictures without a lane after which the search begins anew: a tenth of a second."""
 FOLLOWS_FOR_NS = 350 * NS_PER_MS

@@ -8,6 +8,7 @@ fit before is used.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,13 +100,17 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
     `width_m`, so that just one of them has its centre within half of it.
     """
     near = points.x_m < grid.near_m + START_LENGTH_M
-    x, y = points.x_m[near], points.y_m[near]
     bins = round(width_m / COLUMN_BIN_M)
+    x, y = points.x_m[near], points.y_m[near]
+    far_m = grid.near_m + START_LENGTH_M
+    spread_m = float(np.abs(y).max(initial=0.0)) + (max(START_SLOPES) + max(START_BENDS_PER_M) * far_m) * far_m
+    lanes = 2 * math.ceil(spread_m / width_m)  # as many as straightened paint may lie in, half of them on the right
+    y_bins, bins_per_m = y / width_m * bins + lanes // 2 * bins, bins / width_m
     best_score, best = WINDOW_POINTS_AT_LEAST, None
     for bend in START_BENDS_PER_M:
         for slope in START_SLOPES:
-            folded = ((y - (slope + bend * x) * x) / width_m * bins).astype(np.int64) % bins
-            counts = np.bincount(folded, minlength=bins)
+            straight = (y_bins - (slope * bins_per_m + bend * bins_per_m * x) * x).astype(np.intp)
+            counts = np.bincount(straight, minlength=lanes * bins).reshape(-1, bins).sum(axis=0)
             scores = counts + np.roll(counts, 1) + np.roll(counts, -1)
             if scores.max() > best_score:
                 line_m = (float(np.argmax(scores)) + 0.5) / bins * width_m  # between 0 and the width: one of the lines
