@@ -8,20 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.build import (
-    FIDELITIES,
-    MachineEntropy,
-    SeededEntropy,
-    build_controller,
-    build_plant,
-    build_server,
-    build_unpictured,
-    camera_model,
-    car_of,
-    check_names,
-    parse_address,
-    run_seed,
-)
+from lavt.build.addresses import parse_address
+from lavt.build.cameras import camera_model
+from lavt.build.entropy import MachineEntropy, SeededEntropy, run_seed
+from lavt.build.fidelity import FIDELITIES
+from lavt.build.sides import build_controller, build_server, check_names
+from lavt.build.vehicles import build_plant, build_unpictured, car_of
 from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
 from lavt.domain import Lane, Now
 from lavt.errors import UserError

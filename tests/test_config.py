@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.build import limits_of
+from lavt.build.sides import limits_of
 from lavt.config import (
     ClientConfig,
     ClocksConfig,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from lavt.errors import UserError
 
@@ -77,6 +77,51 @@ class CameraConfig(Section):
         if exposure_ms > period_ms:
             raise ValueError(f"must be at most the time between two frames, {period_ms:.3g} ms at camera.rate_hz")
         return exposure_ms
+
+
+class ClientCameraConfig(CameraConfig):
+    """The camera as the client knows it."""
+
+    calibration: str = ""
+    """File of a calibration, which then says everything but the rate; empty: the keys above say it."""
+
+
+class CalibrationConfig(Section):
+    """A camera that was calibrated: its size, its lens in OpenCV's terms, and where it sits (vehicle's frame)."""
+
+    width_px: int = Field(ge=64, le=8192)
+    height_px: int = Field(ge=64, le=8192)
+    field_of_view_deg: float | None = Field(None, gt=10, lt=150)
+    """Over the width, with square pixels and the axis in the middle; or the four below."""
+    fx_px: float | None = Field(None, gt=0)
+    fy_px: float | None = Field(None, gt=0)
+    cx_px: float | None = None
+    cy_px: float | None = None
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2 (and k3, or k3 to k6) of a pinhole, k1 to k4 of a fisheye; empty: none."""
+    x_m: float
+    y_m: float = 0.0
+    z_m: float = Field(gt=0)
+    yaw_deg: float = Field(0.0, ge=-90, le=90)
+    pitch_deg: float = Field(0.0, ge=-60, le=80)
+    roll_deg: float = Field(0.0, ge=-60, le=60)
+
+    @field_validator("distortion")
+    @classmethod
+    def _whole(cls, distortion: tuple[float, ...], info: Any) -> tuple[float, ...]:
+        lengths = (0, 4) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
+        if len(distortion) not in lengths:
+            raise ValueError(f"must have {' or '.join(str(each) for each in lengths)} coefficients for this lens")
+        return distortion
+
+    @model_validator(mode="after")
+    def _one_focal_length(self) -> CalibrationConfig:
+        matrix = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        whole = None not in matrix
+        if whole == (self.field_of_view_deg is not None) or (not whole and matrix != (None,) * 4):
+            raise ValueError("give either field_of_view_deg, or all of fx_px, fy_px, cx_px and cy_px")
+        return self
 
 
 class VideoConfig(Section):
@@ -251,7 +296,7 @@ class ClientConfig(Section):
     vehicle_id: str = "vehicle-1"
     who: str = "operator-1"
     controller: ControllerConfig = ControllerConfig()
-    camera: CameraConfig = CameraConfig()
+    camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
     record: RecordConfig = RecordConfig()
@@ -391,11 +436,14 @@ def _sentence(kind: type[BaseModel], problem: Any) -> str:
     where = ".".join(location)
     if problem["type"] == "extra_forbidden":
         known = _keys(kind, location[:-1])
-        near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
+        near = [key for key in known if key.startswith(location[-1])]  # a unit left out
+        near = near or difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(sorted(known))}"
         return f"unknown key {where!r}: {hint}"
     if problem["type"] == "missing":
         return f"{where!r} is missing: give it"
+    if not where:  # about several keys at once
+        return str(problem["msg"])
     return f"{where!r}: {problem['msg']}, not {problem['input']!r}"
 
 

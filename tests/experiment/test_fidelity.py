@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from lavt.build import FIDELITIES
+from lavt.build.fidelity import FIDELITIES
 from lavt.config import RunConfig, load_config, shipped
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
@@ -107,6 +107,6 @@ def test_every_fidelity_is_named_in_the_report() -> None:
 
 def test_geometry_needs_a_known_road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A vehicle that does not tell its road is refused in a sentence at fidelity geometry."""
-    monkeypatch.setattr("lavt.build.VEHICLES", {"simulator": None, "boat": None})
+    monkeypatch.setattr("lavt.build.vehicles.VEHICLES", {"simulator": None, "boat": None})
     with pytest.raises(UserError, match=r"choose vehicle.kind simulator instead of 'boat'"):
         build_loop(planned("vehicle.kind=boat", "fidelity=geometry"), tmp_path / "run")

@@ -16,7 +16,7 @@ from lavt.node import WAKE, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.reports import PathToken, PictureRead, ReceivedUnit, View
-from lavt.perception.lane_detector import LaneDetector
+from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
 from lavt.transport.channels import CHANNELS
 from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.messages import decode, encode
@@ -290,3 +290,18 @@ def test_the_emergency_stop_is_in_every_command() -> None:
     made = [*bench.view(), *(command for _, command in bench.go(200 * NS_PER_MS))]
     assert len(made) == 11
     assert {(command.emergency_stop, command.mode, command.throttle) for command in made} == {(number, "stop", 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("since_ns", "forgets"),
+    [(FRAME_NS, False), (FOLLOWS_FOR_NS, False), (FOLLOWS_FOR_NS + 1, True), (-FRAME_NS, True)],
+    ids=["the next", "just in time", "after a gap", "of a clock put back"],
+)
+def test_after_a_gap_the_lane_is_looked_for_anew(since_ns: int, forgets: bool) -> None:
+    """When pictures were missing for so long that another lane may lie where the lane was, it is not followed on."""
+    bench = Bench().driving()
+    bench.view()
+    before = bench.detector.forgot
+    bench.mono_ns += since_ns
+    bench.view()
+    assert (bench.detector.forgot > before) == forgets

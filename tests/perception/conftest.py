@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lavt.domain import CameraModel, FloatArray, Picture
-from lavt.perception.bird_eye import ground_to_picture
+from lavt.perception.calibration import calibrated, ground_to_picture
 
 ROAD_GREY, SKY_GREY = 85, 190
 MARK_WIDTH_M = 0.125
@@ -64,7 +64,7 @@ class Scene:
         """Give the ground seen along each fine ray, infinite above the horizon."""
         u = (np.arange(self.model.width_px * FINE) + 0.5) / FINE - 0.5
         v = (np.arange(self.model.height_px * FINE) + 0.5) / FINE - 0.5
-        inverse = np.linalg.inv(ground_to_picture(self.model))
+        inverse = np.linalg.inv(ground_to_picture(calibrated(self.model)))
         rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
         below = rays[..., 2] > 1e-9  # the inverse's third row is the depth turned round: positive below the horizon
         scale = np.where(below, rays[..., 2], 1.0)

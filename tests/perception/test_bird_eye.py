@@ -5,11 +5,12 @@ import pytest
 
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye, ground_to_picture
+from lavt.perception.bird_eye import STAMP_SIDE_PX, GroundGrid, bird_eye
+from lavt.perception.calibration import calibrated, ground_to_picture
 
 
 def seen_at(model: CameraModel, x_m: float, y_m: float) -> tuple[float, float]:
-    u, v, depth = ground_to_picture(model) @ np.array([x_m, y_m, 1.0])
+    u, v, depth = ground_to_picture(calibrated(model)) @ np.array([x_m, y_m, 1.0])
     return u / depth, v / depth
 
 
@@ -38,7 +39,7 @@ def test_pitch_down_lifts_the_road() -> None:
 def test_a_painted_cell_lands_in_its_own_place() -> None:
     """A spot painted into the picture where a ground point is seen comes out in that point's cell."""
     model, grid = CameraModel(), GroundGrid()
-    view = bird_eye(model, grid)
+    view = bird_eye(calibrated(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     u, v = seen_at(model, 8.0, -1.5)
     picture[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
@@ -51,14 +52,27 @@ def test_a_painted_cell_lands_in_its_own_place() -> None:
     "model", [CameraModel(), CameraModel(320, 240), CameraModel(1280, 720), CameraModel(pitch_rad=0.5)]
 )
 def test_the_stamp_is_never_looked_at(model: CameraModel) -> None:
-    """The rows cut out begin below the time stamp, whatever the camera."""
-    assert bird_eye(model, GroundGrid()).top_px >= STAMP_SIDE_PX
+    """Of a picture that is white where the stamp is and black elsewhere, nothing is seen from above."""
+    view = bird_eye(calibrated(model), GroundGrid())
+    picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
+    picture[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = 255
+    assert not view.from_above(view.region(picture)).any()
+
+
+def test_without_a_stamp_its_corner_is_road_too() -> None:
+    """A camera pitched down so far that it sees road in the corner looks there when there is no stamp."""
+    camera = calibrated(CameraModel(field_of_view_rad=0.7, pitch_rad=0.3))
+    white = np.full((480, 640), 255, dtype=np.uint8)
+    stamped, plain = (bird_eye(camera, GroundGrid(), stamped=each) for each in (True, False))
+    assert np.count_nonzero(stamped.from_above(stamped.region(white))) < np.count_nonzero(
+        plain.from_above(plain.region(white))
+    )
 
 
 @pytest.mark.parametrize(
-    "model", [CameraModel(pitch_rad=-0.8), CameraModel(pitch_rad=1.4), CameraModel(160, 64), CameraModel(x_m=25.0)]
+    "model", [CameraModel(pitch_rad=-0.8), CameraModel(pitch_rad=1.4), CameraModel(64, 64), CameraModel(x_m=25.0)]
 )
 def test_a_camera_that_does_not_see_the_road_is_refused(model: CameraModel) -> None:
     """A camera that looks elsewhere is the user's mistake, told with what to correct."""
-    with pytest.raises(UserError, match="correct its height"):
-        bird_eye(model, GroundGrid())
+    with pytest.raises(UserError, match="correct its place"):
+        bird_eye(calibrated(model), GroundGrid())

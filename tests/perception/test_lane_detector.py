@@ -1,9 +1,13 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
-from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene, centre_y_m
+from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene, centre_y_m, on_road
 
 from lavt.domain import CameraModel, Lane, Picture
 from lavt.perception.bird_eye import STAMP_SIDE_PX
+from lavt.perception.calibration import CalibratedCamera, calibrated, ground_points
 from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING, TRACK_CONFIDENCE, LaneDetector
 
 MODEL = CameraModel()
@@ -103,6 +107,80 @@ def test_the_lane_is_kept_when_the_car_leaves_it(scene: Scene) -> None:
     for offset_m in np.arange(0.0, 3.01, 0.3):
         lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
     assert at(lane, 8.0) == pytest.approx(-3.0, abs=0.3)  # the average lags by 0.2 m
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_lane_left_by_its_whole_width_is_given_up(scene: Scene, direction: int) -> None:
+    """A car that has got as far as the middle of the next lane is told about that one, as it stands in it."""
+    detector = LaneDetector(MODEL)
+    seen = [
+        detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m))).centre[0]
+        for offset_m in np.arange(0.0, direction * 4.2, direction * 0.1)
+    ]
+    offsets = np.arange(0.0, 4.2, 0.1)
+    old, new = (np.array(seen)[part] for part in (offsets < 3.2, offsets > 4.0))
+    assert np.abs(old + direction * offsets[offsets < 3.2]).max() < 0.2
+    assert np.abs(new + direction * (offsets[offsets > 4.0] - 3.5)).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    "offset_m", [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0]
+)  # on a line either lane is right
+@pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 42])
+def test_after_a_gap_the_nearest_lane_is_the_lane(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
+    """Wherever the car has got to while it saw nothing, the lane told next is the one that it stands in."""
+    six_lanes = (*FOUR_LANES, Line(-8.75, dash_m=3.0))
+    detector = LaneDetector(MODEL)
+    detector.detect(scene.picture(six_lanes))
+    detector.forget()
+    lane = detector.detect(scene.picture(six_lanes, curvature_per_m, offset_m=float(offset_m)))
+    expected_m = -float(np.remainder(offset_m + 1.75, 3.5) - 1.75)
+    assert at(lane, 5.0) == pytest.approx(expected_m + centre_y_m(5.0, curvature_per_m), abs=0.15)
+
+
+def test_the_sight_says_what_was_done(scene: Scene) -> None:
+    """The first picture is searched with windows, the next is followed without; both leave their steps to look at."""
+    detector = LaneDetector(MODEL)
+    detector.detect(scene.picture())
+    assert detector.sight is not None
+    assert detector.sight.windows
+    detector.detect(scene.picture())
+    assert not detector.sight.windows
+    assert detector.sight.fit is not None
+    assert detector.sight.mask.shape == (164, 280)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"distortion": (-0.25, 0.06, 0.0, 0.0, 0.0)},
+        {"distortion": (0.02, -0.01, 0.0, 0.0), "fisheye": True},
+        {"roll_rad": 0.06, "yaw_rad": -0.08, "y_m": 0.4, "pitch_rad": 0.08},
+    ],
+    ids=["barrel", "fisheye", "askew"],
+)
+def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
+    """Through a lens that bends lines, or from a camera mounted askew, the centre is right within 10 cm."""
+    camera = replace(calibrated(CameraModel(320, 240)), **lens)
+    picture = distorted(camera, 1 / 87, 0.4)
+    lane = LaneDetector(camera, stamped=False).detect(picture)
+    assert lane.confidence > 0.7
+    for x_m in (5.0, 10.0, 15.0):
+        assert at(lane, x_m) == pytest.approx(centre_y_m(x_m, 1 / 87) - 0.4, abs=0.1)
+
+
+def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float) -> Picture:
+    """Draw a road of four lanes as a calibrated camera sees it, pixel by pixel."""
+    columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    ground = ground_points(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64))
+    seen = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
+    x_m, y_m = np.where(seen[:, None], ground, 0.0).T
+    along, across = on_road(x_m, y_m, curvature_per_m, offset_m, 0.0)
+    shades = np.full((len(ground), 3), 85, dtype=np.uint8)
+    for line in FOUR_LANES:
+        paint = (np.abs(across - line.offset_m) < 0.0625) & (np.mod(along - line.phase_m, 9.0) < line.dash_m)
+        shades[seen & paint] = line.colour_bgr
+    return shades.reshape(camera.height_px, camera.width_px, 3)
 
 
 def test_the_stamp_changes_nothing(scene: Scene) -> None:

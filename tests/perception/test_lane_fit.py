@@ -34,7 +34,7 @@ def lines(centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m:
 def follow(points: Points, width_m: float = 3.5) -> tuple[Sides, LaneFit | None]:
     start = start_line(points, GRID, width_m)
     assert start is not None
-    sides = sides_by_windows(points, GRID, start, width_m)
+    sides, _ = sides_by_windows(points, GRID, start, width_m)
     return sides, fit_lane(points, sides, GRID, width_m)
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 import lavt.nodes
-from lavt.build import SeededEntropy, build_client, build_server
-from lavt.config import CameraConfig, ClientConfig, ServerConfig, VehicleConfig
+from lavt.build.entropy import SeededEntropy
+from lavt.build.sides import build_client, build_server
+from lavt.config import CameraConfig, ClientCameraConfig, ClientConfig, ServerConfig, VehicleConfig
 from lavt.domain import Now
 from lavt.node import WAKE, Node
 from lavt.transport.channels import CHANNELS, QUEUE_LENGTH
@@ -28,7 +29,11 @@ def nodes() -> Sequence[Node]:
         host="",
         video_port=1,
     )
-    client = build_client(ClientConfig(camera=camera), lambda: Now(0, 10**18), SeededEntropy(1, "client"))
+    client = build_client(
+        ClientConfig(camera=ClientCameraConfig(width_px=640, height_px=480)),
+        lambda: Now(0, 10**18),
+        SeededEntropy(1, "client"),
+    )
     return [*server.all, *client.all]
 
 

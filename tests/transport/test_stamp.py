@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
-from lavt.transport.stamp import STAMP_PX, read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+from lavt.transport.stamp import STAMP_PX, holds_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp
 
 STAMPS = st.integers(min_value=0, max_value=2**64 - 1)
 
@@ -95,3 +95,15 @@ def test_agreement(stamp_ns: int, bit: int) -> None:
     assert stamp_agrees(stamp_ns, rtp_timestamp(stamp_ns))
     if bit > 13:
         assert not stamp_agrees(stamp_ns ^ 1 << bit, rtp_timestamp(stamp_ns))
+
+
+def test_a_picture_with_a_stamp_is_told_from_one_without() -> None:
+    """A corner of black and white cells is a stamp; plain, grey or noisy corners and tiny pictures hold none."""
+    picture = np.full((128, 160, 3), 90, dtype=np.uint8)
+    assert not holds_stamp(picture)
+    assert not holds_stamp(np.zeros_like(picture))
+    assert not holds_stamp(np.zeros((40, 40, 3), dtype=np.uint8))
+    write_stamp(picture, 1_700_000_000_123_456_789)
+    assert holds_stamp(picture)
+    picture[:64, :64] = picture[:64, :64] // 3 + 80
+    assert not holds_stamp(picture)

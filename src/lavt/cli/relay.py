@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lavt.build import resolved_address
+from lavt.build.addresses import resolved_address
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import DelayConfig, RelayConfig, load_config

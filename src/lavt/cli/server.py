@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lavt.build import MachineEntropy, build_server
+from lavt.build.entropy import MachineEntropy
+from lavt.build.sides import build_server
 from lavt.cli import console
 from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock

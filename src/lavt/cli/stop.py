@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lavt.build import MachineEntropy
+from lavt.build.entropy import MachineEntropy
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock

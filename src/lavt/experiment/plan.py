@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lavt.build import check_names, run_seed
+from lavt.build.entropy import run_seed
+from lavt.build.sides import check_names
 from lavt.config import RunConfig, SweepConfig, condition, parse_config
 from lavt.errors import UserError
 

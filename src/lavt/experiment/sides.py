@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from lavt.config import ClientConfig, ClientVideoConfig, RunConfig, ServerConfig, ServerVideoConfig, ZenohConfig
+from lavt.config import (
+    ClientCameraConfig,
+    ClientConfig,
+    ClientVideoConfig,
+    RunConfig,
+    ServerConfig,
+    ServerVideoConfig,
+    ZenohConfig,
+)
 
 
 def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
@@ -22,7 +30,7 @@ def client_config(run: RunConfig, *, router: str = "", video_port: int = 0) -> C
     """Give the client's part of a run."""
     return ClientConfig(
         controller=run.controller,
-        camera=run.camera,
+        camera=ClientCameraConfig(**run.camera.model_dump()),
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
         zenoh=ZenohConfig(router=router),
         record=run.record,

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lavt.build import FIDELITIES, ClientNodes, SeededEntropy, ServerNodes, build_client, build_server
+from lavt.build.entropy import SeededEntropy
+from lavt.build.fidelity import FIDELITIES
+from lavt.build.sides import ClientNodes, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig, condition, load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
 from lavt.experiment.directory import make_directory

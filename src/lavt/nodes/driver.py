@@ -15,6 +15,7 @@ from lavt.errors import BadMessage, BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, VideoUnit, View
+from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
 from lavt.transport.pictures import PictureReceiver, Received
 from lavt.transport.stamp import stamp_agrees
@@ -87,6 +88,7 @@ class DriverNode:
         self._sequence = 0
         self._view: View | None = None
         self._view_ns = 0
+        self._looked_at_ns = 0
         self._decision: Decision | None = None
         self._lane_says: LaneState = "ok"
         self._speed_mps = 0.0
@@ -155,7 +157,11 @@ class DriverNode:
 
     def _perceive(self, message: Message, _now: Now) -> Seen:
         view: View = message.payload
-        if self.session.phase != "driving":  # what was tracked before a stop may be another lane by now
+        since_last_ns = view.stamp_ns - self._looked_at_ns
+        self._looked_at_ns = view.stamp_ns
+        # After a stop or a gap, what lies where the lane was may be another one. A gap is one between
+        # the times at which pictures were sent, as the car went on; of a clock put back nobody knows how long.
+        if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
             self._detector.forget()
         return Seen(view, view.stamp_ns, self._detector.detect(view.picture))
 

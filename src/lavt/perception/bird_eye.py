@@ -1,7 +1,6 @@
-"""The ground as seen from above: inverse perspective mapping by the camera's geometry, assuming flat ground.
+"""The ground as seen from above: inverse perspective mapping by the camera's calibration, assuming flat ground.
 
-Ground coordinates are the vehicle's frame: x ahead of the rear axle, y left, in metres. Pixel coordinates are those of
-OpenCV: the middle of the top left pixel is (0, 0). A bird's-eye picture has "far" at the top and "left" at the left.
+Coordinates are those of `calibration.py`. A bird's-eye picture has "far" at the top and "left" at the left.
 """
 
 from __future__ import annotations
@@ -13,11 +12,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lavt.domain import CameraModel, FloatArray
+from lavt.domain import FloatArray
 from lavt.errors import UserError
+from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
 
 STAMP_SIDE_PX = 64
-"""The top left square of this side carries the time stamp; the rows it covers are never looked at."""
+"""The top left square of this side carries the time stamp, and is never looked at where there is one."""
+STAMP_BESIDE_PX = 12
+"""Beside the stamp, at a focal length of 320 px or less: its edges speak for that much (half of `MARK_PX`)."""
+BentMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
+"""OpenCV's maps in fixed point: where in the picture each cell is seen."""
+MARGIN_PX = 3
+"""Rows beyond the ground looked at, for interpolation and the 5 rows of smoothing."""
+LANE_AHEAD_M = 3.5
+"""To either side: the ground ahead that matters most."""
+SEES_AT_LEAST = 0.4
+"""Share of the ground ahead that a camera must see to be of use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,25 +72,6 @@ class GroundGrid:
         )
 
 
-def ground_to_picture(model: CameraModel) -> FloatArray:
-    """Give the 3 x 3 homography from ground (x, y, 1) to picture (u, v, 1), up to scale.
-
-    The third component is the depth along the camera's axis; a point with none is not in the picture.
-    """
-    cosine, sine, focal_px = math.cos(model.pitch_rad), math.sin(model.pitch_rad), model.focal_px
-    # Rows: to the right, down, and deep, of a ground point (x, y, 1) as the camera sees it.
-    camera = np.array(
-        [
-            [0.0, -1.0, 0.0],
-            [-sine, 0.0, model.x_m * sine + model.z_m * cosine],
-            [cosine, 0.0, -model.x_m * cosine + model.z_m * sine],
-        ]
-    )
-    u_px, v_px = (model.width_px - 1) / 2, (model.height_px - 1) / 2
-    lens: FloatArray = np.array([[focal_px, 0.0, u_px], [0.0, focal_px, v_px], [0.0, 0.0, 1.0]])
-    return np.asarray(lens @ camera, dtype=np.float64)
-
-
 @dataclass(frozen=True, slots=True)
 class BirdEye:
     """How one camera's pictures become bird's-eye pictures: which rows to cut out, and the map from grid to them."""
@@ -88,7 +79,10 @@ class BirdEye:
     grid: GroundGrid
     top_px: int
     bottom_px: int
-    region_from_grid: FloatArray
+    region_from_grid: FloatArray | BentMaps
+    """From the grid to the rows cut out: a homography, or maps for a lens that bends lines."""
+    hidden: NDArray[np.uint8] | None
+    """0 for the cells that the time stamp covers, else 255; None when it covers none."""
 
     def region(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Cut out the rows in which the grid is seen, a view of `picture`."""
@@ -96,29 +90,50 @@ class BirdEye:
 
     def from_above(self, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Map a cut-out, grey or in colour, to the grid: (grid.rows, grid.columns), black where nothing is seen."""
-        seen = cv2.warpPerspective(
-            region,
-            self.region_from_grid,
-            (self.grid.columns, self.grid.rows),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        )
+        size = (self.grid.columns, self.grid.rows)
+        if isinstance(self.region_from_grid, tuple):
+            seen = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)
+        else:
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            seen = cv2.warpPerspective(region, self.region_from_grid, size, flags=flags)
+        if self.hidden is not None:
+            seen = cv2.bitwise_and(seen, seen, mask=self.hidden)
         return np.asarray(seen, dtype=np.uint8)
 
 
-def bird_eye(model: CameraModel, grid: GroundGrid) -> BirdEye:
-    """Prepare the mapping for a camera.
+def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True) -> BirdEye:
+    """Prepare the mapping for a camera; `stamped` tells whether its pictures carry the time stamp.
 
-    Raises UserError when the camera does not see the far and the near end of the grid below the stamp.
+    Raises UserError when the camera does not see the road that the grid covers.
     """
-    picture_from_ground = ground_to_picture(model)
-    far, near = (picture_from_ground @ np.array([x_m, 0.0, 1.0]) for x_m in (grid.far_m, grid.near_m))
-    # A margin of two rows, for interpolation and the 5 rows of smoothing.
-    top_px = max(math.floor(far[1] / far[2]) - 2, STAMP_SIDE_PX) if far[2] > 0 else 0
-    bottom_px = min(math.ceil(near[1] / near[2]) + 3, model.height_px) if near[2] > 0 else 0
-    if bottom_px - top_px < 16:
+    pixels = _cell_pixels(camera, grid)
+    u_px, v_px = pixels[..., 0], pixels[..., 1]
+    with np.errstate(invalid="ignore"):
+        inside = (u_px >= 0) & (u_px <= camera.width_px - 1) & (v_px >= 0) & (v_px <= camera.height_px - 1)
+        beside_px = STAMP_BESIDE_PX * max(camera.scale, 1.0)
+        stamp = inside & (u_px < STAMP_SIDE_PX + beside_px) & (v_px < STAMP_SIDE_PX + MARGIN_PX) & stamped
+    ahead = np.abs(grid.column_y_m()) < LANE_AHEAD_M
+    seen = inside & ~stamp
+    if seen[:, ahead].mean() < SEES_AT_LEAST or not seen[: grid.rows // 2, ahead].any():
         raise UserError(
             f"the camera does not see the road {grid.near_m} to {grid.far_m} m ahead of the rear axle; "
-            "correct its height, pitch, field of view or picture size"
+            "correct its place, yaw, pitch, roll, lens or picture size"
         )
-    shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
-    return BirdEye(grid, top_px, bottom_px, shift @ picture_from_ground @ grid.to_ground())
+    top_px = max(math.floor(v_px[inside].min()) - MARGIN_PX, 0)
+    bottom_px = min(math.ceil(v_px[inside].max()) + MARGIN_PX, camera.height_px)
+    hidden = np.where(stamp, 0, 255).astype(np.uint8) if stamp.any() else None
+    if not camera.distortion:
+        shift = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -top_px], [0.0, 0.0, 1.0]])
+        homography = shift @ ground_to_picture(camera) @ grid.to_ground()
+        return BirdEye(grid, top_px, bottom_px, homography, hidden)
+    maps = np.where(inside[..., None], pixels - (0, top_px), -9.0).astype(np.float32)
+    whole, fractions = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
+    return BirdEye(grid, top_px, bottom_px, (np.asarray(whole), np.asarray(fractions)), hidden)
+
+
+def _cell_pixels(camera: CalibratedCamera, grid: GroundGrid) -> FloatArray:
+    """Tell where in the picture the middle of each cell is seen: (rows, columns, 2), NaN where it is not."""
+    columns, rows = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
+    cells = np.stack([columns, rows, np.ones_like(columns)], axis=-1).reshape(-1, 3)
+    ground = cells @ grid.to_ground()[:2].T
+    return picture_points(camera, ground).reshape(grid.rows, grid.columns, 2)

@@ -8,8 +8,11 @@ fit before is used.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,10 +25,13 @@ Sides = NDArray[np.int8]
 
 PAINT_AT_LEAST = 128  # a cell of the bird's-eye mask is paint when half of it is
 CORRIDOR_M = 0.7  # beside the line expected: far more than a car moves in one frame, far less than half a lane
-OUTLIER_M = 0.25  # off the first fit: two widths of a mark
+OUTLIER_M = 0.25  # off the last fit but one: two widths of a mark
+DOUBTED_FROM_M = (0.3, 0.15)  # off the first two fits: paint this far off counts half, so that the greater part wins
 POINTS_AT_LEAST = 25  # of a line: a quarter of a metre of paint at full width
 LINEAR_BELOW_M = 6.0  # of length seen: the curvature of less is noise
 WIDTH_WITHIN_M = (2.6, 4.4)  # a lane's width
+SLOPE_AT_MOST = 0.5  # of the lane to the car: a line farther turned crosses the lane
+CURVATURE_AT_MOST_PER_M = 1 / 15  # what a car at walking pace could just follow
 COLUMN_BIN_M = 0.1
 START_LENGTH_M = 12.0  # the first paint is looked for within more than one period of broken marks
 START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)  # straight first: it wins a tie
@@ -33,8 +39,12 @@ START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)  # half the curvature, d
 WINDOW_M = (1.0, 0.6)  # a sliding window's length along x, and half its width
 WINDOW_POINTS_AT_LEAST = 6
 COVER_BIN_M = 0.5
-COVER_POINTS_AT_LEAST = 2
+COVER_POINTS_AT_LEAST = 4  # a third of what a whole mark gives in a bin
+COVER_LINE_M = 0.15  # a mark's half width, and as much for how well a curve fits
+COVER_CLEAN = 0.6  # share of the paint beside the line (`CORRIDOR_M`) that lies on it: by chance it is 0.2
+COVER_BINS_TOGETHER = 2  # paint of less than a metre is a spot
 COVER_REACH_M = 3.0  # half the gap of broken marks: seen paint vouches for as much road before and behind it
+PARALLEL_SEEN_AT_LEAST = 0.2  # of the length, to be the line of a neighbour lane
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +67,20 @@ class LaneFit:
     """Share of the length looked at in which the left line is seen, 0 to 1."""
     right_seen: float
     fitting: float
-    """Share of the points taken for this lane's that lie on its lines, 0 to 1."""
+    """Share of the paint in and beside the lane that lies on its lines, 0 to 1."""
 
     @property
     def confidence(self) -> float:
-        """Mean share of the two lines seen, times how much better than by chance the points fit."""
-        by_chance = OUTLIER_M / CORRIDOR_M
+        """Mean share of the two lines seen, times how much better than by chance the lines explain the paint."""
+        by_chance = 4 * OUTLIER_M / (self.width_m + 2 * CORRIDOR_M)
         return (self.left_seen + self.right_seen) / 2 * max(self.fitting - by_chance, 0.0) / (1 - by_chance)
 
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:
     """Give the cells of a bird's-eye mask that are paint as points on the ground."""
-    rows, columns = np.nonzero(mask >= PAINT_AT_LEAST)
-    return Points(grid.row_x_m()[rows], grid.column_y_m()[columns])
+    found: Any = cv2.findNonZero(cv2.threshold(mask, PAINT_AT_LEAST - 1, 255, cv2.THRESH_BINARY)[1])
+    cells = np.empty((0, 2), dtype=np.int32) if found is None else np.reshape(found, (-1, 2))
+    return Points(grid.row_x_m()[cells[:, 1]], grid.column_y_m()[cells[:, 0]])
 
 
 def sides_near(points: Points, centre: tuple[float, float, float], width_m: float) -> Sides:
@@ -89,13 +100,17 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
     `width_m`, so that just one of them has its centre within half of it.
     """
     near = points.x_m < grid.near_m + START_LENGTH_M
-    x, y = points.x_m[near], points.y_m[near]
     bins = round(width_m / COLUMN_BIN_M)
+    x, y = points.x_m[near], points.y_m[near]
+    far_m = grid.near_m + START_LENGTH_M
+    spread_m = float(np.abs(y).max(initial=0.0)) + (max(START_SLOPES) + max(START_BENDS_PER_M) * far_m) * far_m
+    lanes = 2 * math.ceil(spread_m / width_m)  # as many as straightened paint may lie in, half of them on the right
+    y_bins, bins_per_m = y / width_m * bins + lanes // 2 * bins, bins / width_m
     best_score, best = WINDOW_POINTS_AT_LEAST, None
     for bend in START_BENDS_PER_M:
         for slope in START_SLOPES:
-            folded = ((y - (slope + bend * x) * x) / width_m * bins).astype(np.int64) % bins
-            counts = np.bincount(folded, minlength=bins)
+            straight = (y_bins - (slope * bins_per_m + bend * bins_per_m * x) * x).astype(np.intp)
+            counts = np.bincount(straight, minlength=lanes * bins).reshape(-1, bins).sum(axis=0)
             scores = counts + np.roll(counts, 1) + np.roll(counts, -1)
             if scores.max() > best_score:
                 line_m = (float(np.argmax(scores)) + 0.5) / bins * width_m  # between 0 and the width: one of the lines
@@ -103,18 +118,23 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
     return best
 
 
-def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float) -> Sides:
+def sides_by_windows(
+    points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float
+) -> tuple[Sides, tuple[tuple[float, float], ...]]:
     """Follow both lines from the near end with a pair of sliding windows that move as one.
 
-    They follow the centre `start`, moved by how far off it they were seen to be last.
+    They follow the centre `start`, moved by how far off it they were seen to be last. Gives the sides and, for each
+    pair, its near end (x) and how far left of `start` its middle is, in metres.
     """
     length_m, half_width_m = WINDOW_M
     offset_m = points.y_m - _along(points.x_m, start)[0]
     off_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
+    places = []
     for low_m in np.arange(grid.near_m, grid.far_m, length_m):
         inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
         seen_m = []
+        places.append((float(low_m), off_m))
         for side in (1, -1):
             line_m = off_m + side * width_m / 2
             caught = inside & (np.abs(offset_m - line_m) < half_width_m)
@@ -123,37 +143,54 @@ def sides_by_windows(points: Points, grid: GroundGrid, start: tuple[float, float
                 seen_m.append(float(np.mean(offset_m[caught])) - line_m)
         if seen_m:
             off_m += sum(seen_m) / len(seen_m)
-    return sides
+    return sides, tuple(places)
 
 
-def fit_lane(points: Points, sides: Sides, grid: GroundGrid, width_m: float) -> LaneFit | None:
-    """Fit a lane to the points of its lines, leave out what lies off it, and fit again; None when too few are left.
+def fit_lane(
+    points: Points, sides: Sides, grid: GroundGrid, width_m: float, expected: tuple[float, float, float] | None = None
+) -> LaneFit | None:
+    """Fit a lane to the points of its lines, trusting less what lies off it, and fit again; None when there is none.
 
     `width_m` is the width expected; it is used where only one line is seen, or where what is seen is not a lane's.
+    `expected` is the centre expected, where one is.
     """
-    of_lane = sides != 0
+    of_lane = np.flatnonzero(sides)
     chosen, side = Points(points.x_m[of_lane], points.y_m[of_lane]), sides[of_lane]
-    first = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0))
-    if first is None:
+    fit = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
+    for doubted_m in DOUBTED_FROM_M:
+        if fit is None:
+            return None
+        trust = 1 / (1 + (_residual_m(chosen, side, *fit) / doubted_m) ** 2)
+        fit = _fit_once(chosen, side, width_m, slopes_of=fit[0], trust=trust)
+    if fit is None:
         return None
-    fits = np.abs(_residual_m(chosen, side, *first)) < 2 * OUTLIER_M  # parallels were taken as if straight
-    refined = _fit_once(Points(chosen.x_m[fits], chosen.y_m[fits]), side[fits], width_m, slopes_of=first[0])
-    if refined is None:
-        return None
-    fits = np.abs(_residual_m(chosen, side, *refined)) < OUTLIER_M
+    fits = np.abs(_residual_m(chosen, side, *fit)) < OUTLIER_M
     kept, kept_side = Points(chosen.x_m[fits], chosen.y_m[fits]), side[fits]
-    last = _fit_once(kept, kept_side, width_m, slopes_of=refined[0])
-    if last is None:
+    fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
+    if fit is None or abs(fit[0][1]) > SLOPE_AT_MOST or 2 * abs(fit[0][2]) > CURVATURE_AT_MOST_PER_M:
         return None
+    centre, measured_m = fit
+    across = _across_m(points, centre)
+    beyond = np.abs(across) - measured_m / 2
+    near_line = np.abs(beyond)
     return LaneFit(
-        centre=last[0],
-        width_m=last[1],
+        centre=centre,
+        width_m=measured_m,
         near_m=float(kept.x_m.min()),
         far_m=float(kept.x_m.max()),
-        left_seen=_share_seen(kept.x_m[kept_side > 0], grid),
-        right_seen=_share_seen(kept.x_m[kept_side < 0], grid),
-        fitting=float(np.mean(fits)),
+        left_seen=_share_seen(points.x_m[across > 0], near_line[across > 0], grid),
+        right_seen=_share_seen(points.x_m[across < 0], near_line[across < 0], grid),
+        fitting=float(np.count_nonzero(near_line < OUTLIER_M)) / max(int(np.count_nonzero(beyond < CORRIDOR_M)), 1),
     )
+
+
+def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
+    """Tell whether there are two lines a lane's width apart: both of the lane's, or one and one of a neighbour's."""
+    seen = [side for side, share in ((1, fit.left_seen), (-1, fit.right_seen)) if share >= PARALLEL_SEEN_AT_LEAST]
+    if len(seen) != 1:
+        return len(seen) == 2
+    off = np.abs(_across_m(points, fit.centre) - seen[0] * 1.5 * fit.width_m)
+    return _share_seen(points.x_m, off, grid) >= PARALLEL_SEEN_AT_LEAST
 
 
 def _along(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
@@ -163,16 +200,26 @@ def _along(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatAr
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
 
 
-def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
+def _across_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
+    """Give how far left of a centre line points lie."""
     middle, slope_factor = _along(points.x_m, centre)
-    return (points.y_m - middle) / slope_factor - side * width_m / 2
+    return (points.y_m - middle) / slope_factor
+
+
+def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
+    return _across_m(points, centre) - side * width_m / 2
 
 
 def _fit_once(
-    points: Points, side: Sides, width_m: float, slopes_of: tuple[float, float, float]
+    points: Points,
+    side: Sides,
+    width_m: float,
+    slopes_of: tuple[float, float, float],
+    trust: FloatArray | None = None,
 ) -> tuple[tuple[float, float, float], float] | None:
     """Least squares for centre and width; the parallels' slopes are those of an earlier centre."""
-    left, right = int(np.count_nonzero(side > 0)), int(np.count_nonzero(side < 0))
+    left = int(np.count_nonzero(side > 0))
+    right = len(side) - left
     if max(left, right) < POINTS_AT_LEAST:
         return None
     x, y = points.x_m, points.y_m
@@ -180,23 +227,25 @@ def _fit_once(
     curve = [np.ones_like(x), x]
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
         curve.append(x * x)
+    weight = curve[0] if trust is None else trust
     if min(left, right) >= POINTS_AT_LEAST:
-        solved = _solve([*curve, half_lane], y)
+        solved = _solve([*curve, half_lane], y, weight)
         if solved is None:
             return None
         if WIDTH_WITHIN_M[0] <= solved[-1] <= WIDTH_WITHIN_M[1]:
             return _centre(solved[:-1]), float(solved[-1])
     # One line, or two that are not a lane apart: believe the one of which more is seen.
     better = side == (1 if left >= right else -1)
-    solved = _solve([column[better] for column in curve], (y - width_m * half_lane)[better])
+    solved = _solve([column[better] for column in curve], (y - width_m * half_lane)[better], weight[better])
     return None if solved is None else (_centre(solved), width_m)
 
 
-def _solve(columns: list[FloatArray], y: FloatArray) -> FloatArray | None:
+def _solve(columns: list[FloatArray], y: FloatArray, weight: FloatArray) -> FloatArray | None:
     """Solve the normal equations: hundreds of points, four unknowns; None when the points do not determine them."""
     design = np.stack(columns)
+    weighted = design * weight
     try:
-        return np.asarray(np.linalg.solve(design @ design.T, design @ y), dtype=np.float64)
+        return np.asarray(np.linalg.solve(weighted @ design.T, weighted @ y), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
 
@@ -205,10 +254,21 @@ def _centre(solved: FloatArray) -> tuple[float, float, float]:
     return float(solved[0]), float(solved[1]), float(solved[2]) if len(solved) > 2 else 0.0
 
 
-def _share_seen(x_m: FloatArray, grid: GroundGrid) -> float:
-    """Give the share of the grid's length within reach of paint, so that a broken line counts almost as a solid one."""
+def _share_seen(x_m: FloatArray, off_m: FloatArray, grid: GroundGrid) -> float:
+    """Give the share of the grid's length within reach of a line's clean paint, so that broken counts as solid.
+
+    `off_m` is how far each point lies off the line; clean is where most of what lies near it lies on it.
+    """
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
-    counts = np.histogram(x_m, bins, (grid.near_m, grid.far_m))[0]
+    each = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
+    on_line = np.bincount(each[off_m < COVER_LINE_M], minlength=bins)
+    beside = np.bincount(each[off_m < CORRIDOR_M], minlength=bins)
+    clean = (on_line >= COVER_POINTS_AT_LEAST) & (on_line >= COVER_CLEAN * beside)
+    runs = np.convolve(clean, np.ones(COVER_BINS_TOGETHER), mode="full") == COVER_BINS_TOGETHER
+    # A run ends where it was found: what reaches back over it, and COVER_REACH_M from both its ends, is seen.
     reach = round(COVER_REACH_M / COVER_BIN_M)
-    seen = np.convolve(counts >= COVER_POINTS_AT_LEAST, np.ones(2 * reach + 1), mode="same") > 0
-    return float(np.mean(seen))
+    ends = np.flatnonzero(runs)
+    near = np.zeros(bins + 1)
+    np.add.at(near, np.maximum(ends - COVER_BINS_TOGETHER + 1 - reach, 0), 1)
+    np.add.at(near, np.minimum(ends + reach + 1, bins), -1)
+    return float(np.mean(np.cumsum(near)[:bins] > 0))

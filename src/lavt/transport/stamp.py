@@ -22,6 +22,7 @@ _CELL_PX = STAMP_PX // _CELLS
 _CENTRE = slice(_CELL_PX // 4, _CELL_PX - _CELL_PX // 4)
 _CENTRE_PIXELS = (_CELL_PX // 2) ** 2
 _THRESHOLD = 128
+_BLACK_BELOW, _WHITE_ABOVE = 64, 192  # far from both is what a codec makes of a cell
 
 _RTP_CLOCK_HZ_BY_10000 = 9
 _NS_PER_S_BY_10000 = 100_000
@@ -52,6 +53,16 @@ def read_stamp(luma: NDArray[np.uint8]) -> int:
     cells = luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
     sums = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
     return int.from_bytes(np.packbits(sums > _THRESHOLD * _CENTRE_PIXELS).tobytes(), "big")
+
+
+def holds_stamp(picture_bgr: Picture) -> bool:
+    """Tell whether a picture, (height, width, 3), looks as if it carries a stamp: 64 cells, each black or white."""
+    if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
+        return False
+    corner = picture_bgr[:STAMP_PX, :STAMP_PX].mean(axis=2).reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
+    cells = corner[:, _CENTRE, :, _CENTRE]
+    black, white = (cells < _BLACK_BELOW).all(axis=(1, 3)), (cells > _WHITE_ABOVE).all(axis=(1, 3))
+    return bool((black | white).all() and black.any() and white.any())
 
 
 def rtp_timestamp(stamp_ns: int) -> int:

@@ -1,0 +1,1 @@
+"""Objects made of configs: the only floor that sees both."""

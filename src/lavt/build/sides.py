@@ -1,0 +1,180 @@
+"""The one place where nodes are made of configs; nothing below it asks whether time is real."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+from lavt.build.addresses import resolved_address
+from lavt.build.entropy import Entropy
+from lavt.build.fidelity import VIDEO, Fidelity
+from lavt.build.vehicles import check_vehicle, looks_of
+from lavt.config import (
+    ClientConfig,
+    ControllerConfig,
+    SafetyConfig,
+    ServerConfig,
+    VehicleConfig,
+)
+from lavt.control.drive_controller import DriveController, find_preset, make_controller
+from lavt.control.limiter import Limiter
+from lavt.control.limits import CLIENT_LIMITS, LIMITS, Limits
+from lavt.control.safety import SafetyGate
+from lavt.domain import NS_PER_MS, Now
+from lavt.errors import UserError
+from lavt.node import Node
+from lavt.nodes.actuator import ActuatorNode
+from lavt.nodes.camera import CameraNode
+from lavt.nodes.client_session import ClientSession
+from lavt.nodes.clock_sync import ClockSyncNode
+from lavt.nodes.driver import DriverNode
+from lavt.nodes.receiver import ReceiverNode
+from lavt.transport.reorder import ReorderBuffer
+from lavt.transport.rtp import Depacketizer, Packetizer
+from lavt.transport.video_path import TOKEN_BYTES, PathServer
+
+
+@dataclass(frozen=True, slots=True)
+class ServerNodes:
+    """The server's nodes."""
+
+    camera: CameraNode
+    actuator: ActuatorNode
+    clock_sync: ClockSyncNode
+
+    @property
+    def all(self) -> Sequence[Node]:
+        """All nodes, for a runtime."""
+        return (self.camera, self.actuator, self.clock_sync)
+
+
+@dataclass(frozen=True, slots=True)
+class ClientNodes:
+    """The client's nodes."""
+
+    receiver: ReceiverNode
+    driver: DriverNode
+    clock_sync: ClockSyncNode
+
+    @property
+    def all(self) -> Sequence[Node]:
+        """All nodes, for a runtime."""
+        return (self.receiver, self.driver, self.clock_sync)
+
+
+@lru_cache(maxsize=64)  # a sweep asks for each of its runs
+def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
+    """Raise `UserError` for a vehicle, route, controller or preset that does not exist, before any work is begun."""
+    check_vehicle(vehicle)
+    build_controller(controller)
+
+
+def build_controller(config: ControllerConfig) -> DriveController:
+    """Make the configured controller; raises `UserError` naming the known ones and the known presets."""
+    return make_controller(config.kind, replace(find_preset(config.preset), **config.changes), config.wheelbase_m)
+
+
+def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
+    """Take the configured limits; only a simulated vehicle may have wider ones than the default."""
+    limits = replace(
+        LIMITS,
+        lateral_acceleration_mps2=config.lateral_acceleration_mps2,
+        picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
+    )
+    wider = (
+        limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
+        or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
+    )
+    if wider and not simulated:
+        raise UserError(
+            f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2 and "
+            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms: lower safety.lateral_acceleration_mps2 and "
+            "safety.picture_age_limit_ms"
+        )
+    return limits
+
+
+def build_server(
+    config: ServerConfig,
+    now: Callable[[], Now],
+    entropy: Entropy,
+    *,
+    host: str,
+    video_port: int,
+    fidelity: Fidelity = VIDEO,
+    lives_on_demand: bool = False,
+) -> ServerNodes:
+    """Make the server's nodes; their time begins when everything that is slow has been prepared.
+
+    With `lives_on_demand` a vehicle that catches up lives on only when somebody looks: where no wake is ever late, in
+    virtual time.
+    """
+    plant = fidelity.plant(config)
+    pictures = fidelity.sender(config)
+    start = now()
+    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
+    vehicle = plant.start(start)
+    able = vehicle.capabilities
+    limits = limits_of(config.safety, simulated=able.simulated)
+    limiter = Limiter(
+        limits,
+        wheelbase_m=able.wheelbase_m,
+        max_steering_rad=able.max_steering_rad,
+        max_braking_mps2=able.max_braking_mps2,
+    )
+    gate = SafetyGate(
+        limits,
+        limiter,
+        new_epoch=lambda: entropy.number(64),
+        new_token=lambda: entropy.token(TOKEN_BYTES),
+        host=host,
+        video_port=video_port,
+    )
+    return ServerNodes(
+        CameraNode(
+            plant.camera,
+            pictures,
+            Packetizer(entropy.number(32), entropy.number(16)),
+            PathServer(lambda: entropy.token(32)),
+            start_ns=start.mono_ns,
+            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
+        ),
+        ActuatorNode(
+            vehicle,
+            gate,
+            start_ns=start.mono_ns,
+            route=plant.route,
+            looks=looks,
+            after_collision=config.vehicle.after_collision,
+        ),
+        ClockSyncNode(start.mono_ns),
+    )
+
+
+def build_client(
+    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: Fidelity = VIDEO
+) -> ClientNodes:
+    """Make the client's nodes."""
+    controller = config.controller
+    pictures, detector = fidelity.receiver(config), fidelity.detector(config)
+    drive_controller = build_controller(controller)
+    start = now()
+    session = ClientSession(
+        config.who,
+        entropy.number(64),
+        rearm=controller.rearm,
+        start_ns=start.mono_ns,
+        clear_stop=controller.clear_emergency_stop,
+    )
+    return ClientNodes(
+        ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
+        DriverNode(
+            pictures,
+            detector,
+            drive_controller,
+            session,
+            CLIENT_LIMITS,
+        ),
+        ClockSyncNode(start.mono_ns),
+    )

@@ -1,0 +1,193 @@
+"""All steps from a picture to its lane, drawn side by side: what the detector did, for people to look at."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from lavt.domain import FloatArray, Lane, Picture
+from lavt.perception.bird_eye import BirdEye, GroundGrid
+from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
+from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector, Sight
+from lavt.perception.lane_fit import CORRIDOR_M, WINDOW_M
+from lavt.perception.lane_pixels import edge_pixels, grey_of, lane_pixels, white_pixels, yellow_pixels
+
+TILE_PX = (400, 300)
+"""Width and height of a step's picture; a row of text stands above each."""
+LABEL_PX = 24
+COLUMNS = 4
+LEFT, RIGHT, NOBODYS, CENTRE, EXPECTED = (80, 200, 80), (230, 150, 60), (120, 120, 120), (60, 60, 255), (60, 220, 255)
+"""Colours (blue, green, red) of the left and the right line's points, of others', of the centre, and of a guess."""
+
+
+def panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) -> Picture:
+    """Let the detector look at the next picture and draw its steps: (3 rows of tiles, 4 columns of tiles, 3)."""
+    lane = detector.detect(picture)
+    sight, view = detector.sight, detector.view
+    if sight is None:
+        raise ValueError("a detector that has looked has a sight")
+    region = view.region(picture)
+    grey, scale = grey_of(region), camera.scale
+    rows = {
+        "3 white: brighter than around": white_pixels(grey, scale),
+        "4 yellow: much more red than blue": yellow_pixels(region),
+        "5 near upright edges": edge_pixels(grey, scale),
+        "6 marks: (3 or 4) and 5": lane_pixels(region, scale),
+    }
+    tiles = {
+        "1 picture": picture,
+        "2 without distortion; ground looked at": _with_region(camera, picture, view.grid),
+        **{label: _in_place(mask, picture, view) for label, mask in rows.items()},
+        "7 bird's eye, far end at the top": view.from_above(region),
+        "8 marks from above": _grey_to_colour(sight.mask),
+        "9 points: left, right, nobody's": _points(sight, view.grid),
+        "10 lane fitted": _fitted(sight, lane, view),
+        "11 lane in the picture": _lane_in(camera, picture, lane),
+    }
+    drawn = [_tile(label, tile) for label, tile in tiles.items()]
+    drawn.append(_tile("12 confidence", _words(sight, lane)))
+    return np.vstack([np.hstack(drawn[start : start + COLUMNS]) for start in range(0, len(drawn), COLUMNS)])
+
+
+def _tile(label: str, tile: Picture) -> Picture:
+    """Fit a picture into a tile and write its label above."""
+    width, height = TILE_PX
+    factor = min(width / tile.shape[1], height / tile.shape[0])
+    size = (max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1))
+    shrunk = cv2.resize(tile, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_NEAREST)
+    whole = np.full((height + LABEL_PX, width, 3), 30, dtype=np.uint8)
+    left, top = (width - size[0]) // 2, LABEL_PX + (height - size[1]) // 2
+    whole[top : top + size[1], left : left + size[0]] = shrunk
+    cv2.putText(whole, label, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return whole
+
+
+def _grey_to_colour(grey: Picture) -> Picture:
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+
+
+def _in_place(mask: Picture, picture: Picture, view: BirdEye) -> Picture:
+    """Put a mask of the rows cut out where they are in the picture."""
+    whole = np.full_like(picture, 30)
+    view.region(whole)[:] = mask[..., None]
+    return whole
+
+
+def _with_region(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
+    """Straighten the picture and outline the ground that is looked at."""
+    straight, factors = picture.copy(), np.array(camera.distortion)
+    if camera.distortion:
+        size, undistorted = (camera.width_px, camera.height_px), camera.lens
+        make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+        maps = make(camera.lens, factors, np.eye(3), undistorted, size, cv2.CV_16SC2)
+        straight = np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
+    near, far, side = grid.near_m, grid.far_m, grid.half_width_m
+    corners = np.array([[near, side], [far, side], [far, -side], [near, -side], [near, side]])
+    rim = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(corners)])
+    seen = np.column_stack([rim, np.ones(len(rim))]) @ ground_to_picture(camera).T
+    seen = seen[seen[:, 2] > 0.1]
+    _curve(straight, seen[:, :2] / seen[:, 2:], EXPECTED)
+    return straight
+
+
+def _curve(picture: Picture, pixels: FloatArray, colour: tuple[int, int, int], thickness: int = 2) -> None:
+    """Draw a line through those of the points (n, 2) that are anywhere near the picture."""
+    limit = 4 * max(picture.shape)
+    near = np.isfinite(pixels).all(axis=1) & (np.abs(np.nan_to_num(pixels)) < limit).all(axis=1)
+    cv2.polylines(picture, [np.round(pixels[near]).astype(np.int32)], False, colour, thickness, cv2.LINE_AA)
+
+
+def _cells(points: FloatArray, grid: GroundGrid) -> FloatArray:
+    """Turn ground points (n, 2) into (column, row) of the grid."""
+    columns = (grid.half_width_m - points[:, 1]) / grid.step_y_m - 0.5
+    return np.column_stack([columns, (grid.far_m - points[:, 0]) / grid.step_x_m - 0.5])
+
+
+def _parallel(centre: tuple[float, float, float], offset_m: float, near_m: float, far_m: float) -> FloatArray:
+    """Give ground points (n, 2) along the parallel of a centre line, left of it by `offset_m`."""
+    x = np.linspace(near_m, far_m, 60)
+    slope = centre[1] + 2 * centre[2] * x
+    across = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
+    return np.column_stack([x, centre[0] + (centre[1] + centre[2] * x) * x]) + offset_m * across
+
+
+def _points(sight: Sight, grid: GroundGrid) -> Picture:
+    """Draw whose point is whose, and the windows or corridors in which they were looked for."""
+    drawn = np.zeros((*sight.mask.shape, 3), dtype=np.uint8)
+    cells = np.round(_cells(np.column_stack([sight.points.x_m, sight.points.y_m]), grid)).astype(int)
+    palette = np.array([NOBODYS, LEFT, RIGHT], dtype=np.uint8)  # by side: 0, 1, -1
+    drawn[cells[:, 1], cells[:, 0]] = palette[sight.sides]
+    if sight.expected is None:
+        return drawn
+    if not sight.windows:
+        for side in (1, -1):
+            for rim_m in (-CORRIDOR_M, CORRIDOR_M):
+                line = _parallel(sight.expected, side * sight.expected_width_m / 2 + rim_m, grid.near_m, grid.far_m)
+                _curve(drawn, _cells(line, grid), EXPECTED, 1)
+    length_m, half_width_m = WINDOW_M
+    c0, c1, c2 = sight.expected
+    for low_m, off_m in sight.windows:
+        middle_m = low_m + length_m / 2
+        for side in (1, -1):
+            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * sight.expected_width_m / 2
+            box = np.array([[low_m, y_m + half_width_m], [low_m + length_m, y_m - half_width_m]])
+            first, second = np.round(_cells(box, grid)).astype(int).tolist()
+            cv2.rectangle(drawn, first, second, EXPECTED, 1)
+    return drawn
+
+
+def _fitted(sight: Sight, lane: Lane, view: BirdEye) -> Picture:
+    """Draw the lane of this picture alone over its marks, and the average's centre."""
+    drawn = _grey_to_colour(sight.mask // 2)
+    if sight.fit is not None:
+        for offset_m, colour in ((sight.fit.width_m / 2, LEFT), (-sight.fit.width_m / 2, RIGHT)):
+            line = _parallel(sight.fit.centre, offset_m, sight.fit.near_m, sight.fit.far_m)
+            _curve(drawn, _cells(line, view.grid), colour, 1)
+    if lane.confidence >= TRACK_CONFIDENCE:
+        centre = _parallel(lane.centre, 0.0, view.grid.near_m, view.grid.far_m)
+        _curve(drawn, _cells(centre, view.grid), CENTRE, 1)
+    return drawn
+
+
+def _lane_in(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
+    """Draw the lane into the picture, through the lens; nothing where there is none to drive by."""
+    drawn = picture.copy()
+    if lane.confidence < TRACK_CONFIDENCE:
+        return drawn
+    left, right = (_parallel(lane.centre, side * lane.width_m / 2, lane.near_m, lane.far_m) for side in (1, -1))
+    rim = picture_points(camera, np.concatenate([left, right[::-1]]))
+    rim = rim[np.isfinite(rim).all(axis=1)]
+    filled = drawn.copy()
+    cv2.fillPoly(filled, [np.round(rim).astype(np.int32)], LEFT)
+    cv2.addWeighted(filled, 0.35, drawn, 0.65, 0, drawn)
+    for line, colour in ((left, LEFT), (right, RIGHT)):
+        _curve(drawn, picture_points(camera, line), colour)
+    _curve(drawn, picture_points(camera, _parallel(lane.centre, 0.0, lane.near_m, lane.far_m)), CENTRE)
+    return drawn
+
+
+def _words(sight: Sight, lane: Lane) -> Picture:
+    """Write the confidence and what it is made of."""
+    drawn = np.full((TILE_PX[1], TILE_PX[0], 3), 30, dtype=np.uint8)
+    enough = lane.confidence >= TRACK_CONFIDENCE
+    lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if enough else f"no lane (below {TRACK_CONFIDENCE})")]
+    searched = sight.windows or sight.expected is None
+    lines.append("searched by windows" if searched else "followed from the picture before")
+    if sight.fit is None:
+        lines.append("no two parallel lines, or nothing a lane can be")
+    else:
+        fit = sight.fit
+        lines += [f"left line seen {fit.left_seen:.2f}", f"right line seen {fit.right_seen:.2f}",
+                  f"paint in the lane that is on its lines {fit.fitting:.2f}"]  # fmt: skip
+    if enough:
+        c0, c1, c2 = lane.centre
+        lines += [f"width {lane.width_m:.2f} m", f"centre {abs(c0):.2f} m to the {'left' if c0 > 0 else 'right'}",
+                  f"turned {math.degrees(math.atan(c1)):+.1f} deg (left +)", f"curvature {2 * c2:+.4f} / m",
+                  f"seen from {lane.near_m:.1f} to {lane.far_m:.1f} m"]  # fmt: skip
+    for number, line in enumerate(lines):
+        colour = (255, 255, 255) if number else ((120, 230, 120) if enough else (90, 90, 255))
+        cv2.putText(drawn, line, (10, 28 + 25 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+    return drawn

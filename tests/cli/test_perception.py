@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lavt.build.cameras import camera_of_file
+from lavt.build.entropy import MachineEntropy
+from lavt.build.sides import build_client
+from lavt.cli.main import app
+from lavt.cli.pictures import write_video
+from lavt.clock import MachineClock
+from lavt.config import ClientConfig, parse_config, shipped
+from lavt.domain import CameraModel
+from lavt.errors import UserError
+from lavt.perception.calibration import calibrated
+from lavt.perception.lane_detector import LaneDetector
+
+CALIBRATION = """
+width_px: 640
+height_px: 480
+fx_px: 330.0
+fy_px: 331.0
+cx_px: 321.0
+cy_px: 238.0
+distortion: [-0.28, 0.07, 0.0005, -0.0003, 0.0]
+x_m: 1.6
+z_m: 1.4
+"""
+ROAD = np.full((480, 640, 3), 85, dtype=np.uint8)
+Show = Callable[..., None]
+
+
+@pytest.fixture
+def show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Show:
+    """Give a function that runs the command in a directory that has a calibration and a picture."""
+    monkeypatch.chdir(tmp_path)
+    Path("camera.yaml").write_text(CALIBRATION)
+    cv2.imwrite("road.png", ROAD)
+
+    def show_here(source: str, *options: str, camera: str = "camera.yaml") -> None:
+        app(["perception", "show", source, "--camera", camera, *options], standalone_mode=False)
+
+    return show_here
+
+
+def test_a_pictures_steps_are_drawn(show: Show) -> None:
+    """A picture and a calibration give one picture of twelve labelled steps."""
+    show("road.png")
+    steps = cv2.imread("road-steps.png")
+    assert steps is not None
+    assert steps.shape == (3 * 324, 4 * 400, 3)
+    assert steps[:24].max() > 200  # the labels
+
+
+@pytest.mark.parametrize("name", ["demo.yaml", "client.yaml", "sweep.yaml"])
+def test_a_configs_camera_is_a_calibration_too(show: Show, name: str) -> None:
+    """The camera of a config file, also where it is left to its defaults, can be looked through."""
+    show("road.png", "--out", "steps.jpg", camera=str(shipped(f"configs/{name}")))
+    assert Path("steps.jpg").is_file()
+    assert camera_of_file(shipped(f"configs/{name}")) == calibrated(CameraModel())
+
+
+def test_a_videos_steps_are_a_video(show: Show) -> None:
+    """A video gives a video with as many pictures."""
+    write_video(Path("road.mp4"), [ROAD] * 3, 30.0)
+    show("road.mp4", "--out", "steps.mp4")
+    video = cv2.VideoCapture("steps.mp4")
+    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
+
+
+@pytest.mark.parametrize(
+    ("source", "calibration", "options", "says"),
+    [
+        ("nothing.png", CALIBRATION, (), "nothing.png is not there"),
+        (".", CALIBRATION, (), "is not there: name a picture"),
+        ("camera.yaml", CALIBRATION, (), "neither a picture nor a video"),
+        ("empty.mp4", CALIBRATION, (), "neither a picture nor a video"),
+        ("record.mcap", CALIBRATION, (), "holds no picture"),
+        ("small.png", CALIBRATION, (), "is 320 x 240, but the calibration is for 640 x 480"),
+        ("road.png", CALIBRATION + "fx: 3.0\n", (), "did you mean 'fx_px'"),
+        ("road.png", CALIBRATION + "pich_deg: 3.0\n", (), "did you mean 'pitch_deg'"),
+        ("road.png", CALIBRATION + "pitch_deg: -50.0\n", (), "does not see the road"),
+        ("road.png", CALIBRATION + "yaw_deg: 90.0\n", (), "does not see the road"),
+        ("road.png", CALIBRATION + "field_of_view_deg: 90.0\n", (), "give either field_of_view_deg, or all of fx_px"),
+        ("road.png", CALIBRATION.replace("fy_px: 331.0\n", ""), (), "give either field_of_view_deg, or all of fx_px"),
+        ("road.png", CALIBRATION + "lens: fisheye\n", (), "must have 0 or 4 coefficients"),
+        ("road.png", CALIBRATION.replace("x_m: 1.6\n", ""), (), "'x_m' is missing"),
+        ("road.png", "camera: 3\n", (), "camera must hold keys and values"),
+        ("road.png", CALIBRATION, ("--out", "steps.txt"), "a picture ends with .png"),
+        ("road.png", CALIBRATION, ("--out", "nowhere/steps.png"), "nowhere is not a directory"),
+    ],
+)
+def test_what_cannot_be_shown_is_told(
+    show: Show, source: str, calibration: str, options: tuple[str, ...], says: str
+) -> None:
+    """Files, calibrations and outputs that cannot be used are refused with a sentence that says what to do."""
+    Path("camera.yaml").write_text(calibration)
+    Path("empty.mp4").touch()
+    Path("record.mcap").touch()
+    cv2.imwrite("small.png", ROAD[::2, ::2])
+    with pytest.raises(UserError) as refused:
+        show(source, *options)
+    assert says in str(refused.value)
+    assert not list(Path().glob("*steps*"))
+
+
+def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (its directory)
+    """The client takes its camera from the file that `camera.calibration` names."""
+    config = parse_config(ClientConfig, {"camera": {"calibration": "camera.yaml"}}, "test")
+    nodes = build_client(config, MachineClock().now, MachineEntropy())
+    detector = nodes.driver._detector
+    assert isinstance(detector, LaneDetector)
+    assert isinstance(detector.view.region_from_grid, tuple)
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ({"calibration": "camera.yaml", "pitch_deg": 3.0}, "leave out camera.pitch_deg"),
+        ({"calibration": "camera.yaml", "width_px": 320}, "camera.width_px is 320, but camera.yaml was made for 640"),
+        ({"calibration": "none.yaml"}, "none.yaml cannot be read"),
+    ],
+)
+def test_a_calibration_that_is_contradicted_is_refused(show: Show, camera: dict[str, object], says: str) -> None:  # noqa: ARG001
+    """What the config says beside its calibration must not say something else."""
+    with pytest.raises(UserError, match=says):
+        build_client(parse_config(ClientConfig, {"camera": camera}, "test"), MachineClock().now, MachineEntropy())

@@ -1,0 +1,100 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lavt.perception.bird_eye import GroundGrid, bird_eye
+from lavt.perception.calibration import CalibratedCamera, axes, ground_points, picture_points
+
+COMMON_LENS = st.tuples(
+    st.floats(-0.35, 0.2), st.floats(-0.05, 0.1), st.floats(-0.002, 0.002), st.floats(-0.002, 0.002), st.just(0.0)
+)
+FISHEYE_LENS = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.03, 0.03), st.floats(-0.01, 0.01), st.just(0.0))
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> CalibratedCamera:
+    """Cameras as people mount them, with the lenses people have."""
+    fisheye = draw(st.booleans())
+    focal_px = draw(st.floats(250, 600))
+    return CalibratedCamera(
+        width_px=640,
+        height_px=480,
+        focal_px=(focal_px, focal_px * draw(st.floats(0.97, 1.03))),
+        middle_px=(draw(st.floats(300, 340)), draw(st.floats(220, 260))),
+        x_m=draw(st.floats(-0.5, 2.0)),
+        y_m=draw(st.floats(-0.8, 0.8)),
+        z_m=draw(st.floats(1.0, 2.5)),
+        yaw_rad=draw(st.floats(-0.15, 0.15)),
+        pitch_rad=draw(st.floats(-0.03, 0.3)),
+        roll_rad=draw(st.floats(-0.1, 0.1)),
+        distortion=draw(FISHEYE_LENS if fisheye else st.one_of(st.just(()), COMMON_LENS)),
+        fisheye=fisheye,
+    )
+
+
+GROUND = np.array([[x, y] for x in (4.0, 6.0, 9.0, 13.0, 19.0) for y in (-5.0, -1.75, 0.0, 1.75, 5.0)])
+
+
+def inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        ahead = (pixels > 17) & (pixels < (camera.width_px - 18, camera.height_px - 18))
+    return np.asarray(ahead.all(axis=1))
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(cameras())
+def test_what_the_picture_shows_is_where_it_was(camera: CalibratedCamera) -> None:
+    """A ground point seen through any lens comes back from its pixel to its place, within 1 cm."""
+    pixels = picture_points(camera, GROUND)
+    seen = inside(camera, pixels)
+    assert np.abs(ground_points(camera, pixels[seen]) - GROUND[seen]).max(initial=0.0) < 0.01
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(cameras())
+def test_a_point_of_the_ground_lands_in_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
+    """Painted into the distorted picture where it is seen, a ground point comes out in its own bird's-eye cell."""
+    grid = GroundGrid()
+    view = bird_eye(camera, grid, stamped=False)
+    pixels = picture_points(camera, GROUND)
+    for (x_m, y_m), (u, v) in zip(GROUND[inside(camera, pixels)], pixels[inside(camera, pixels)], strict=True):
+        picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
+        beside = round(60 / x_m)  # some 0.2 m: more than a cell
+        picture[round(v) - 1 : round(v) + 2, round(u) - beside : round(u) + beside + 1] = 255
+        # How much ground the spot is decides how well its place can be known.
+        near, left = ground_points(camera, np.array([[u, v + 2], [u - beside, v]]))
+        rows, columns = np.nonzero(view.from_above(view.region(picture)))
+        if len(rows) == 0:
+            assert abs(x_m - near[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
+            continue
+        off_x_m, off_y_m = grid.row_x_m()[rows].mean() - x_m, grid.column_y_m()[columns].mean() - y_m
+        assert abs(off_x_m) < 0.1 + abs(x_m - near[0]) + abs(x_m - left[0])
+        assert abs(off_y_m) < 0.05 + abs(y_m - left[1]) + abs(y_m - near[1])
+
+
+def test_the_angles_turn_as_they_say() -> None:
+    """Yaw looks to the left, pitch looks down, and roll lowers the right side."""
+    level = CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, 0.0, 0.0, 0.0)
+
+    def turned(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
+        return axes(CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, yaw, pitch, roll))
+
+    right, down, deep = axes(level)
+    assert (right.tolist(), down.tolist(), deep.tolist()) == ([0, -1, 0], [0, 0, -1], [1, 0, 0])
+    assert turned(yaw=0.1)[2, 1] == pytest.approx(math.sin(0.1))
+    assert turned(pitch=0.1)[2, 2] == pytest.approx(-math.sin(0.1))
+    assert turned(roll=0.1)[0, 2] == pytest.approx(-math.sin(0.1))
+    assert np.linalg.det(turned(0.3, -0.2, 0.4)) == pytest.approx(1.0)
+
+
+def test_a_lens_that_folds_the_edge_back_shows_nothing_there() -> None:
+    """Far aside of a strong barrel lens the polynomial turns back; what it puts into the picture is not seen there."""
+    camera = CalibratedCamera(
+        640, 480, (320.0, 320.0), (319.5, 239.5), 1.6, 0.0, 1.4, 0.0, 0.0, 0.0, (-0.3, 0.0, 0.0, 0.0, 0.0)
+    )
+    middle, aside = picture_points(camera, np.array([[10.0, 0.0], [3.0, 6.0]]))
+    assert np.isfinite(middle).all()
+    assert np.isnan(aside).all()
