@@ -189,4 +189,5 @@ def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
     """Distance from a coordinate to the nearest of sorted lines."""
     index = bisect_left(lines_m, at_m)
     above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
-    return min(above_m, at_m - lines_m[index - 1]) if index else above_m
+    below_m = at_m - lines_m[index - 1] if index else math.inf
+    return above_m if above_m < below_m else below_m
