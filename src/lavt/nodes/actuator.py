@@ -108,7 +108,7 @@ class ActuatorNode:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
         lives_ns = self._look_ns if self._looks else self.vehicle.next_wake_ns()
-        due_ns = lives_ns if lives_ns < self._publish_ns else self._publish_ns
+        due_ns = min(self._publish_ns, lives_ns)
         return due_ns if watch_ns is None or due_ns < watch_ns else watch_ns
 
     # A command comes.

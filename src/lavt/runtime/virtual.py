@@ -184,7 +184,7 @@ class VirtualRuntime:
         for receiver in CHANNELS[message.channel].receivers:
             running = host.running[receiver]
             running.inbox.put(message)
-            self._poke(running, true_ns if true_ns > running.free_ns else running.free_ns)
+            self._poke(running, max(running.free_ns, true_ns))
 
     def _poke(self, running: _Running, true_ns: int) -> None:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""

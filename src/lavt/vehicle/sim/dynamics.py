@@ -131,7 +131,7 @@ class Car:
             motion.side_speed_mps += (rolling_radps * self._to_rear_m - motion.side_speed_mps) * self._rolling_share
         # Brakes and resistance stop a car, they do not drive it backwards.
         speed_mps = motion.speed_mps + acceleration * step_s
-        motion.speed_mps = speed_mps if speed_mps > 0.0 else 0.0
+        motion.speed_mps = max(0.0, speed_mps)
         self._move()
 
     def stop_dead(self) -> None:
