@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
+from itertools import repeat
 
 import pytest
 from hypothesis import given
@@ -147,7 +148,7 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
         wakes = 0
         while (wake_ns := actuator.next_wake_ns()) < 10**12 + 10**9:
             now = Now(max(wake_ns, 10**12), 10**18)
-            walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, lambda _hop, before: before)
+            walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
             wakes += 1
         woken.append(wakes)
     assert woken[0] == woken[2] > 240

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ def give(
 ) -> list[Send]:
     """Walk one message through a node whose hops take no time."""
     message = Message(channel, payload, arrived or now, peer)
-    return walk(node.name, node.chains[channel], message, now, lambda _hop, before: before).sends
+    return walk(node.name, node.chains[channel], message, now, repeat(now)).sends
 
 
 def of(sends: list[Send], channel: str) -> list[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import count, repeat
 from typing import Any
 
 import pytest
@@ -78,7 +79,7 @@ def test_each_hop_gets_the_time_after_the_one_before() -> None:
     first = message("control")
     sends = [Send("event", 1)]
     hops = [("a", hop(Stamped(42))), ("b", hop("bare")), ("c", hop(sends))]
-    walked = walk("node", hops, first, Now(1010, 5010), lambda _name, before: before.later(7))
+    walked = walk("node", hops, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
     assert seen == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
     assert (walked.sends, walked.end) == (sends, Now(1031, 5031))
     assert walked.timeline is not None
@@ -89,7 +90,7 @@ def test_each_hop_gets_the_time_after_the_one_before() -> None:
 def test_none_ends_a_chain() -> None:
     """A hop that returns None is the last one called; nothing is sent, and without a stamp there is no timeline."""
     hops = [("a", lambda _value, _now: None), ("b", lambda _value, _now: pytest.fail("called"))]
-    walked = walk("node", hops, message("control"), NOW, lambda _name, before: before.later(1))
+    walked = walk("node", hops, message("control"), NOW, repeat(NOW.later(1)))
     assert (walked.sends, walked.end.mono_ns, walked.timeline) == ([], 1001, None)
 
 

@@ -41,20 +41,20 @@ class Limiter:
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
         if self._steering_rad is None:
             step_rad = 0.0
-        steps = (
-            ("steering angle", self._max_steering_rad),
-            ("lateral acceleration", self._lateral_limit_rad(vehicle.speed_mps)),
-        )
         changed = []
         steering_rad = asked.steering_rad
-        for name, bound_rad in steps:
-            bounded_rad = min(max(steering_rad, -bound_rad), bound_rad)
-            if bounded_rad != steering_rad:
+        for name, bound_rad in (
+            ("steering angle", self._max_steering_rad),
+            ("lateral acceleration", self._lateral_limit_rad(vehicle.speed_mps)),
+        ):
+            if not -bound_rad <= steering_rad <= bound_rad:
                 changed.append(name)
-                steering_rad = bounded_rad
-        reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
-        if abs(steering_rad - before_rad) > max(step_rad, self.limits.steering_rate_radps * COMMAND_PERIOD_S):
-            changed.append("steering rate")
+                steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
+        reached_rad = steering_rad
+        if not before_rad - step_rad <= steering_rad <= before_rad + step_rad:
+            reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
+            if abs(steering_rad - before_rad) > max(step_rad, self.limits.steering_rate_radps * COMMAND_PERIOD_S):
+                changed.append("steering rate")
         throttle = asked.throttle
         known = math.isfinite(vehicle.speed_mps)
         if throttle > 0 and not (known and vehicle.speed_mps <= self.limits.speed_limit_mps):

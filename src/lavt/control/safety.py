@@ -277,13 +277,14 @@ class SafetyGate:
         """Say what the vehicle shall do now: the command in force within all limits, or what its state asks for."""
         asked = self._command if self.state in ("driving", "degraded") else None
         throttle, brake = (asked.throttle, asked.brake) if asked else (0.0, self.limits.arming_brake)
-        pedals = {
-            "driving": (throttle, brake),
-            "degraded": (0.0, max(brake, self._pedal(self.limits.degraded_deceleration_mps2))),  # never eases a brake
-            "safe_stop": (0.0, self._pedal(self.limits.stop_deceleration_mps2)),
-        }.get(self.state, (0.0, 1.0))
+        if self.state == "degraded":  # never eases a brake
+            throttle, brake = 0.0, max(brake, self._pedal(self.limits.degraded_deceleration_mps2))
+        elif self.state == "safe_stop":
+            throttle, brake = 0.0, self._pedal(self.limits.stop_deceleration_mps2)
+        elif self.state != "driving":
+            throttle, brake = 0.0, 1.0
         target_rad = asked.steering_rad if asked else self.limiter.target_rad(vehicle)
-        return self.limiter.limit(Actuation(target_rad, *pedals), vehicle, now_ns)
+        return self.limiter.limit(Actuation(target_rad, throttle, brake), vehicle, now_ns)
 
     def end_drive(self) -> None:
         """The drive is over: stop."""

@@ -108,8 +108,8 @@ class ActuatorNode:
         """When the vehicle, the watchdog or the state is due."""
         watch_ns = self.gate.next_wake_ns()
         lives_ns = self._look_ns if self._looks else self.vehicle.next_wake_ns()
-        due_ns = min(lives_ns, self._publish_ns)
-        return due_ns if watch_ns is None else min(due_ns, watch_ns)
+        due_ns = min(self._publish_ns, lives_ns)
+        return due_ns if watch_ns is None or due_ns < watch_ns else watch_ns
 
     # A command comes.
 
@@ -194,7 +194,8 @@ class ActuatorNode:
 
     def _publish(self, events: list[VehicleEvent], now: Now) -> list[Send]:
         sends = []
-        truth = self.vehicle.ground_truth()
+        told = now.mono_ns >= self._publish_ns
+        truth = self.vehicle.ground_truth() if told or self._pose_wanted else None
         if truth is not None and self._pose_wanted:
             sends.append(Send("pose", Pose(truth.mono_ns, truth.x_m, truth.y_m, truth.heading_rad)))
         for event in events:
@@ -202,7 +203,7 @@ class ActuatorNode:
             if event.kind in self._endings:
                 sends += self._end(self._endings[event.kind], event.mono_ns)
         sends += self._changes(now)
-        if now.mono_ns >= self._publish_ns:
+        if told:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
             if truth is not None:

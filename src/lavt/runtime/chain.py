@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,17 +30,19 @@ class Walked(NamedTuple):
     sends: list[Send]
     end: Now
     timeline: Timeline | None
+    called: int
+    """How many hops were called."""
 
 
-def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, after: Callable[[str, Now], Now]) -> Walked:
-    """Call hop after hop; `after(name, before)` tells the time when hop `name`, begun at `before`, is done."""
+def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> Walked:
+    """Call hop after hop; `ends`, asked after each, gives the time when it was done."""
     value: object = message
     now = start
     stamp_ns: int | None = None
     done = [("wait", start.mono_ns)]
     for name, hop in hops:
         value = hop(value, now)
-        now = after(name, now)
+        now = next(ends)
         done.append((name, now.mono_ns))
         stamp_ns = getattr(value, "stamp_ns", stamp_ns)
         if value is None:
@@ -48,4 +50,4 @@ def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, after: Ca
     timeline = None
     if stamp_ns:
         timeline = Timeline(node, message.channel, stamp_ns, message.arrived.mono_ns, tuple(done))
-    return Walked(value if isinstance(value, list) else [], now, timeline)
+    return Walked(value if isinstance(value, list) else [], now, timeline, len(done) - 1)

@@ -92,9 +92,8 @@ class RealRuntime:
 
     def run_chain(self, node: Node, message: Message) -> None:
         """Walk a message through its hops and send what comes out."""
-        walked = walk(
-            node.name, node.chains[message.channel], message, self._clock.now(), lambda _hop, _before: self._clock.now()
-        )
+        readings = iter(self._clock.now, None)
+        walked = walk(node.name, node.chains[message.channel], message, next(readings), readings)
         for send in walked.sends:
             self._send(send)
         if walked.timeline is not None:

@@ -7,8 +7,9 @@ configuration give the same result, bit for bit.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, repeat
 from typing import Any
 
 from lavt.domain import NS_PER_S, Now
@@ -39,7 +40,7 @@ class HostClock:
 
     def at(self, true_ns: int) -> Now:
         """Read both clocks at a true time."""
-        gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB
+        gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB if self.drift_ppb else true_ns
         wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
         if self.steps:
             wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
@@ -48,6 +49,8 @@ class HostClock:
     def true_ns(self, mono_ns: int) -> int:
         """Tell the first true time at which the monotonic clock shows at least `mono_ns`."""
         gone_ns = mono_ns - self.mono_start_ns
+        if not self.drift_ppb:
+            return gone_ns
         guess_ns = gone_ns * NS_PER_PPB // (NS_PER_PPB + self.drift_ppb)
         while guess_ns + guess_ns * self.drift_ppb // NS_PER_PPB < gone_ns:
             guess_ns += 1
@@ -100,10 +103,35 @@ class _Running:
         self.host = host
         self.node = node
         self.inbox = Inbox()
-        self.costs_ns = {hop: cost_ns for (name, hop), cost_ns in host.costs_ns.items() if name == node.name}
-        self.waits_ns = {channel: self.costs_ns.get(f"wait_{channel}", 0) for channel in node.chains}
+        self.spent_ns = {
+            channel: tuple(
+                accumulate(
+                    host.costs_ns.get((node.name, name), 0) for name in (f"wait_{channel}", *(hop[0] for hop in hops))
+                )
+            )
+            for channel, hops in node.chains.items()
+        }
+        """For each chain how long after its begin the first hop begins, and how long after it each hop is done."""
         self.free_ns = 0
         self.poke_ns: int | None = None
+        self.wake_mono_ns: int | None = None
+        self.wake_ns: int | None = None
+        """When the node wants to be woken, on its host's monotonic clock and in true time."""
+        self.note_wake()
+
+    def note_wake(self) -> None:
+        """Ask the node when it wants to be woken; nothing but a walk through its hops changes that."""
+        wake_mono_ns = self.node.next_wake_ns()
+        if wake_mono_ns != self.wake_mono_ns:
+            self.wake_mono_ns = wake_mono_ns
+            self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
+
+    def times(self, channel: str, now: Now, true_ns: int) -> Iterator[Now]:
+        """When the first hop of a chain begins that is begun `now`, and when each hop is done."""
+        spent_ns = self.spent_ns[channel]
+        if not spent_ns[-1]:
+            return repeat(now)
+        return map(self.host.clock.at, [true_ns + each_ns for each_ns in spent_ns])
 
 
 class VirtualRuntime:
@@ -127,8 +155,9 @@ class VirtualRuntime:
 
     def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
         """Run until `finished()` or to the limit; tell whether it finished."""
-        while self._heap and self._heap[0][0] <= limit_ns:
-            self.true_ns, _, action, arguments = heapq.heappop(self._heap)
+        heap, take = self._heap, heapq.heappop
+        while heap and heap[0][0] <= limit_ns:
+            self.true_ns, _, action, arguments = take(heap)
             action(*arguments)
             if finished():
                 return True
@@ -146,71 +175,65 @@ class VirtualRuntime:
         """Let a message arrive on a side, now; what came over the network is written down."""
         host = self.hosts[side]
         arrived = host.now(self.true_ns)
-        row = CHANNELS[channel]
-        if row.carrier != "local":
+        if CHANNELS[channel].carrier != "local":
             record(host.recorder, channel, payload, arrived)
-        for receiver in row.receivers:
+        self._put(host, Message(channel, payload, arrived, peer))
+
+    def _put(self, host: VirtualHost, message: Message) -> None:
+        true_ns = self.true_ns
+        for receiver in CHANNELS[message.channel].receivers:
             running = host.running[receiver]
-            running.inbox.put(Message(channel, payload, arrived, peer))
-            self._poke(running, max(self.true_ns, running.free_ns))
+            running.inbox.put(message)
+            self._poke(running, max(running.free_ns, true_ns))
 
     def _poke(self, running: _Running, true_ns: int) -> None:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""
         if running.poke_ns is None or true_ns < running.poke_ns:
             running.poke_ns = true_ns
-            self.at(true_ns, self._look, running, true_ns)
+            self._number += 1
+            heapq.heappush(self._heap, (true_ns, self._number, self._look, (running, true_ns)))
 
     def _look(self, running: _Running, true_ns: int) -> None:
         if running.poke_ns != true_ns:
             return  # it was looked at earlier, and has asked anew
         running.poke_ns = None
-        now = running.host.now(true_ns)
-        wake_ns = running.node.next_wake_ns()
-        if wake_ns is not None and wake_ns <= now.mono_ns:
+        if running.wake_ns is not None and running.wake_ns <= true_ns:
+            now = running.host.now(true_ns)
             self._walk(running, Message(WAKE, None, now), now)
         elif (message := running.inbox.take()) is not None:
-            self._walk(running, message, now)
-        elif wake_ns is not None:
-            self._poke(running, running.host.clock.true_ns(wake_ns))
+            self._walk(running, message, running.host.now(true_ns))
+        elif running.wake_ns is not None:
+            self._poke(running, running.wake_ns)
 
-    def _walk(self, running: _Running, message: Message, start: Now) -> None:
-        host, node = running.host, running.node
-        costs_ns = running.costs_ns
-        spent_ns = running.waits_ns[message.channel]
-        start = start if spent_ns == 0 else host.clock.at(self.true_ns + spent_ns)
-
-        def after(hop: str, before: Now) -> Now:
-            nonlocal spent_ns
-            if hop not in costs_ns:
-                return before
-            spent_ns += costs_ns[hop]
-            return host.clock.at(self.true_ns + spent_ns)
-
-        walked = walk(node.name, node.chains[message.channel], message, start, after)
+    def _walk(self, running: _Running, message: Message, now: Now) -> None:
+        host, node, channel = running.host, running.node, message.channel
+        times = running.times(channel, now, self.true_ns)
+        walked = walk(node.name, node.chains[channel], message, next(times), times)
+        spent_ns = running.spent_ns[channel][walked.called]
         running.free_ns = self.true_ns + spent_ns
         if walked.timeline is not None:
             host.recorder.write("timeline", walked.timeline, walked.end)
         if walked.sends:
             if spent_ns:
-                self.at(running.free_ns, self._send_all, host, walked.sends)
+                self.at(running.free_ns, self._send_all, host, walked.sends, walked.end)
             else:
-                self._send_all(host, walked.sends)
+                self._send_all(host, walked.sends, walked.end)
         self._rest(running)
 
     def _rest(self, running: _Running) -> None:
         """Look at a node again when it is free and has something to do."""
+        running.note_wake()
         if running.inbox.waiting:
             self._poke(running, running.free_ns)
-        elif (wake_ns := running.node.next_wake_ns()) is not None:
-            self._poke(running, max(running.free_ns, running.host.clock.true_ns(wake_ns)))
+        elif running.wake_ns is not None:
+            self._poke(running, max(running.free_ns, running.wake_ns))
 
-    def _send_all(self, host: VirtualHost, sends: Sequence[Send]) -> None:
-        now = host.now(self.true_ns)
+    def _send_all(self, host: VirtualHost, sends: Sequence[Send], now: Now) -> None:
         for send in sends:
             record(host.recorder, send.channel, send.payload, now)
             carrier = CHANNELS[send.channel].carrier
             if carrier == "local":
-                self.deliver(host.side, send.channel, send.payload)
+                self._put(host, Message(send.channel, send.payload, now))
             elif carrier == "clock":
                 self.deliver(host.side, "clock_report", host.clock_source(self.true_ns))
             elif carrier != "record":

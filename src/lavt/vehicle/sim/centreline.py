@@ -137,11 +137,13 @@ class Centreline:
         """
         best = (first_m, math.inf, 0.0, 0.0)
         best_m = math.inf
-        for index in range(bisect_right(self._begins, first_m) - 1, len(self._searched)):
-            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = self._searched[index]
+        searched = self._searched
+        for index in range(bisect_right(self._begins, first_m) - 1, len(searched)):
+            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = searched[index]
             if begin_m > last_m:
                 break
-            low_m, high_m = max(begin_m, first_m) - s_m, min(end_m, last_m) - s_m
+            low_m = (max(first_m, begin_m)) - s_m
+            high_m = (min(last_m, end_m)) - s_m
             dx_m, dy_m = x_m - x0_m, y_m - y0_m
             ahead_m, left_m = dx_m * cosine + dy_m * sine, dy_m * cosine - dx_m * sine
             turn_rad = 0.0
@@ -151,11 +153,11 @@ class Centreline:
                 ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
                 curvature_per_m += piece.rate_per_m2 * along_m
             elif curvature_per_m == 0.0:
-                along_m = min(max(ahead_m, low_m), high_m)
+                along_m = low_m if ahead_m < low_m else min(ahead_m, high_m)
                 ahead_m -= along_m
             else:
                 along_m = _arc_foot_m(ahead_m, left_m, curvature_per_m, (low_m + high_m) / 2)
-                along_m = min(max(along_m, low_m), high_m)
+                along_m = low_m if along_m < low_m else min(along_m, high_m)
                 turn_rad = curvature_per_m * along_m
                 turned_cosine, turned_sine = math.cos(turn_rad), math.sin(turn_rad)
                 ahead_m -= turned_sine / curvature_per_m

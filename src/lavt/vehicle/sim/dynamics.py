@@ -87,6 +87,8 @@ class Car:
     def __init__(self, parameters: CarParameters, motion: CarMotion, step_s: float) -> None:
         self.parameters, self.motion = parameters, motion
         self._step_s = step_s
+        self._asked: Actuation | None = None
+        self._wanted = Actuation(0.0, 0.0, 0.0)
         self._to_rear_m = parameters.wheelbase_m - parameters.front_axle_to_gravity_m
         weight_n = parameters.mass_kg * GRAVITY_MPS2 / parameters.wheelbase_m
         self._front_grip_n = parameters.friction * weight_n * self._to_rear_m
@@ -94,14 +96,25 @@ class Car:
         self._throttle_share = _share(step_s, parameters.throttle_lag_s)
         self._brake_share = _share(step_s, parameters.brake_lag_s)
         self._steering_share = _share(step_s, parameters.steering_lag_s)
+        self._furthest_rad = parameters.max_steering_rate_radps * step_s
         # At the speed where the models meet, tyres take the car to rolling without slip with this rate (1/s).
         stiffness = parameters.front_stiffness_nprad + parameters.rear_stiffness_nprad
         settling = stiffness / (parameters.mass_kg * parameters.kinematic_below_mps)
         self._rolling_share = 1.0 - math.exp(-step_s * settling)
 
+    def _within_reach(self, wanted: Actuation) -> Actuation:
+        most_rad = self.parameters.max_steering_rad
+        return Actuation(
+            steering_rad=min(max(wanted.steering_rad, -most_rad), most_rad),
+            throttle=min(max(wanted.throttle, 0.0), 1.0),
+            brake=min(max(wanted.brake, 0.0), 1.0),
+        )
+
     def step(self, wanted: Actuation) -> None:
         """Live on for one time step under `wanted`; values out of range are taken as the nearest in range."""
-        self._follow(wanted)
+        if wanted is not self._asked:  # the same for many steps
+            self._asked, self._wanted = wanted, self._within_reach(wanted)
+        self._follow(self._wanted)
         motion, step_s = self.motion, self._step_s
         side_acceleration, yaw_acceleration, drag = 0.0, 0.0, 0.0
         if motion.speed_mps >= self.parameters.kinematic_below_mps:
@@ -117,7 +130,8 @@ class Car:
             motion.yaw_rate_radps += (rolling_radps - motion.yaw_rate_radps) * self._rolling_share
             motion.side_speed_mps += (rolling_radps * self._to_rear_m - motion.side_speed_mps) * self._rolling_share
         # Brakes and resistance stop a car, they do not drive it backwards.
-        motion.speed_mps = max(0.0, motion.speed_mps + acceleration * step_s)
+        speed_mps = motion.speed_mps + acceleration * step_s
+        motion.speed_mps = max(0.0, speed_mps)
         self._move()
 
     def stop_dead(self) -> None:
@@ -162,13 +176,16 @@ class Car:
         motion.yaw_rate_radps += (point[0] * sideways - point[1] * forward) / parameters.yaw_inertia_kgm2
 
     def _follow(self, wanted: Actuation) -> None:
-        parameters, motion = self.parameters, self.motion
-        motion.throttle += (min(max(wanted.throttle, 0.0), 1.0) - motion.throttle) * self._throttle_share
-        motion.brake += (min(max(wanted.brake, 0.0), 1.0) - motion.brake) * self._brake_share
-        target_rad = min(max(wanted.steering_rad, -parameters.max_steering_rad), parameters.max_steering_rad)
-        furthest_rad = parameters.max_steering_rate_radps * self._step_s
-        change_rad = (target_rad - motion.steering_rad) * self._steering_share
-        motion.steering_rad += min(max(change_rad, -furthest_rad), furthest_rad)
+        motion = self.motion
+        motion.throttle += (wanted.throttle - motion.throttle) * self._throttle_share
+        motion.brake += (wanted.brake - motion.brake) * self._brake_share
+        furthest_rad = self._furthest_rad
+        change_rad = (wanted.steering_rad - motion.steering_rad) * self._steering_share
+        if change_rad > furthest_rad:
+            change_rad = furthest_rad
+        elif change_rad < -furthest_rad:
+            change_rad = -furthest_rad
+        motion.steering_rad += change_rad
 
     def _pedal_acceleration(self) -> float:
         parameters, motion = self.parameters, self.motion

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
 from lavt.vehicle.sim.cross_section import Rail
 from lavt.vehicle.sim.dynamics import CarMotion, CarParameters, Contact
-from lavt.vehicle.sim.road import Road
+from lavt.vehicle.sim.road import PROJECTION_WINDOW_M, Road
 
 REFERENCE_SPEED_MPS = 30.0 / 3.6
 TIMEOUT_SLOWNESS = 3.0
@@ -23,6 +23,9 @@ MOVING_MPS = 0.1
 
 CONTACT_GAP_NS = NS_PER_S // 2
 """A car that has been clear of all rails for so long and touches one again has another collision."""
+
+LONGEST_UNSEEN_M = PROJECTION_WINDOW_M / 3
+"""So far a body may move before it is looked at again: projections look around the station that was seen last."""
 
 Place = tuple[float, float, float]
 """Station (m), lateral offset (m) and the road's heading (rad) of a point of the body."""
@@ -68,7 +71,8 @@ class Judge:
 
     def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Tell what has happened since the last call; call it at every step."""
-        events = [] if self._quiet.holds(motion) else self._look(motion, at_ns)
+        quiet = not self.contacts and self._quiet.holds(motion)
+        events = [] if quiet else self._look(motion, at_ns)
         if self._began_ns is None:
             if motion.speed_mps > MOVING_MPS:
                 self._began_ns = at_ns
@@ -152,41 +156,64 @@ class _Quiet:
     """Knows for how far nothing can happen: until a point of the body may have reached the nearest line that counts.
 
     Lines that count are edges of lanes and of asphalt, rails, the stations where these begin and end, and the end of
-    the route. A point's lateral offset changes by no more than the point moves, its station by no more than that over
-    `_slowest`: on the inside of a curve stations are closer together than metres.
+    the route. A point's station changes by no more than the point moves over `_slowest`: on the inside of a curve
+    stations are closer together than metres. Its lateral offset changes by how far it moves across the road as that
+    runs where it was looked at, and by how far the road may have bent away from there. While the body is between the
+    rails, it does not matter where these begin and end.
     """
 
     def __init__(self, road: Road, reach_m: float) -> None:
         self._reach_m = reach_m
         across = [road.lanes.edges_m, *((strip.left_m, strip.right_m) for strip in road.paved)]
         self._offsets_m = sorted({*itertools.chain(*across), *(rail.offset_m for rail in road.rails)})
-        ends = [(strip.from_m, strip.to_m) for strip in road.paved] + [(rail.from_m, rail.to_m) for rail in road.rails]
-        self._stations_m = sorted({road.length_m, *(each for each in itertools.chain(*ends) if math.isfinite(each))})
+        asphalt = [end_m for strip in road.paved for end_m in (strip.from_m, strip.to_m)]
+        rails = [end_m for rail in road.rails for end_m in (rail.from_m, rail.to_m)]
+        self._stations_m = sorted({road.length_m, *filter(math.isfinite, asphalt)})
+        self._all_stations_m = sorted({*self._stations_m, *filter(math.isfinite, rails)})
+        self._inside_m = (
+            max((rail.offset_m for rail in road.rails if rail.offset_m < 0.0), default=-math.inf),
+            min((rail.offset_m for rail in road.rails if rail.offset_m >= 0.0), default=math.inf),
+        )
         widest_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + reach_m
         tightest = max(max(abs(each.curvature_per_m), abs(each.end_curvature_per_m)) for each in road.segments)
         self._slowest = 1.0 - tightest * widest_m
+        self._bend_per_m = tightest / self._slowest if self._slowest > 0.0 else math.inf
         self._from = (math.inf, math.inf, 0.0)
-        self._room_m = 0.0
+        self._across = (0.0, 1.0)
+        self._spread_rad = 0.0
+        self._room_m = self._stretch_m = 0.0
 
-    def begin(self, motion: CarMotion, places: Iterable[Place]) -> None:
-        """Note where the body was looked at, and how far it is from what counts."""
-        self._from = (motion.x_m, motion.y_m, motion.heading_rad)
+    def begin(self, motion: CarMotion, places: Sequence[Place]) -> None:
+        """Note where the body was looked at, the rear axle first, and how far it is from what counts."""
         if self._slowest <= 0.0:
             return  # a road for which this reckoning does not hold is looked at every time
-        self._room_m = min(
-            min(_distance_m(self._offsets_m, lateral_m), _distance_m(self._stations_m, s_m) * self._slowest)
-            for s_m, lateral_m, _ in places
-        )
+        self._from = (motion.x_m, motion.y_m, motion.heading_rad)
+        road_rad = places[0][2]
+        self._across = (-math.sin(road_rad), math.cos(road_rad))
+        self._spread_rad = max(abs(heading_rad - road_rad) for _, _, heading_rad in places)
+        self._room_m = min(_distance_m(self._offsets_m, lateral_m) for _, lateral_m, _ in places)
+        right_m, left_m = self._inside_m
+        inside = all(right_m < lateral_m < left_m for _, lateral_m, _ in places)
+        stations_m = self._stations_m if inside else self._all_stations_m
+        along_m = min(_distance_m(stations_m, s_m) for s_m, _, _ in places)
+        self._stretch_m = min(along_m * self._slowest, LONGEST_UNSEEN_M)
 
     def holds(self, motion: CarMotion) -> bool:
         """Whether no point of the body can have reached a line since it was looked at."""
         x_m, y_m, heading_rad = self._from
-        moved_m = math.hypot(motion.x_m - x_m, motion.y_m - y_m)
-        return moved_m + self._reach_m * abs(motion.heading_rad - heading_rad) < self._room_m
+        dx_m, dy_m = motion.x_m - x_m, motion.y_m - y_m
+        moved_m = math.hypot(dx_m, dy_m)
+        turned_m = self._reach_m * abs(motion.heading_rad - heading_rad)
+        most_m = moved_m + turned_m
+        if not most_m < self._stretch_m:
+            return False
+        across_m = abs(dx_m * self._across[0] + dy_m * self._across[1]) + moved_m * self._spread_rad + turned_m
+        return across_m + self._bend_per_m * most_m * most_m / 2 < self._room_m
 
 
 def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
     """Distance from a coordinate to the nearest of sorted lines."""
     index = bisect_left(lines_m, at_m)
     above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
-    return min(above_m, at_m - lines_m[index - 1]) if index else above_m
+    below_m = at_m - lines_m[index - 1] if index else math.inf
+    return min(below_m, above_m)

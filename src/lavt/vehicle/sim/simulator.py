@@ -80,17 +80,19 @@ class Simulator:
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
         events: list[VehicleEvent] = []
-        while self.next_wake_ns() <= to_ns:
-            self._obey(grid_ns(self._index))
+        at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
+        while next_ns <= to_ns:
+            self._obey(at_ns)
             self._index += 1
+            at_ns, next_ns = next_ns, grid_ns(self._index + 1)
             if self._wrecked:
                 continue
             self._car.step(self._actuation)
-            happened = self._judge.judge(self._car.motion, grid_ns(self._index))
+            happened = self._judge.judge(self._car.motion, at_ns)
             if self._goes_on:
                 for contact in self._judge.contacts:
                     self._car.slide(contact)
-            elif any(event.kind == "collision" for event in happened):
+            elif happened and any(event.kind == "collision" for event in happened):
                 self._wrecked = True
                 self._car.stop_dead()
             events += happened
@@ -108,14 +110,15 @@ class Simulator:
 
     def _obey(self, at_ns: int) -> None:
         """Take over what has become due."""
+        steering_due = self._steering and self._steering[0][0] <= at_ns
+        if not steering_due and not (self._pedals and self._pedals[0][0] <= at_ns):
+            return
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
-        due = False
         while self._steering and self._steering[0][0] <= at_ns:
-            due, (_, steering_rad) = True, self._steering.popleft()
+            _, steering_rad = self._steering.popleft()
         while self._pedals and self._pedals[0][0] <= at_ns:
-            due, (_, throttle, brake) = True, self._pedals.popleft()
-        if due:
-            self._actuation = Actuation(steering_rad, throttle, brake)
+            _, throttle, brake = self._pedals.popleft()
+        self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
         """Tell speed and road wheel angle at the newest point of the grid."""
