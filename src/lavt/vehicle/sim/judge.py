@@ -68,7 +68,8 @@ class Judge:
 
     def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Tell what has happened since the last call; call it at every step."""
-        events = [] if self._quiet.holds(motion) else self._look(motion, at_ns)
+        # In a rail it is looked at every time: the contact may deepen or end, and lasts while the car stands in it.
+        events = [] if not self.contacts and self._quiet.holds(motion) else self._look(motion, at_ns)
         if self._began_ns is None:
             if motion.speed_mps > MOVING_MPS:
                 self._began_ns = at_ns
