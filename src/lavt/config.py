@@ -123,7 +123,7 @@ class CalibrationConfig(Section):
             raise ValueError("give either field_of_view_deg, or all of fx_px, fy_px, cx_px and cy_px")
         if self.lens == "fisheye" and not (whole and self.distortion):
             # Without them it would be taken for a pinhole, which no fisheye is.
-            raise ValueError("a fisheye needs fx_px, fy_px, cx_px, cy_px and its distortion, [0, 0, 0, 0] where it has none")
+            raise ValueError("a fisheye needs fx_px, fy_px, cx_px, cy_px and its distortion; [0, 0, 0, 0] is none")
         return self
 
 
@@ -447,7 +447,7 @@ def _sentence(kind: type[BaseModel], problem: Any) -> str:
         return f"{where!r} is missing: give it"
     if problem["type"] == "float_type" and (number := _meant(problem["input"])) is not None:
         return f"{where!r}: YAML takes {problem['input']} for text: write {problem['input']} as {number!r}"
-    said = problem["msg"].removeprefix("Value error, ")  # pydantic's, before what a check of ours says
+    said = str(problem["msg"]).removeprefix("Value error, ")  # pydantic's, before what a check of ours says
     if not where:  # about several keys at once
         return said
     return f"{where!r}: {said}, not {problem['input']!r}"

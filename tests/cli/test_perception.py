@@ -113,7 +113,9 @@ def test_what_cannot_be_shown_is_told(
     assert says in str(refused.value)
     assert "Value error" not in str(refused.value)
     assert not list(Path().glob("*steps*"))
-    assert np.array_equal(cv2.imread("road.png"), ROAD)
+    kept = cv2.imread("road.png")
+    assert kept is not None
+    assert np.array_equal(kept, ROAD)
 
 
 def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (its directory)

@@ -35,7 +35,9 @@ def _group() -> None:
 def show(
     source: Annotated[Path, typer.Argument(help="PNG, JPEG, MP4, MKV, or a run's client.mcap.")],
     camera: Annotated[Path, typer.Option(help="A calibration in YAML, or a config with a camera section.")],
-    out: Annotated[Path | None, typer.Option(help="A .png or .jpg, for a video .mp4 or .mkv; default: SOURCE-steps.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help=".png or .jpg, for a video .mp4 or .mkv; default: NAME-steps.")
+    ] = None,
     lane_width_m: Annotated[float, typer.Option(min=2.0, max=5.0, help="Where it cannot be seen.")] = LANE_WIDTH_M,
 ) -> None:
     """Draw all steps from a picture to the lane in it, side by side; for a video, one such picture for each.
