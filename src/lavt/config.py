@@ -110,7 +110,7 @@ class CalibrationConfig(Section):
     @field_validator("distortion")
     @classmethod
     def _whole(cls, distortion: tuple[float, ...], info: Any) -> tuple[float, ...]:
-        lengths = (0, 4) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
+        lengths = (4,) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
         if len(distortion) not in lengths:
             raise ValueError(f"must have {' or '.join(str(each) for each in lengths)} coefficients for this lens")
         return distortion
@@ -121,6 +121,9 @@ class CalibrationConfig(Section):
         whole = None not in matrix
         if whole == (self.field_of_view_deg is not None) or (not whole and matrix != (None,) * 4):
             raise ValueError("give either field_of_view_deg, or all of fx_px, fy_px, cx_px and cy_px")
+        if self.lens == "fisheye" and not (whole and self.distortion):
+            # Without them it would be taken for a pinhole, which no fisheye is.
+            raise ValueError("a fisheye needs fx_px, fy_px, cx_px, cy_px and its distortion; [0, 0, 0, 0] is none")
         return self
 
 
@@ -442,9 +445,20 @@ def _sentence(kind: type[BaseModel], problem: Any) -> str:
         return f"unknown key {where!r}: {hint}"
     if problem["type"] == "missing":
         return f"{where!r} is missing: give it"
+    if problem["type"] == "float_type" and (number := _meant(problem["input"])) is not None:
+        return f"{where!r}: YAML takes {problem['input']} for text: write {problem['input']} as {number!r}"
+    said = str(problem["msg"]).removeprefix("Value error, ")  # pydantic's, before what a check of ours says
     if not where:  # about several keys at once
-        return str(problem["msg"])
-    return f"{where!r}: {problem['msg']}, not {problem['input']!r}"
+        return said
+    return f"{where!r}: {said}, not {problem['input']!r}"
+
+
+def _meant(value: Any) -> float | None:
+    """Give the number that a text stands for, such as 1e-05, which YAML takes for one only with a point in it."""
+    try:
+        return float(value) if isinstance(value, str) else None
+    except ValueError:
+        return None
 
 
 def _keys(kind: type[BaseModel], location: Iterable[str]) -> list[str]:

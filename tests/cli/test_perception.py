@@ -30,6 +30,8 @@ distortion: [-0.28, 0.07, 0.0005, -0.0003, 0.0]
 x_m: 1.6
 z_m: 1.4
 """
+MATRIX = "fx_px: 330.0\nfy_px: 331.0\ncx_px: 321.0\ncy_px: 238.0"
+FISHEYE = "lens: fisheye\nwidth_px: 640\nheight_px: 480\nx_m: 1.6\nz_m: 1.4\n{}\n"
 ROAD = np.full((480, 640, 3), 85, dtype=np.uint8)
 Show = Callable[..., None]
 
@@ -87,7 +89,11 @@ def test_a_videos_steps_are_a_video(show: Show) -> None:
         ("road.png", CALIBRATION + "yaw_deg: 90.0\n", (), "does not see the road"),
         ("road.png", CALIBRATION + "field_of_view_deg: 90.0\n", (), "give either field_of_view_deg, or all of fx_px"),
         ("road.png", CALIBRATION.replace("fy_px: 331.0\n", ""), (), "give either field_of_view_deg, or all of fx_px"),
-        ("road.png", CALIBRATION + "lens: fisheye\n", (), "must have 0 or 4 coefficients"),
+        ("road.png", CALIBRATION + "lens: fisheye\n", (), "must have 4 coefficients"),
+        ("road.png", FISHEYE.format("field_of_view_deg: 90.0\ndistortion: [0, 0, 0, 0]"), (), "a fisheye needs fx_px"),
+        ("road.png", FISHEYE.format(MATRIX), (), "a fisheye needs fx_px, fy_px, cx_px, cy_px and its distortion"),
+        ("road.png", CALIBRATION.replace("0.0005", "5e-04"), (), "write 5e-04 as 0.0005"),
+        ("road.png", CALIBRATION, ("--out", "./road.png"), "road.png is what is read"),
         ("road.png", CALIBRATION.replace("x_m: 1.6\n", ""), (), "'x_m' is missing"),
         ("road.png", "camera: 3\n", (), "camera must hold keys and values"),
         ("road.png", CALIBRATION, ("--out", "steps.txt"), "a picture ends with .png"),
@@ -105,7 +111,11 @@ def test_what_cannot_be_shown_is_told(
     with pytest.raises(UserError) as refused:
         show(source, *options)
     assert says in str(refused.value)
+    assert "Value error" not in str(refused.value)
     assert not list(Path().glob("*steps*"))
+    kept = cv2.imread("road.png")
+    assert kept is not None
+    assert np.array_equal(kept, ROAD)
 
 
 def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (its directory)

@@ -35,7 +35,9 @@ def _group() -> None:
 def show(
     source: Annotated[Path, typer.Argument(help="PNG, JPEG, MP4, MKV, or a run's client.mcap.")],
     camera: Annotated[Path, typer.Option(help="A calibration in YAML, or a config with a camera section.")],
-    out: Annotated[Path | None, typer.Option(help="Where to write the steps: .png or .jpg, .mp4 for a video.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help=".png or .jpg, for a video .mp4 or .mkv; default: NAME-steps.")
+    ] = None,
     lane_width_m: Annotated[float, typer.Option(min=2.0, max=5.0, help="Where it cannot be seen.")] = LANE_WIDTH_M,
 ) -> None:
     """Draw all steps from a picture to the lane in it, side by side; for a video, one such picture for each.
@@ -45,7 +47,7 @@ def show(
     known = camera_of_file(camera)
     found = read_pictures(source)
     out = out or Path(f"{source.stem}-steps{'.mp4' if found.moving else '.png'}")
-    check_output(out, moving=found.moving)
+    check_output(out, source=source, moving=found.moving)
     first = next(found.pictures, None)
     if first is None:
         raise UserError(f"{source} holds no picture: name another")

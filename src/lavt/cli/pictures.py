@@ -58,7 +58,7 @@ def read_pictures(path: Path) -> Pictures:
 def _of_video(path: Path, video: cv2.VideoCapture) -> Iterator[Picture]:
     there, picture = video.read()
     if not there:
-        raise UserError(f"{path} holds no picture: name a video that is not empty")
+        raise UserError(f"{path} holds no picture that can be read: give PNG, JPEG, MP4, MKV or MCAP")
     while there:
         yield np.asarray(picture, dtype=np.uint8)
         there, picture = video.read()
@@ -75,13 +75,15 @@ def _of_record(path: Path) -> Iterator[Picture]:
         raise UserError(f"{path} holds no picture: name a record that was made with record.video")
 
 
-def check_output(out: Path, *, moving: bool) -> None:
-    """Raise `UserError` for a name from which nobody could tell what to write."""
+def check_output(out: Path, *, source: Path, moving: bool) -> None:
+    """Raise `UserError` for a name from which nobody could tell what to write, and for that of the source itself."""
     known = VIDEO_SUFFIXES if moving else PICTURE_SUFFIXES
     if out.suffix.lower() not in known:
         raise UserError(f"{out} cannot be written: a {'video' if moving else 'picture'} ends with {' or '.join(known)}")
     if not out.parent.is_dir():
         raise UserError(f"{out.parent} is not a directory: make it, or name another with --out")
+    if out.exists() and out.samefile(source):
+        raise UserError(f"{out} is what is read, and would be lost: name another file with --out")
 
 
 def write_picture(out: Path, picture: Picture) -> None:

@@ -15,7 +15,7 @@ from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathServer
-from lavt.vehicle.camera import Camera, CapturedFrame, TimedCamera
+from lavt.vehicle.camera import Camera, CapturedFrame, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
 """No more than one keyframe on request in this time, so that requests cannot fill the link."""
@@ -73,7 +73,7 @@ class CameraNode:
             self._there_after_ns = camera.exposure_ns + camera.sensor_delay_ns
         self._packetizer = packetizer
         self._path = path
-        self._start_ns = start_ns + camera.phase_ns
+        self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
         self._send_to = tuple(send_to)
         self._next_frame = 0
         self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
@@ -108,23 +108,19 @@ class CameraNode:
 
     def next_wake_ns(self) -> int:
         """When the next picture is there."""
-        return self._due_ns(self._next_frame) + self._there_after_ns
-
-    def _due_ns(self, number: int) -> int:
-        return self._start_ns + round(number * NS_PER_S / self._camera.rate_hz)
+        return self._opens.due_ns(self._next_frame) + self._there_after_ns
 
     def _capture(self, _message: Message, now: Now) -> CapturedFrame | None:
         number = self._next_frame
-        while self._due_ns(number + 1) + self._there_after_ns <= now.mono_ns:
+        while self._opens.due_ns(number + 1) + self._there_after_ns <= now.mono_ns:
             number += 1
         self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame = number + 1
-        due_ns = self._due_ns(number)
+        due_ns = self._opens.due_ns(number)
         if isinstance(self._camera, TimedCamera):
             frame = self._camera.expose(number, due_ns, self._poses)
         else:
-            pose = next((pose for pose in reversed(self._poses) if pose.mono_ns <= due_ns), None)
-            frame = self._camera.capture(number, due_ns, pose)
+            frame = self._camera.capture(number, due_ns, newest_pose(self._poses, due_ns))
         if frame is None:
             self._counts["frames_missing"] += 1
         return frame

@@ -147,8 +147,8 @@ def has_been_left(lane: Lane) -> bool:
     return abs(c0) / math.hypot(1.0, c1) > LEFT_AT_WIDTHS * lane.width_m
 
 
-def averaged(before: Lane | None, fit: LaneFit) -> Lane:
-    """Move the lane seen before towards the newest fit; the first fit after a loss stands alone."""
+def averaged(before: Lane | None, fit: LaneFit | Lane) -> Lane:
+    """Move the lane seen before towards the newest one; the first fit after a loss stands alone."""
     if before is None:
         return Lane(fit.centre, fit.width_m, fit.near_m, fit.far_m, fit.confidence)
     c0, c1, c2 = (old + SMOOTHING * (new - old) for old, new in zip(before.centre, fit.centre, strict=True))

@@ -57,7 +57,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class LaneFit:
-    """A lane fitted to one picture, or the average of several."""
+    """A lane fitted to one picture."""
 
     centre: tuple[float, float, float]
     width_m: float

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lavt.domain import Lane, SeenLane
-from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, SMOOTHING, TRACK_CONFIDENCE
+from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, TRACK_CONFIDENCE, averaged
 
 
 class GivenLane:
@@ -28,11 +28,7 @@ class GivenLane:
         if seen.confidence < TRACK_CONFIDENCE:
             self._misses += 1
             self._lane = replace(self._lane, confidence=seen.confidence)
-        elif self._misses >= FORGET_AFTER:
-            self._misses, self._lane = 0, seen
         else:
-            before = zip(self._lane.centre, seen.centre, strict=True)
-            c0, c1, c2 = (old + SMOOTHING * (new - old) for old, new in before)
-            width_m = self._lane.width_m + SMOOTHING * (seen.width_m - self._lane.width_m)
-            self._misses, self._lane = 0, Lane((c0, c1, c2), width_m, seen.near_m, seen.far_m, seen.confidence)
+            self._lane = averaged(self._lane if self._misses < FORGET_AFTER else None, seen)
+            self._misses = 0
         return self._lane

@@ -30,6 +30,11 @@ class FrameTimes:
         return self.first_ns + round(number * NS_PER_S / self.rate_hz)
 
 
+def newest_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:
+    """Give the last pose at or before a time, of poses that are sorted by time; None when all are later."""
+    return next((pose for pose in reversed(poses) if pose.mono_ns <= at_ns), None)
+
+
 class Camera(Protocol):
     """Something that gives a frame at a time."""
 

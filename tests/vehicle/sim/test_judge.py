@@ -228,6 +228,14 @@ def test_one_contact_is_one_collision(road: Road) -> None:
     assert collisions == [0, 1021]
 
 
+def test_a_car_that_stands_in_a_rail_stays_in_one_collision(road: Road) -> None:
+    """Pressed against a rail for seconds and moved there again, a car has touched it once."""
+    judge = Judge(road, CAR, near_s_m=5.0)
+    events = [event for at_s in range(4) for event in judge.judge(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
+    events += judge.judge(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
+    assert kinds(events).count("collision") == 1
+
+
 def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> None:
     """The front right corner in the right rail: its place on the body, its depth, and that out is to the left."""
     judge = Judge(road, CAR, near_s_m=5.0)

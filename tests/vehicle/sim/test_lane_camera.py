@@ -13,9 +13,9 @@ ROAD = load_road("a_key")
 S_M = 5.0
 
 
-def camera(**keys: int) -> LaneCamera:
+def camera(*, model: CameraModel = CameraModel(), **keys: int) -> LaneCamera:  # noqa: B008 (frozen)
     return LaneCamera(
-        model=CameraModel(), rate_hz=30.0, phase_ns=0, road=ROAD, near_m=3.6, far_m=20.0, half_width_m=7.0, **keys
+        model=model, rate_hz=30.0, phase_ns=0, road=ROAD, near_m=3.6, far_m=20.0, half_width_m=7.0, **keys
     )
 
 
@@ -59,6 +59,25 @@ def test_confidence_is_what_is_in_view() -> None:
         assert confidences == sorted(confidences, reverse=True)
         assert confidences[-1] == 0.0
     assert 0.3 < beside[3] < 0.5, "from 6 m beside, one line is seen and the other is beyond 7 m"
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "y_m", "sees"),
+    [
+        (0.0, 0.0, 1.0),
+        (20.0, 0.0, 0.9),
+        (-20.0, 0.0, 0.9),
+        (46.0, 0.0, 0.5),
+        (120.0, 0.0, 0.0),
+        (180.0, 0.0, 0.0),
+        (0.0, 5.0, 0.8),
+    ],
+)
+def test_a_camera_that_looks_aside_sees_less(yaw_deg: float, y_m: float, sees: float) -> None:
+    """Half of the lane's lines are left of a camera that looks 46 degrees to one side; behind the car there is none."""
+    model = CameraModel(yaw_rad=math.radians(yaw_deg), y_m=y_m)
+    lane = camera(model=model).lane_from(pose_at(S_M))
+    assert lane.confidence == pytest.approx(sees, abs=0.1)
 
 
 def test_no_pose_no_picture() -> None:

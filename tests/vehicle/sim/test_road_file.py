@@ -99,6 +99,8 @@ REFUSED = {
     "part of nothing": ("title: x\npart_of: z\nfrom_m: 0\nlength_m: 30", r"no road"),
     "part of a part": ("title: x\npart_of: a_key\nfrom_m: 0\nlength_m: 30", r"a_key is itself a part.*name the whole"),
     "part too long": ("title: x\npart_of: a\nfrom_m: 400\nlength_m: 30", r"a has only 5\.\d m from 400\.0 m on"),
+    "part beyond its road": ("title: x\npart_of: a\nfrom_m: 1000\nlength_m: 30", r"a ends at 405\.\d m: from_m must"),
+    "dashes like dust": ("title: x\nsegments: [{length_m: 9}]\nmarks: [{offset_m: 1, dash_m: 0.01}]", r"dash_m.*0\.1"),
     "part with segments": ("title: x\npart_of: a\nfrom_m: 0\nlength_m: 30\nsegments: []", r"unknown key 'segments'"),
 }
 

@@ -202,6 +202,15 @@ rails: [{offset_m: -6}, {offset_m: 6, kind: barrier}]
 """
 
 
+RAIL_AHEAD = """
+title: a narrow lane, and a rail that begins beside it
+segments: [{length_m: 300}]
+lanes: {widths_m: [3.5, 1.0], driven: 1}
+shoulders: {left_m: 5, right_m: 5}
+rails: [{offset_m: 0.52, from_m: 20, kind: barrier}]
+"""
+
+
 def into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
     """Drive with constant wheel and throttle, collisions not ending it; tell the deepest any corner got into a rail."""
     simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, goes_on=True)
@@ -242,3 +251,20 @@ def test_a_crash_at_a_large_angle_stops_a_car_that_goes_on() -> None:
     simulator, events, _ = into_the_rail(0.4, 8.0)
     assert "collision" in {event.kind for event in events}
     assert 0.0 <= simulator.state().speed_mps < 0.3
+
+
+def test_a_car_that_runs_against_the_end_of_a_rail_stops_before_it() -> None:
+    """It meets the end with its front, stays where it is across the road, and never jumps; that is one collision."""
+    road = parse_road(RAIL_AHEAD, source="x")
+    simulator = Simulator(road=road, seed=1, start_mono_ns=0, goes_on=True)
+    simulator.apply(Actuation(0.0, 0.6, 0.0), 0)
+    events, steps_m, before = [], [], simulator.pose()
+    for _ in range(240 * 12):
+        events += simulator.advance(simulator.next_wake_ns())
+        pose = simulator.pose()
+        steps_m.append(math.dist((pose.x_m, pose.y_m), (before.x_m, before.y_m)))
+        before = pose
+    assert [event.kind for event in events].count("collision") == 1
+    assert max(steps_m) < 0.06
+    assert simulator.state().speed_mps < 0.3
+    assert simulator.ground_truth().progress_m < 20.0 - 3.6

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from lavt.domain import NS_PER_MS, CameraModel, Pose
-from lavt.vehicle.camera import CapturedFrame
+from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.light import LightName
 from lavt.vehicle.sim.renderer import Renderer, SceneryKind
 from lavt.vehicle.sim.road import Road
@@ -77,7 +77,7 @@ class SimCamera:
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Render frame `number` as seen while the shutter was open; None when no pose is as old as its opening."""
         if self._exposure_ns == 0:
-            return self.capture(number, begin_ns, _newest(poses, begin_ns))
+            return self.capture(number, begin_ns, newest_pose(poses, begin_ns))
         begin, end = pose_at(poses, begin_ns), pose_at(poses, begin_ns + self._exposure_ns)
         if begin is None or end is None:
             return None
@@ -91,7 +91,7 @@ def pose_at(poses: Sequence[Pose], at_ns: int) -> Pose | None:
     Beyond the newest the motion of the last two goes on, for `LONGEST_GUESS_NS` at most: the physics tells a pose after
     its time, so the last one is a step old when the shutter closes.
     """
-    before = _newest(poses, at_ns)
+    before = newest_pose(poses, at_ns)
     if before is None or before.mono_ns == at_ns or len(poses) < 2:
         return before
     after = next((pose for pose in poses if pose.mono_ns > at_ns), None)
@@ -107,7 +107,3 @@ def pose_at(poses: Sequence[Pose], at_ns: int) -> Pose | None:
         first.y_m + (second.y_m - first.y_m) * share,
         first.heading_rad + turn_rad * share,
     )
-
-
-def _newest(poses: Sequence[Pose], at_ns: int) -> Pose | None:
-    return next((pose for pose in reversed(poses) if pose.mono_ns <= at_ns), None)

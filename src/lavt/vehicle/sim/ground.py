@@ -5,6 +5,7 @@ A tile is a function of its place alone, so that what the camera sees does not d
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from functools import lru_cache
 
@@ -18,13 +19,12 @@ from lavt.vehicle.sim.damage import damages
 from lavt.vehicle.sim.light import Light
 from lavt.vehicle.sim.road import Road
 from lavt.vehicle.sim.shadows import Shadows
-from lavt.vehicle.sim.strips import OVERLAP_M, Grey, Square, Strips, along, join, pieces
+from lavt.vehicle.sim.strips import OVERLAP_M, PIECE_M, Grey, Square, Strips, along, join, pieces
 from lavt.vehicle.sim.textures import SCALES_M, all_textures
 
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
 """Edge of a tile at each scale."""
 
-_MARK_M = 0.125
 _KEPT_TILES = (40, 60, 160, 400, 400)
 """The two finest scales are painted on the way, a few tiles at a time; the others are kept for a whole road."""
 _GRAVEL_M = 1.6
@@ -55,7 +55,7 @@ class Ground:
         )
         self._tracks = _tracks(road)
         self._damages = damages(road)
-        self._marks = {colour: _marks(road, colour) for colour in _PAINT}
+        self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _paints(road)]
 
     def window(self, level: int, low: tuple[int, int], count: int) -> Picture:
         """Paint `count` x `count` tiles from the tile index `low` (x, y) on, with a fourth channel that says nothing.
@@ -123,10 +123,10 @@ class Ground:
                 damage.places.fill(darker, square, grey)
         worn = np.asarray(cv2.subtract(_cut(textures.asphalt, square), darker), dtype=np.uint8)
         picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
-        thinness = min(1.0, _MARK_M * 1.3 / scale_m)
-        for colour, places in self._marks.items():
+        for colour, width_m, places in self._marks:
             paint = places.mask(square)
             if paint is not None:
+                thinness = min(1.0, width_m * 1.3 / scale_m)
                 alpha = np.asarray(cv2.multiply(paint, _cut(textures.wear, square), scale=thinness / 255), np.uint8)
                 cover = cv2.merge((alpha, alpha, alpha))
                 kept = cv2.multiply(picture, cv2.bitwise_not(cover), scale=1 / 255)
@@ -174,19 +174,27 @@ def _tracks(road: Road) -> list[tuple[Strips, int]]:
     ]
 
 
-def _marks(road: Road, colour: str) -> Strips:
+def _paints(road: Road) -> list[tuple[str, float]]:
+    """Colours and widths (m) of marks, white first."""
+    return [
+        (colour, each) for colour in _PAINT for each in sorted({m.width_m for m in road.marks if m.colour == colour})
+    ]
+
+
+def _marks(road: Road, colour: str, width_m: float) -> Strips:
     found = []
     for mark in road.marks:
-        if mark.colour != colour:
+        if (mark.colour, mark.width_m) != (colour, width_m):
             continue
         left_m, right_m = mark.offset_m + mark.width_m / 2, mark.offset_m - mark.width_m / 2
         if mark.kind == "solid":
             found.append(along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
         begin = mark.dashes_m(road.first_m, road.last_m)
-        # Two halves a dash, so that it bends with the road.
-        halves = np.concatenate([begin, begin + mark.dash_m / 2])
-        found.append(pieces(road, left_m, right_m, halves, halves + mark.dash_m / 2 + OVERLAP_M))
+        # Two pieces a dash and more, so that it bends with the road.
+        count = max(2, math.ceil(mark.dash_m / PIECE_M))
+        parts = (begin + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
+        found.append(pieces(road, left_m, right_m, parts, parts + mark.dash_m / count + OVERLAP_M))
     return join(found)
 
 

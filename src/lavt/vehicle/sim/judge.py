@@ -71,6 +71,7 @@ class Judge:
 
     def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Tell what has happened since the last call; call it at every step."""
+        # In a rail it is looked at every time: the contact may deepen or end, and lasts while the car stands in it.
         quiet = not self.contacts and self._quiet.holds(motion)
         events = [] if quiet else self._look(motion, at_ns)
         if self._began_ns is None:
@@ -140,7 +141,13 @@ class Judge:
                 continue
             for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
                 if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
-                    found.append(Contact(ahead_m, left_m, depth_m, heading_rad - side * math.pi / 2))
+                    # Out is the shortest way: across, or along, for a car that has run against an end of the rail.
+                    ways = (
+                        (depth_m, heading_rad - side * math.pi / 2),
+                        (s_m - rail.from_m, heading_rad + math.pi),
+                        (rail.to_m - s_m, heading_rad),
+                    )
+                    found.append(Contact(ahead_m, left_m, *min(ways)))
                     hit = hit or rail
         return tuple(found), hit
 

@@ -8,12 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from lavt.domain import CameraModel, Lane, Pose, SeenLane
-from lavt.vehicle.camera import CapturedFrame
+from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.road import Road
 
 LINEAR_BELOW_M = 6.0
 """Of length seen: as with pixels, less gives no curvature."""
 POINTS_AT_LEAST = 3
+_ABEAM_RAD = math.radians(89.9)
+"""Edges of the view that look farther aside, or back, see nothing of what lies ahead."""
+
 STATIONS_PER_M = 1
 """Of the lane's lines that are looked at."""
 
@@ -22,8 +25,9 @@ class LaneCamera:
     """A `lavt.vehicle.camera.Camera` without pixels: its pictures are `SeenLane`, fitted to the road's true centre.
 
     The ground it looks at is that of the detector: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to
-    both sides, as far as the camera's field of view has it. Confidence is the share of the lane's two lines in there.
-    A car that has turned by more than 90 degrees sees none.
+    both sides, as far as the camera's field of view has it: its place, its yaw and its width count, pitch and roll do
+    not. Confidence is the share of the lane's two lines in there. A car that has turned by more than 90 degrees sees
+    none.
     """
 
     def __init__(
@@ -46,7 +50,10 @@ class LaneCamera:
         self.sensor_delay_ns = sensor_delay_ns
         self._road = road
         self._near_m, self._far_m, self._half_width_m = near_m, far_m, half_width_m
-        self._view_slope = math.tan(model.field_of_view_rad / 2)
+        half_rad = model.field_of_view_rad / 2
+        self._left_slope, self._right_slope = (
+            math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
+        )
         self._width_m = road.lanes.widths_m[road.lanes.driven]
         self._ahead = math.ceil(math.hypot(far_m, half_width_m)) * STATIONS_PER_M + 1
         stations_m = np.arange(road.length_m * STATIONS_PER_M + 2 * self._ahead) / STATIONS_PER_M
@@ -63,7 +70,7 @@ class LaneCamera:
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
         """Give the lane as it is seen half-way between the poses at the shutter's opening and at its closing."""
-        first, last = _newest(poses, begin_ns), _newest(poses, begin_ns + self.exposure_ns)
+        first, last = newest_pose(poses, begin_ns), newest_pose(poses, begin_ns + self.exposure_ns)
         if first is None or last is None:
             return None
         turned_rad = math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi)
@@ -78,7 +85,8 @@ class LaneCamera:
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
         near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
-        slope, lens_m = self._view_slope, self.model.x_m
+        left_slope, right_slope = self._left_slope, self._right_slope
+        lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
         centre, lines_seen = [], 0
         for line in self._stations[first : first + self._ahead]:
             seen = 0
@@ -86,8 +94,9 @@ class LaneCamera:
                 dx, dy = world_x - x_m, world_y - y_m
                 ahead_m = dx * cosine + dy * sine
                 if near_m <= ahead_m <= far_m:
-                    aside_m = abs(dy * cosine - dx * sine)
-                    seen += aside_m <= wide_m and aside_m <= (ahead_m - lens_m) * slope
+                    left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                    in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
+                    seen += in_view and -wide_m <= left_m <= wide_m
             if seen:
                 lines_seen += seen
                 dx, dy = line[0][0] - x_m, line[0][1] - y_m
@@ -97,10 +106,6 @@ class LaneCamera:
         share = lines_seen / STATIONS_PER_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
-
-
-def _newest(poses: Sequence[Pose], at_ns: int) -> Pose | None:
-    return next((pose for pose in reversed(poses) if pose.mono_ns <= at_ns), None)
 
 
 def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:

@@ -120,6 +120,8 @@ def parse_road(text: str, source: str) -> Road:
         raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole as part_of")
     whole = _whole(of_file)
     room_m = whole.last_m - read.from_m
+    if room_m <= 0.0:
+        raise UserError(f"{source}: {read.part_of} ends at {whole.last_m:.1f} m: from_m must be less")
     if read.length_m > room_m:
         raise UserError(f"{source}: {read.part_of} has only {room_m:.1f} m from {read.from_m} m on: shorten length_m")
     return whole.part(read.title, read.from_m, read.length_m)

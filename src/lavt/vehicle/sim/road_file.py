@@ -24,6 +24,9 @@ TIGHTEST_PER_M = 0.2
 SHORTEST_M = 10.0
 """Of a route: cars start up to 2 m into it."""
 
+SHORTEST_DASH_M = 0.1
+"""Of a dash and of a gap: hundreds of thousands on a road take minutes to draw, and nobody sees them."""
+
 INNER_SHARE = 0.1
 """The inner edge of the road must keep this share of the centre's length in a curve."""
 
@@ -31,6 +34,7 @@ Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-100_00
 Offset = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-200, le=200)]
 Station = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-20_000, le=20_000)]
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20_000)]
+Dash = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SHORTEST_DASH_M, le=20_000)]
 RouteLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SHORTEST_M, le=20_000)]
 RunLength = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=2_000)]
 Width = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=20)]
@@ -86,8 +90,8 @@ class _MarkKeys(_Along):
     kind: Literal["solid", "broken"] = "solid"
     colour: Literal["white", "yellow"] = "white"
     width_m: Width = SOLID_M
-    dash_m: Length = DASH_M
-    gap_m: Length = GAP_M
+    dash_m: Dash = DASH_M
+    gap_m: Dash = GAP_M
     dash_at_m: Station = 0.0
 
 

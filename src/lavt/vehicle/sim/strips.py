@@ -17,7 +17,9 @@ Grey = NDArray[np.uint8]
 OVERLAP_M = 0.03
 """How far a piece reaches into the next one, so that no gap is seen."""
 
-_PIECE_M = 2.0
+PIECE_M = 2.0
+"""Longest straight piece of what bends with the road."""
+
 _SUBPIXEL_BITS = 4
 
 
@@ -73,7 +75,7 @@ def join(found: Sequence[Strips]) -> Strips:
 def along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
     """Lay a strip along the road between two lateral offsets, cut into short pieces."""
     first_m, last_m = max(from_m, road.first_m), min(to_m, road.last_m)
-    cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _PIECE_M) + 1))
+    cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / PIECE_M) + 1))
     return pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
 
 
