@@ -6,11 +6,12 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lavt.value import value
 
 Picture = NDArray[np.uint8]
 """A picture: (height, width, 3), blue green red, 0 to 255."""
@@ -41,7 +42,7 @@ class Now(NamedTuple):
         return Now(self.mono_ns + duration_ns, self.wall_ns + duration_ns)
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Pose:
     """Where the vehicle is: its rear axle in the world's frame, at a time of the server's monotonic clock."""
 
@@ -51,7 +52,7 @@ class Pose:
     heading_rad: float
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Actuation:
     """What a vehicle is asked to do: road wheel angle, and pedals in [0, 1]."""
 
@@ -60,7 +61,7 @@ class Actuation:
     brake: float
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class VehicleState:
     """What a vehicle reports of itself, at its own time `mono_ns` on the server's monotonic clock."""
 
@@ -70,7 +71,7 @@ class VehicleState:
     gear: Literal["park", "reverse", "neutral", "drive"]
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class GroundTruth:
     """What only a simulator knows; it is recorded on the server and never published."""
 
@@ -93,7 +94,7 @@ EventKind = Literal["lane_invasion", "collision", "off_road", "completed", "time
 Ending = Literal["completed", "collision", "off_road", "timeout", "safe_stop"]
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class VehicleEvent:
     """Something that happened to a vehicle."""
 
@@ -102,7 +103,7 @@ class VehicleEvent:
     detail: str
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class CameraModel:
     """A pinhole camera on a vehicle: no distortion, principal point in the middle of the picture.
 
@@ -127,7 +128,7 @@ class CameraModel:
         return self.width_px / 2 / float(np.tan(self.field_of_view_rad / 2))
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Lane:
     """The lane as seen in one picture, in the vehicle's frame.
 
@@ -142,7 +143,7 @@ class Lane:
     """0 (nothing of a lane in the picture) to 1 (both lines seen over the whole length)."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class SeenLane:
     """What takes the place of a picture where nothing is rendered: the lane that would be seen in it."""
 
@@ -153,7 +154,7 @@ class SeenLane:
     lane: Lane
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Decision:
     """What a controller wants: pedals, road wheel angle, and the path it means to follow.
 
@@ -171,7 +172,7 @@ Operation = Literal["hold", "release", "emergency_stop", "clear_emergency_stop"]
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Command:
     """What the client wants the vehicle to do, at least 50 times a second."""
 
@@ -192,7 +193,7 @@ class Command:
     """0, or the number of an emergency stop; the numbers only grow."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class State:
     """What the vehicle tells, 50 times a second."""
 
@@ -211,7 +212,7 @@ class State:
     """Why a command was last refused; empty: none was."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class SessionRequest:
     """A client's query to the server."""
 
@@ -223,7 +224,7 @@ class SessionRequest:
     """Number of an emergency stop, else 0."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class SessionReply:
     """The server's answer to a `SessionRequest`."""
 

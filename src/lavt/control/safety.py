@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from lavt.control.limiter import Limiter
 from lavt.control.limits import Limits
 from lavt.control.written import WrittenStamps
 from lavt.domain import Actuation, Command, Operation, SafetyState, SessionReply, SessionRequest, VehicleState
+from lavt.value import value
 
 Trigger = Literal[
     "arming begins", "arming broken", "arming held", "silence", "fresh command", "long silence", "stop asked",
@@ -58,7 +58,7 @@ BECAUSE: dict[Trigger, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Verdict:
     """What became of a command; `reason` is empty when it was obeyed."""
 

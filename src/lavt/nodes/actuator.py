@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 from lavt.control.safety import ACTIVE, SafetyGate, Verdict
@@ -13,6 +12,7 @@ from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.reports import Admission, Event, FrameWritten, Route
 from lavt.transport.messages import decode, encode
+from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import Vehicle
 
@@ -31,7 +31,7 @@ ENDINGS: dict[str, Ending] = {
 """Events that end a drive; a collision only where the vehicle does not go on after it."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Received:
     """A command as it came in."""
 
@@ -44,7 +44,7 @@ class Received:
         return self.command.stamp_ns
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Judged:
     """A command with what was decided on it."""
 

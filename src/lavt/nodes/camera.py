@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from lavt.domain import NS_PER_S, Now, Pose, Sight
 from lavt.errors import BadPacket
@@ -15,6 +14,7 @@ from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathServer
+from lavt.value import value
 from lavt.vehicle.camera import Camera, CapturedFrame, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
@@ -25,7 +25,7 @@ REMEMBERED_POSES = 512
 """At 240 Hz twice the longest that a picture may take from the opening of the shutter."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Stamped:
     """A picture with its send time in its pixels."""
 
@@ -36,7 +36,7 @@ class Stamped:
     picture: Sight
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Encoded:
     """A stamped picture as H.264."""
 

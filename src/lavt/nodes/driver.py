@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 from lavt.control.drive_controller import DriveController
@@ -19,6 +18,7 @@ from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
 from lavt.transport.pictures import PictureReceiver, Received
 from lavt.transport.stamp import stamp_agrees
+from lavt.value import value
 
 
 class Detector(Protocol):
@@ -33,7 +33,7 @@ class Detector(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Decoded:
     """A received access unit and the picture that came of it."""
 
@@ -42,7 +42,7 @@ class Decoded:
     decoded_mono_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class StampRead:
     """A decoded picture with its stamp; 0 where it could not be read."""
 
@@ -51,7 +51,7 @@ class StampRead:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Seen:
     """A view and the lane that perception found in it."""
 

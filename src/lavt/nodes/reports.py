@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from lavt.domain import Lane, Sight
+from lavt.value import value
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class FrameWritten:
     """A frame was stamped and encoded on the server."""
 
@@ -20,7 +19,7 @@ class FrameWritten:
     size_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class VideoUnit:
     """One H.264 access unit as it was sent or received."""
 
@@ -28,7 +27,7 @@ class VideoUnit:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class ReceivedUnit:
     """An access unit out of the network; the times are the client's monotonic clock."""
 
@@ -40,7 +39,7 @@ class ReceivedUnit:
     """Arrival of its last packet."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class View:
     """A decoded picture with a stamp that could be read."""
 
@@ -49,7 +48,7 @@ class View:
     picture: Sight
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class PictureRead:
     """What became of a received access unit."""
 
@@ -68,7 +67,7 @@ class PictureRead:
     read_wall_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class LaneSeen:
     """What perception made of a picture."""
 
@@ -76,7 +75,7 @@ class LaneSeen:
     lane: Lane
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Admission:
     """What became of a command on the server."""
 
@@ -98,7 +97,7 @@ class Admission:
     brake: float
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Event:
     """Something worth a line in the record of the server."""
 
@@ -107,7 +106,7 @@ class Event:
     detail: str
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Route:
     """The road that is driven: the middle of its lane, once at the start of a record."""
 
@@ -116,7 +115,7 @@ class Route:
     points: tuple[tuple[float, float], ...]
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class PathToken:
     """The client may open the path of the video with this."""
 
@@ -124,7 +123,7 @@ class PathToken:
     port: int
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class ClockSample:
     """A clock report beside a reading of both clocks."""
 

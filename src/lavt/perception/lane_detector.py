@@ -11,6 +11,7 @@ from lavt.domain import NS_PER_MS, CameraModel, Lane, Picture
 from lavt.perception.bird_eye import GroundGrid, bird_eye
 from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_fit import (
+    OUTLIER_M,
     LaneFit,
     Points,
     Sides,
@@ -127,7 +128,7 @@ class LaneDetector:
             self._refined(points, fit_lane(points, sides, grid, self._lane_width_m)),
             self._refined(points, self._followed(points, start, self._lane_width_m)),
         )
-        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid)]
+        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and stands_in(fit)]
         found = max(lanes, key=lambda fit: fit.confidence, default=None)
         return Sight(mask, points, sides, start, self._lane_width_m, windows, found)
 
@@ -141,10 +142,19 @@ class LaneDetector:
         return fit
 
 
+def stands_in(lane: LaneFit) -> bool:
+    """Tell whether the car stands in a lane, as far as a fit can tell; on a line it stands in both."""
+    return _aside_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
+
+
 def has_been_left(lane: Lane) -> bool:
     """Tell whether the car is so far beside a lane that it is in the middle of the next one, or beyond."""
-    c0, c1, _ = lane.centre
-    return abs(c0) / math.hypot(1.0, c1) > LEFT_AT_WIDTHS * lane.width_m
+    return _aside_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
+
+
+def _aside_m(centre: tuple[float, float, float]) -> float:
+    c0, c1, _ = centre
+    return abs(c0) / math.hypot(1.0, c1)
 
 
 def averaged(before: Lane | None, fit: LaneFit | Lane) -> Lane:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from lavt.domain import Now
 from lavt.node import Hop, Message, Send
+from lavt.value import value
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Timeline:
     """When each hop of a chain was done, on the host's monotonic clock.
 

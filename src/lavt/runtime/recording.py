@@ -7,12 +7,13 @@ import queue
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 from lavt.domain import Command, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
+from lavt.value import value
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ def _without_token(data: bytes) -> object:
     return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Packet:
     """A datagram of the video; sequence and timestamp where it is RTP (RFC 3550, section 5.1)."""
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
 
+from lavt.value import value
 
-@dataclass(frozen=True, slots=True)
+
+@value
 class ClockReport:
     """What the host's source of time says of the host's clock."""
 

@@ -7,7 +7,6 @@ FFmpeg's frame threads buy speed with one frame of delay each.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Final, cast
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from lavt.domain import Picture
 from lavt.errors import UserError
 from lavt.transport.rtp import split_nal_units
+from lavt.value import value
 
 _MIN_SIDE_PX: Final = 64
 _MAX_DECODED_PX: Final = 4096 * 2304
@@ -116,7 +116,7 @@ def _check_rates(rate_hz: float, bit_rate_bps: int, gop_frames: int, buffer_s: f
         raise UserError(f"a decoder buffer of {buffer_s} s: choose 0.001 to 10 s, and at least one frame")
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class DecodedPicture:
     """A picture that came out of the decoder."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from lavt.domain import Lane, Picture, SeenLane, Sight
 from lavt.errors import BadPacket
 from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.stamp import STAMP_PX, read_stamp, write_stamp
+from lavt.value import value
 
 _STANDS_ALONE: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
 """An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
@@ -142,7 +143,7 @@ class HandedOver:
         return read_stamp(received.luma)
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class ReceivedLane:
     """A lane that came in the place of a picture."""
 

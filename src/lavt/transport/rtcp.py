@@ -6,10 +6,10 @@ RTCP shares the port with RTP; which of the two a datagram is shows in its secon
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Final
 
 from lavt.errors import BadPacket
+from lavt.value import value
 
 _HEADER = struct.Struct("!BBH")
 _SSRC = struct.Struct("!I")
@@ -29,7 +29,7 @@ _RTP_HEADER_BYTES: Final = 12
 _RTCP_HEADER_BYTES: Final = 8
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class ReceptionReport:
     """How a stream arrives at one receiver (RFC 3550, section 6.4.1)."""
 
@@ -44,7 +44,7 @@ class ReceptionReport:
     """Mean deviation of the arrival spacing, in ticks of the RTP clock (90 kHz)."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Feedback:
     """What one RTCP datagram says."""
 

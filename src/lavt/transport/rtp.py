@@ -8,11 +8,11 @@ these. An access unit leaves the depacketizer with its marker packet, so no fram
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 from lavt.errors import BadPacket, UserError
+from lavt.value import value
 
 VIDEO_PAYLOAD_TYPE: Final = 96
 MAX_PACKET_BYTES: Final = 1200
@@ -40,7 +40,7 @@ _FU_START: Final = 0x80
 _FU_END: Final = 0x40
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class RtpPacket:
     """An RTP packet without contributing sources and extensions (RFC 3550, section 5.1)."""
 
@@ -168,7 +168,7 @@ def _fragment(unit: bytes, max_payload_bytes: int) -> list[bytes]:
     return [bytes((indicator, flag | kind)) + unit[begin:end] for flag, (begin, end) in pieces]
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class AccessUnit:
     """What is there of one picture's H.264."""
 

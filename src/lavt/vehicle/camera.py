@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
+from lavt.value import value
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class CapturedFrame:
     """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known."""
 
@@ -18,7 +18,7 @@ class CapturedFrame:
     picture: Sight
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class FrameTimes:
     """When a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
 

@@ -6,9 +6,9 @@ import itertools
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 from lavt.domain import NS_PER_S, EventKind, VehicleEvent
+from lavt.value import value
 from lavt.vehicle.sim.cross_section import Rail
 from lavt.vehicle.sim.dynamics import CarMotion, CarParameters, Contact
 from lavt.vehicle.sim.road import PROJECTION_WINDOW_M, Road
@@ -31,7 +31,7 @@ Place = tuple[float, float, float]
 """Station (m), lateral offset (m) and the road's heading (rad) of a point of the body."""
 
 
-@dataclass(frozen=True, slots=True)
+@value
 class Track:
     """A car against the centre of its lane; see `GroundTruth` for what is measured where."""
 
