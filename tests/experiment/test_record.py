@@ -19,6 +19,8 @@ from lavt.experiment.table import MISSING
 from lavt.nodes.reports import VideoUnit
 
 WALL_NS = 1_700_000_000_000_000_123
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""What compressed data begins with (RFC 8878, section 3.1.1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,8 @@ def test_damage_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_samples(path, 3_000)
     content = bytearray(path.read_bytes())
-    content[len(content) // 3] ^= 0xFF
+    chunk = content.index(ZSTD, content.index(ZSTD) + 1)
+    content[chunk + 1_000] ^= 0xFF
     path.write_bytes(bytes(content))
     record = read_record(path)
     assert not record.complete

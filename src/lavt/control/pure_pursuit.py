@@ -27,15 +27,12 @@ class Place(NamedTuple):
 
     def moved(self, distance_m: float, curvature_per_m: float) -> Place:
         """Go `distance_m` along a circle."""
+        x_m, y_m, heading_rad = self
         turned_rad = distance_m * curvature_per_m
         # The chord of the arc: its length, and its direction half-way between the two headings.
-        chord_m = distance_m if abs(turned_rad) < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
-        direction_rad = self.heading_rad + turned_rad / 2
-        return Place(
-            self.x_m + chord_m * math.cos(direction_rad),
-            self.y_m + chord_m * math.sin(direction_rad),
-            self.heading_rad + turned_rad,
-        )
+        chord_m = distance_m if -1e-9 < turned_rad < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
+        along_rad = heading_rad + turned_rad / 2
+        return Place(x_m + chord_m * math.cos(along_rad), y_m + chord_m * math.sin(along_rad), heading_rad + turned_rad)
 
 
 SEEN_FROM = Place()
@@ -54,7 +51,7 @@ def goal_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> tuple[flo
     From a place farther off the lane than that, it is the point abreast.
     """
     c0, c1, c2 = lane.centre
-    from_x_m, from_y_m = place.x_m, place.y_m
+    from_x_m, from_y_m, _ = place
     farthest_m2 = distance_m * distance_m
     aside_m = c0 + (c1 + c2 * from_x_m) * from_x_m - from_y_m
     if abs(aside_m) >= distance_m:
@@ -82,9 +79,9 @@ def goal_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> tuple[flo
 
 def pursuit_curvature_per_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> float:
     """Give the curvature, left positive, of the circle from `place` to the goal on the lane's centre."""
+    from_x_m, from_y_m, heading_rad = place
     x_m, y_m = goal_m(lane, distance_m, place)
-    angle_rad = math.atan2(y_m - place.y_m, x_m - place.x_m) - place.heading_rad
-    return 2 * math.sin(angle_rad) / distance_m
+    return 2 * math.sin(math.atan2(y_m - from_y_m, x_m - from_x_m) - heading_rad) / distance_m
 
 
 def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place = SEEN_FROM) -> tuple[float, ...]:
@@ -93,11 +90,15 @@ def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place
     It is where pure pursuit would go: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead. The lane's
     own curvature would not do: a car that is beside its lane, or turned, would stay so along a path of that curvature.
     """
-    curvatures = [limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)]
+    curvatures = []
+    bend_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
     for _ in range(PATH_POINTS):
-        place = place.moved(PATH_STEP_M, curvatures[-1])
-        curvatures.append(limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m))
-    return tuple(curvatures[1:])
+        place = place.moved(PATH_STEP_M, bend_per_m)
+        bend_per_m = pursuit_curvature_per_m(lane, distance_m, place)
+        if not -limit_per_m <= bend_per_m <= limit_per_m:
+            bend_per_m = limited(bend_per_m, limit_per_m)
+        curvatures.append(bend_per_m)
+    return tuple(curvatures)
 
 
 def limited(value: float, limit: float) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ from lavt.experiment.table import EMPTY, Table, table_of
 
 CHUNK_BYTES = 64 * 1024
 """What a crash can cost at most: only whole chunks can be read again."""
+
+KEPT_MESSAGES = 64
+"""And so many before them, a tenth of a second of a drive."""
 
 _LARGEST_BYTES = 256 * 1024 * 1024
 """A longer entry is damage: a flipped bit in its length must not fill the memory."""
@@ -79,24 +83,32 @@ class RecordWriter:
         self._left_out = left_out
         self._digest = digest
         self._mcap = McapFile(path, library=f"lavt {side}", chunk_bytes=CHUNK_BYTES)
-        self._channels: dict[tuple[str, type], tuple[int, Callable[[Any], bytes]]] = {}
+        self._channels: dict[str, dict[type, tuple[int, Callable[[Any], bytes]]]] = defaultdict(dict)
         """For each channel and type of payload its number, and what makes JSON of it."""
         self._schemas: dict[type, int] = {}
-        self._said = side.encode()
+        self._kept: list[tuple[str, Any, Now]] = []
 
     def write(self, channel: str, payload: Any, now: Now) -> None:
-        """Write one message: a dataclass or a dict, on the topic "/" + `channel`.
+        """Write one message, soon: a dataclass or a dict that nobody changes, on the topic "/" + `channel`.
 
-        Raises `TypeError` for values that JSON has no words for.
+        Raises `TypeError` for values that JSON has no words for, when it comes to them.
         """
-        if channel in self._left_out:
-            return
-        kind = (channel, type(payload))
-        channel_id, to_bytes = self._channels.get(kind) or self._register(*kind)
-        data = to_bytes(payload)
-        head = self._mcap.add_message(channel_id, now.wall_ns, now.mono_ns, data)
+        self._kept.append((channel, payload, now))
+        if len(self._kept) >= KEPT_MESSAGES:
+            self._write_kept()
+
+    def _write_kept(self) -> None:
+        kept, self._kept = self._kept, []
+        entries = []
+        for channel, payload, now in kept:
+            if channel in self._left_out:
+                continue
+            kind = type(payload)
+            channel_id, to_bytes = self._channels[channel].get(kind) or self._register(channel, kind)
+            entries.append((channel_id, now[1], now[0], to_bytes(payload)))
+        written = self._mcap.add_messages(entries)
         if self._digest is not None:
-            self._digest.update(self._said + head + data)
+            self._digest.update(self._side.encode() + written)
 
     def annotate(self, name: str, entries: Mapping[str, str]) -> None:
         """Write what belongs to this machine and not to the run's result: versions, the machine itself."""
@@ -105,6 +117,7 @@ class RecordWriter:
     def close(self) -> None:
         """Finish the file; a file without this can still be read, but says that it is not complete."""
         if not self._mcap.closed:
+            self._write_kept()
             self._mcap.close()
 
     def _register(self, channel: str, payload_type: type) -> tuple[int, Callable[[Any], bytes]]:
@@ -118,10 +131,10 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
-        self._channels[channel, payload_type] = channel_id, _video_json if channel == VIDEO else writer_of(payload_type)
+        self._channels[channel][payload_type] = channel_id, _video_json if channel == VIDEO else writer_of(payload_type)
         if self._digest is not None:
             self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())
-        return self._channels[channel, payload_type]
+        return self._channels[channel][payload_type]
 
 
 def _video_json(payload: Any) -> bytes:

@@ -114,6 +114,8 @@ class _Running:
         """For each chain how long after its begin the first hop begins, and how long after it each hop is done."""
         self.free_ns = 0
         self.poke_ns: int | None = None
+        self.poked_ns: set[int] = set()
+        """When it is looked at next, and for when that has been asked: often again for a time that still stands."""
         self.wake_mono_ns: int | None = None
         self.wake_ns: int | None = None
         """When the node wants to be woken, on its host's monotonic clock and in true time."""
@@ -190,10 +192,13 @@ class VirtualRuntime:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""
         if running.poke_ns is None or true_ns < running.poke_ns:
             running.poke_ns = true_ns
-            self._number += 1
-            heapq.heappush(self._heap, (true_ns, self._number, self._look, (running, true_ns)))
+            if true_ns not in running.poked_ns:
+                running.poked_ns.add(true_ns)
+                self._number += 1
+                heapq.heappush(self._heap, (true_ns, self._number, self._look, (running, true_ns)))
 
     def _look(self, running: _Running, true_ns: int) -> None:
+        running.poked_ns.remove(true_ns)
         if running.poke_ns != true_ns:
             return  # it was looked at earlier, and has asked anew
         running.poke_ns = None

@@ -17,8 +17,8 @@ POINTS_AT_LEAST = 3
 _ABEAM_RAD = math.radians(89.9)
 """Edges of the view that look farther aside, or back, see nothing of what lies ahead."""
 
-STATIONS_PER_M = 1
-"""Of the lane's lines that are looked at."""
+STATION_M = 1.0
+"""So far apart are the places of the lane's lines that are looked at."""
 
 
 class LaneCamera:
@@ -55,8 +55,8 @@ class LaneCamera:
             math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
         )
         self._width_m = road.lanes.widths_m[road.lanes.driven]
-        self._ahead = math.ceil(math.hypot(far_m, half_width_m)) * STATIONS_PER_M + 1
-        stations_m = np.arange(road.length_m * STATIONS_PER_M + 2 * self._ahead) / STATIONS_PER_M
+        self._ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
+        stations_m = np.arange(road.length_m / STATION_M + 2 * self._ahead) * STATION_M
         lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
         self._stations: list[list[list[float]]] = np.stack(lines, axis=1).tolist()
         """World x and y of the lane's centre, of its left line and of its right one."""
@@ -81,7 +81,7 @@ class LaneCamera:
     def lane_from(self, pose: Pose) -> Lane:
         """Fit the driven lane's centre as far as its lines are in view; confidence 0 where nothing of them is."""
         self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
-        first = max(math.ceil(self._near_s_m * STATIONS_PER_M), 0)
+        first = max(math.ceil(self._near_s_m / STATION_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
         near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
@@ -103,7 +103,7 @@ class LaneCamera:
                 centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
         if len(centre) < POINTS_AT_LEAST:
             return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
-        share = lines_seen / STATIONS_PER_M / (2 * (far_m - near_m))
+        share = lines_seen * STATION_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
         return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
 
