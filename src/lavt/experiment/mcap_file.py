@@ -54,6 +54,7 @@ class McapFile:
         self._metadata_indexes: list[MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._sequence = 0
+        self._size: int = 0
         self._begin_chunk()
         self._file.write(MAGIC + _bytes(Header(profile="", library=library)))
 
@@ -118,7 +119,7 @@ class McapFile:
 
     def _begin_chunk(self) -> None:
         self._parts: list[bytes] = []
-        self._size: int = 0
+        self._size = 0
         self._messages: defaultdict[int, list[int]] = defaultdict(list)
         """For each channel log time and place of each message, one after the other."""
 

@@ -68,9 +68,8 @@ class CameraNode:
         self._counts: Counter[str] = Counter()
         self._camera = camera
         self._pictures = pictures
-        self._there_after_ns = 0
-        if isinstance(camera, TimedCamera):
-            self._there_after_ns = camera.exposure_ns + camera.sensor_delay_ns
+        self._timed = camera if isinstance(camera, TimedCamera) else None
+        self._there_after_ns = 0 if self._timed is None else self._timed.exposure_ns + self._timed.sensor_delay_ns
         self._packetizer = packetizer
         self._path = path
         self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
@@ -117,8 +116,8 @@ class CameraNode:
         self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame = number + 1
         due_ns = self._opens.due_ns(number)
-        if isinstance(self._camera, TimedCamera):
-            frame = self._camera.expose(number, due_ns, self._poses)
+        if self._timed is not None:
+            frame = self._timed.expose(number, due_ns, self._poses)
         else:
             frame = self._camera.capture(number, due_ns, newest_pose(self._poses, due_ns))
         if frame is None:
