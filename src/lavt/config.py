@@ -54,11 +54,11 @@ class CameraConfig(Section):
 
     width_px: int = Field(640, ge=128, le=3840, multiple_of=2)
     height_px: int = Field(480, ge=128, le=2160, multiple_of=2)
-    rate_hz: float = Field(30.0, gt=0, le=120)
+    rate_hz: float = Field(30.0, ge=1, le=120)
     field_of_view_deg: float = Field(90.0, gt=10, lt=150)
-    x_m: float = 1.6
+    x_m: float = Field(1.6, ge=-10, le=10)
     y_m: float = Field(0.0, ge=-5, le=5)
-    z_m: float = Field(1.4, gt=0)
+    z_m: float = Field(1.4, gt=0, le=10)
     yaw_deg: float = Field(0.0, ge=-180, le=180)
     """Positive to the left."""
     pitch_deg: float = Field(0.0, ge=-20, le=45)
