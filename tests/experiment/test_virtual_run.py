@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lavt.config import RunConfig, condition, load_config, shipped
-from lavt.domain import NS_PER_S, Picture
+from lavt.domain import NS_PER_S, Picture, Pose
 from lavt.experiment.metrics import driving_interval, measure
 from lavt.experiment.network import STAMP_TO_STAMP, injected_network, virtual_network
 from lavt.experiment.plan import PlannedRun, plan_run
@@ -25,7 +25,7 @@ from lavt.experiment.virtual_run import VirtualLoop, build_loop, drive, host_clo
 from lavt.runtime.virtual import modelled_clock_source
 from lavt.streams import stream
 from lavt.transport.clock_offset import ClockReport
-from lavt.vehicle.camera import Camera, CapturedFrame
+from lavt.vehicle.camera import CapturedFrame
 
 BARE = "vehicle.scenery=none"
 GREY_FROM_FRAME = 240  # 8 s: the car has 30 km/h and is about to enter the curve
@@ -51,23 +51,18 @@ def records(out: Path) -> tuple[Record, Record]:
     return read_record(out / "server.mcap"), read_record(out / "client.mcap")
 
 
-class ChangedCamera:
-    """A camera whose pictures are changed by a function of (frame number, picture)."""
-
-    def __init__(self, camera: Camera, change: Callable[[int, Picture], Picture]) -> None:
-        self.model, self.rate_hz, self.phase_ns = camera.model, camera.rate_hz, camera.phase_ns
-        self._camera, self._change = camera, change
-
-    def capture(self, number: int, at_ns: int, pose: Any) -> CapturedFrame | None:
-        """Give the changed frame."""
-        frame = self._camera.capture(number, at_ns, pose)
-        return None if frame is None else replace(frame, picture=self._change(number, frame.picture))
-
-
 def with_pictures(change: Callable[[int, Picture], Picture]) -> Change:
+    """Change the camera's pictures by a function of (frame number, picture)."""
+
     def install(loop: VirtualLoop) -> None:
         node = loop.server.camera
-        node._camera = ChangedCamera(node._camera, change)
+        take = node._expose
+
+        def expose(number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+            frame = take(number, begin_ns, poses)
+            return None if frame is None else replace(frame, picture=change(number, frame.picture))
+
+        node._expose = expose
 
     return install
 

@@ -72,7 +72,9 @@ def _of_record(path: Path) -> Iterator[Picture]:
             found = True
             yield decoded.picture
     if not found:
-        raise UserError(f"{path} holds no picture: name a run's client.mcap or server.mcap, whole and made with record.video")
+        raise UserError(
+            f"{path} holds no picture: name a run's client.mcap or server.mcap, whole and made with record.video"
+        )
 
 
 def check_output(out: Path, *, source: Path, moving: bool) -> None:

@@ -66,10 +66,11 @@ class CameraNode:
         send_to: Sequence[tuple[str, int]] = (),
     ) -> None:
         self._counts: Counter[str] = Counter()
-        self._camera = camera
+        self._take = camera.capture
         self._pictures = pictures
-        self._timed = camera if isinstance(camera, TimedCamera) else None
-        self._there_after_ns = 0 if self._timed is None else self._timed.exposure_ns + self._timed.sensor_delay_ns
+        self._there_after_ns, self._expose = 0, self._take_at_once
+        if isinstance(camera, TimedCamera):
+            self._there_after_ns, self._expose = camera.exposure_ns + camera.sensor_delay_ns, camera.expose
         self._packetizer = packetizer
         self._path = path
         self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
@@ -116,13 +117,14 @@ class CameraNode:
         self._counts["frames_skipped"] += number - self._next_frame
         self._next_frame = number + 1
         due_ns = self._opens.due_ns(number)
-        if self._timed is not None:
-            frame = self._timed.expose(number, due_ns, self._poses)
-        else:
-            frame = self._camera.capture(number, due_ns, newest_pose(self._poses, due_ns))
+        frame = self._expose(number, due_ns, self._poses)
         if frame is None:
             self._counts["frames_missing"] += 1
         return frame
+
+    def _take_at_once(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+        """Take a frame with a camera that knows nothing of exposure and delay."""
+        return self._take(number, begin_ns, newest_pose(poses, begin_ns))
 
     def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, int]:
         """Take a checksum of the picture without its stamp, before the time of the stamp begins."""
