@@ -23,7 +23,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from lavt.config import SweepConfig, conditions, load_config, parse_config, shipped
+from lavt.config import SweepConfig
+from lavt.config_file import conditions, load_config, parse_config, shipped
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.sweep import run_all
 

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.experiment.plan import plan_run
 from lavt.experiment.record import Record, read_record
 from lavt.experiment.run import run_once

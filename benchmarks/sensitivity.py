@@ -17,7 +17,8 @@ from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lavt.config import SweepConfig, load_config, parse_config, shipped
+from lavt.config import SweepConfig
+from lavt.config_file import load_config, parse_config, shipped
 from lavt.control.drive_controller import Preset, find_preset
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.sweep import run_all

@@ -29,7 +29,8 @@ from typing import Any
 
 import cv2
 
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
 from lavt.experiment.plan import plan_run
 from lavt.experiment.virtual_run import VirtualLoop, build_loop, drive

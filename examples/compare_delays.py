@@ -9,7 +9,8 @@ import sys
 from pathlib import Path
 from tempfile import mkdtemp
 
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.experiment.plan import plan_run
 from lavt.experiment.run import run_once
 

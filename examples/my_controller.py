@@ -15,7 +15,8 @@ import sys
 from pathlib import Path
 from tempfile import mkdtemp
 
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.control.drive_controller import CONTROLLERS, Preset
 from lavt.domain import PATH_POINTS, Decision, Lane
 from lavt.experiment.plan import plan_run

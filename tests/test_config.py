@@ -20,13 +20,8 @@ from lavt.config import (
     Section,
     ServerConfig,
     SweepConfig,
-    condition,
-    conditions,
-    load_config,
-    parse_config,
-    parse_yaml,
-    shipped,
 )
+from lavt.config_file import condition, conditions, load_config, parse_config, parse_yaml, shipped
 from lavt.control.limits import LIMITS
 from lavt.errors import UserError
 from lavt.experiment.plan import plan_sweep

@@ -16,7 +16,7 @@ import pytest
 import lavt
 from lavt.cli import console
 from lavt.cli.main import app
-from lavt.config import shipped
+from lavt.config_file import shipped
 from lavt.experiment.results import IDENTITY
 from lavt.transport.zenoh_link import Router, quiet_logs
 

@@ -13,7 +13,8 @@ from lavt.build.sides import build_client
 from lavt.cli.main import app
 from lavt.cli.pictures import write_video
 from lavt.clock import MachineClock
-from lavt.config import ClientConfig, parse_config, shipped
+from lavt.config import ClientConfig
+from lavt.config_file import parse_config, shipped
 from lavt.domain import CameraModel
 from lavt.errors import UserError
 from lavt.perception.calibration import calibrated

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from lavt.build.fidelity import FIDELITIES
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_run

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from lavt.config import RunConfig, StudyConfig, SweepConfig, parse_config
+from lavt.config import RunConfig, StudyConfig, SweepConfig
+from lavt.config_file import parse_config
 from lavt.errors import UserError
 from lavt.experiment import plan
 from lavt.experiment.plan import PlannedRun, plan_run, plan_sweep

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from lavt.config import SweepConfig, load_config, shipped
+from lavt.config import SweepConfig
+from lavt.config_file import load_config, shipped
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.sweep import run_all
 

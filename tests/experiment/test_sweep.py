@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from lavt.clock import pause
-from lavt.config import RunConfig, SweepConfig, load_config, shipped
+from lavt.config import RunConfig, SweepConfig
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_run, plan_sweep

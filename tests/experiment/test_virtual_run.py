@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lavt.config import RunConfig, condition, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_S, Picture, Pose
 from lavt.experiment.metrics import driving_interval, measure
 from lavt.experiment.network import STAMP_TO_STAMP, injected_network, virtual_network
@@ -146,7 +147,8 @@ DIGEST = """
 import sys
 from pathlib import Path
 import cv2
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.experiment.plan import plan_run
 from lavt.experiment.virtual_run import build_loop, drive
 cv2.setNumThreads(1)

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from lavt.clock import MachineClock, pause
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.metrics import measure
 from lavt.experiment.plan import PlannedRun, plan_run

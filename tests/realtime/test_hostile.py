@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from lavt.clock import MachineClock, pause
-from lavt.config import shipped
+from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Command, SessionRequest
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import Process, Processes

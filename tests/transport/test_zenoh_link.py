@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from lavt.clock import MachineClock
-from lavt.config import shipped
+from lavt.config_file import shipped
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send

@@ -5,15 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from lavt.config import (
-    CalibrationConfig,
-    CameraConfig,
-    ClientCameraConfig,
-    ClientConfig,
-    RunConfig,
-    parse_config,
-    read_yaml,
-)
+from lavt.config import CalibrationConfig, CameraConfig, ClientCameraConfig, ClientConfig, RunConfig
+from lavt.config_file import parse_config, read_yaml
 from lavt.domain import CameraModel
 from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera, calibrated

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 from lavt.build.cameras import client_camera
 from lavt.build.vehicles import Plant, build_plant, build_unpictured
-from lavt.config import (
-    ClientConfig,
-    ServerConfig,
-)
+from lavt.config import ClientConfig, ServerConfig
 from lavt.nodes.driver import Detector
 from lavt.perception.lane_detector import LaneDetector
 from lavt.perception.lane_given import GivenLane

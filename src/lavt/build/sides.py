@@ -10,13 +10,7 @@ from lavt.build.addresses import resolved_address
 from lavt.build.entropy import Entropy
 from lavt.build.fidelity import VIDEO, Fidelity
 from lavt.build.vehicles import check_vehicle, looks_of
-from lavt.config import (
-    ClientConfig,
-    ControllerConfig,
-    SafetyConfig,
-    ServerConfig,
-    VehicleConfig,
-)
+from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
 from lavt.control.limiter import Limiter
 from lavt.control.limits import CLIENT_LIMITS, LIMITS, Limits

@@ -9,10 +9,7 @@ from importlib.metadata import entry_points
 import numpy as np
 
 from lavt.build.cameras import camera_model
-from lavt.config import (
-    ServerConfig,
-    VehicleConfig,
-)
+from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.nodes.reports import Route

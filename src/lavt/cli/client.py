@@ -13,7 +13,8 @@ from lavt.build.sides import build_client
 from lavt.cli import console
 from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
-from lavt.config import ClientConfig, load_config
+from lavt.config import ClientConfig
+from lavt.config_file import load_config
 
 
 def register(app: typer.Typer) -> None:

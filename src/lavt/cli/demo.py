@@ -12,7 +12,8 @@ from rich.table import Table
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.cli.progress import progress
-from lavt.config import RunConfig, SweepConfig, load_config, parse_config, shipped
+from lavt.config import RunConfig, SweepConfig
+from lavt.config_file import load_config, parse_config, shipped
 from lavt.experiment.directory import prepare_directory
 from lavt.experiment.plan import plan_run, plan_sweep
 from lavt.experiment.results import read_json

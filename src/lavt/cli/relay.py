@@ -10,7 +10,8 @@ import typer
 from lavt.build.addresses import resolved_address
 from lavt.cli import console
 from lavt.clock import MachineClock
-from lavt.config import DelayConfig, RelayConfig, load_config
+from lavt.config import DelayConfig, RelayConfig
+from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.transport.delay import DelayLaw, Lognormal
 from lavt.transport.relay import NONE, Flow, Relay, is_delayed_video, video_index

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
-from lavt.config import shipped, split_change
+from lavt.config_file import shipped, split_change
 
 
 def register(app: typer.Typer) -> None:

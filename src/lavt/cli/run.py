@@ -9,7 +9,8 @@ import typer
 
 from lavt.cli import console
 from lavt.cli.live_view import LiveView
-from lavt.config import RunConfig, load_config
+from lavt.config import RunConfig
+from lavt.config_file import load_config
 from lavt.experiment.directory import check_directory
 from lavt.experiment.plan import plan_run
 from lavt.experiment.run import run_once

@@ -12,7 +12,8 @@ from lavt.build.sides import build_server
 from lavt.cli import console
 from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
-from lavt.config import ServerConfig, load_config
+from lavt.config import ServerConfig
+from lavt.config_file import load_config
 from lavt.transport.clock_offset import kernel_identity
 
 

@@ -12,7 +12,8 @@ from lavt.build.entropy import MachineEntropy
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
-from lavt.config import ClientConfig, load_config
+from lavt.config import ClientConfig
+from lavt.config_file import load_config
 from lavt.domain import Now, SessionReply, SessionRequest
 from lavt.errors import WorkError
 from lavt.node import Send

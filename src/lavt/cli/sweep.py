@@ -9,7 +9,8 @@ import typer
 
 from lavt.cli import console
 from lavt.cli.progress import progress
-from lavt.config import SweepConfig, load_config
+from lavt.config import SweepConfig
+from lavt.config_file import load_config
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
 

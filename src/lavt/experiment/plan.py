@@ -10,7 +10,8 @@ from typing import Any
 
 from lavt.build.entropy import run_seed
 from lavt.build.sides import check_names
-from lavt.config import RunConfig, SweepConfig, condition, parse_config
+from lavt.config import RunConfig, SweepConfig
+from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 
 TAKEN = {"vehicle.route": "routes", "network.condition": "conditions"}

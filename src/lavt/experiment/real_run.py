@@ -14,7 +14,8 @@ import yaml
 from pydantic import BaseModel
 
 from lavt.clock import Clock, MachineClock, pause
-from lavt.config import DelayConfig, RelayConfig, condition
+from lavt.config import DelayConfig, RelayConfig
+from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.network import Network, injected_network

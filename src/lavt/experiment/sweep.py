@@ -16,7 +16,8 @@ from typing import Any
 import yaml
 
 from lavt.clock import MachineClock
-from lavt.config import RunConfig, SweepConfig, load_config
+from lavt.config import RunConfig, SweepConfig
+from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.experiment.directory import prepare_directory

@@ -12,7 +12,8 @@ from typing import Any
 from lavt.build.entropy import SeededEntropy
 from lavt.build.fidelity import FIDELITIES
 from lavt.build.sides import ClientNodes, ServerNodes, build_client, build_server
-from lavt.config import Costs, RunConfig, condition, load_config, shipped
+from lavt.config import Costs, RunConfig
+from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
 from lavt.experiment.directory import make_directory
 from lavt.experiment.network import Network, injected_network, virtual_network

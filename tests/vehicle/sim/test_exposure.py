@@ -10,7 +10,8 @@ import pytest
 from tests.nodes.stand_ins import MONO_NS, at, give, of
 from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 
-from lavt.config import RunConfig, load_config, shipped
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, Picture, Pose
 from lavt.experiment.plan import plan_run
 from lavt.experiment.record import read_record
