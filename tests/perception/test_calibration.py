@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.perception.lens import ground_points
 
 from lavt.perception.bird_eye import GroundGrid, bird_eye
-from lavt.perception.calibration import CalibratedCamera, axes, ground_points, picture_points
+from lavt.perception.calibration import CalibratedCamera, axes, picture_points
 
 COMMON_LENS = st.tuples(
     st.floats(-0.35, 0.2), st.floats(-0.05, 0.1), st.floats(-0.002, 0.002), st.floats(-0.002, 0.002), st.just(0.0)

@@ -4,10 +4,11 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.perception.conftest import BROKEN_LANE, FOUR_LANES, LANE, Line, Scene, centre_y_m, on_road
+from tests.perception.lens import ground_points
 
 from lavt.domain import CameraModel, Lane, Picture
 from lavt.perception.bird_eye import STAMP_SIDE_PX
-from lavt.perception.calibration import CalibratedCamera, calibrated, ground_points
+from lavt.perception.calibration import CalibratedCamera, calibrated
 from lavt.perception.lane_detector import FORGET_AFTER, SMOOTHING, TRACK_CONFIDENCE, LaneDetector
 
 MODEL = CameraModel()

@@ -120,17 +120,6 @@ def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray
     return pixels
 
 
-def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
-    """Tell which ground points the pixels (n, 2) of the distorted picture show.
-
-    (n, 2) in metres, NaN above the horizon.
-    """
-    rays = np.column_stack([_straightened(camera, pixels), np.ones(len(pixels))])
-    found = rays @ np.linalg.inv(ground_to_camera(camera)).T
-    # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.
-    return np.where(found[:, 2:] > 1e-9, found[:, :2] / np.where(found[:, 2:] > 1e-9, found[:, 2:], 1.0), np.nan)
-
-
 def _bent(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
     """Send rays, as points of the plane one deep (n, 2), through the lens: pixels (n, 2)."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.middle_px
@@ -153,18 +142,3 @@ def _seen_once(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
         for step in range(ALONG_RAY + 1)
     ]
     return np.asarray(np.all(np.diff(radii, axis=0) > 0, axis=0))
-
-
-def _straightened(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
-    """Undo `_bent`: pixels (n, 2) to points of the plane one deep (n, 2), by Newton's method."""
-    straight = (pixels - camera.middle_px) / camera.focal_px
-    if not camera.distortion:
-        return straight
-    rays, step = np.zeros_like(straight), 1e-6
-    for part in np.linspace(1 / ALONG_RAY, 1.0, ALONG_RAY):  # outwards from the axis, so that it finds the inner root
-        target = camera.middle_px + part * (pixels - camera.middle_px)
-        for _ in range(4):
-            here = _bent(camera, rays)
-            slopes = np.stack([(_bent(camera, rays + d) - here) / step for d in np.eye(2) * step], axis=-1)
-            rays = rays - np.linalg.solve(slopes, (here - target)[..., None])[..., 0]
-    return rays

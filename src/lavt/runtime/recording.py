@@ -79,10 +79,8 @@ UNRECORDED = frozenset(
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
     """Write down a message, if it belongs into the record."""
-    if channel in UNRECORDED:
-        return
-    read = WIRE.get(channel)
-    recorder.write(channel, payload if read is None else read(payload), now)
+    if channel not in UNRECORDED:
+        recorder.write(channel, as_written(channel, payload), now)
 
 
 def as_written(channel: str, payload: Any) -> Any:

@@ -1,0 +1,34 @@
+"""The way back through a lens, from a pixel to the ground: an inverse by other means than what it checks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.perception.calibration import ALONG_RAY, CalibratedCamera, _bent, ground_to_camera
+
+
+def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
+    """Tell which ground points the pixels (n, 2) of the distorted picture show.
+
+    (n, 2) in metres, NaN above the horizon.
+    """
+    rays = np.column_stack([straightened(camera, pixels), np.ones(len(pixels))])
+    found = rays @ np.linalg.inv(ground_to_camera(camera)).T
+    # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.
+    return np.where(found[:, 2:] > 1e-9, found[:, :2] / np.where(found[:, 2:] > 1e-9, found[:, 2:], 1.0), np.nan)
+
+
+def straightened(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
+    """Undo `_bent`: pixels (n, 2) to points of the plane one deep (n, 2), by Newton's method."""
+    straight = (pixels - camera.middle_px) / camera.focal_px
+    if not camera.distortion:
+        return straight
+    rays, step = np.zeros_like(straight), 1e-6
+    for part in np.linspace(1 / ALONG_RAY, 1.0, ALONG_RAY):  # outwards from the axis, so that it finds the inner root
+        target = camera.middle_px + part * (pixels - camera.middle_px)
+        for _ in range(4):
+            here = _bent(camera, rays)
+            slopes = np.stack([(_bent(camera, rays + d) - here) / step for d in np.eye(2) * step], axis=-1)
+            rays = rays - np.linalg.solve(slopes, (here - target)[..., None])[..., 0]
+    return rays
