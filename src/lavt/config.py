@@ -127,7 +127,7 @@ class NetworkConfig(Section):
 
     condition: str = "L0"
     inherent: Literal["loopback", "paper_wifi5"] = "loopback"
-    injection: Literal["relay", "none"] = "relay"
+    injection: Literal["relay", "netem", "none"] = "relay"
     state_delay: Literal["none", "with_video"] = "none"
 
 
@@ -248,6 +248,31 @@ class ZenohConfig(Section):
     """Endpoint of the router; empty: the one the file names."""
 
 
+class InjectionConfig(Section):
+    """How a side of two machines injects delay by `tc netem` into what its machine sends; it takes root."""
+
+    interface: str = ""
+    """The one towards the other machine; empty: this machine delays nothing."""
+    control_protocol: Literal["udp", "tcp"] = "udp"
+    """Of the link between the routers, and the port at which the vehicle's router listens."""
+    control_port: int = Field(7448, ge=1, le=65535)
+
+
+class ServerInjectionConfig(InjectionConfig):
+    """The server's: what it sends is delayed when a client asks for it."""
+
+    remote: bool = False
+    """Whether a client may: for a simulated vehicle at any time, for another one while it stands disarmed."""
+
+
+class ClientInjectionConfig(InjectionConfig):
+    """The client's: which condition it drives under."""
+
+    condition: str = ""
+    """Of `netem/conditions.yaml`; empty: the network is taken as it is."""
+    state_delay: Literal["none", "with_video"] = "none"
+
+
 class ServerVideoConfig(VideoConfig):
     """The video as the server sends it."""
 
@@ -265,6 +290,7 @@ class ServerConfig(Section):
     camera: CameraConfig = CameraConfig()
     video: ServerVideoConfig = ServerVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
+    injection: ServerInjectionConfig = ServerInjectionConfig()
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
     seed: int = Field(1, ge=0, lt=2**63)
@@ -288,6 +314,7 @@ class ClientConfig(Section):
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
+    injection: ClientInjectionConfig = ClientInjectionConfig()
     record: RecordConfig = RecordConfig()
 
 

@@ -225,6 +225,37 @@ class SessionRequest:
 
 
 @value
+class NetemRequest:
+    """A client's query to the server: what shall happen to what the vehicle's machine sends, and for how long."""
+
+    who: str
+    instance: int
+    """As in a `SessionRequest`."""
+    condition: str
+    """Its name, for the records."""
+    lease_ms: int
+    """Without another request everything is put back after so long."""
+    delay_ms: float
+    jitter_ms: float
+    jitter_correlation: float
+    jitter_distribution: str
+    loss: float
+    loss_burst_packets: float
+    rate_bps: int
+    reorder: float
+    state_delay_ms: float
+    """Of the state and the replies; all before it is the video's."""
+
+
+@value
+class NetemReply:
+    """The server's answer to a `NetemRequest`: whether the condition is in force."""
+
+    granted: bool
+    because: str
+
+
+@value
 class SessionReply:
     """The server's answer to a `SessionRequest`."""
 

@@ -53,16 +53,19 @@ class Drive:
     """From a frame's exposure to its stamp; None: the camera does not tell."""
     late: int = 0
     """So often the physics was late."""
+    began_s: float = 0.0
+    """When it was driven: so much later than others."""
 
     def server(self, at_ns: int) -> Now:
         """Read the server's clocks; its wall clock is the reference."""
-        return Now(SERVER_MONO_NS + at_ns, WALL_NS + at_ns)
+        return Now(SERVER_MONO_NS + at_ns, WALL_NS + round(self.began_s * NS_PER_S) + at_ns)
 
     def client(self, at_ns: int) -> Now:
         """Read the client's clocks: behind by the offset, and losing `drift` a second."""
         ticked = at_ns - round(at_ns * self.drift)
         step_ns = round(self.step_s * NS_PER_S) if at_ns > self.seconds * NS_PER_S / 2 else 0
-        return Now(CLIENT_MONO_NS + ticked, WALL_NS + ticked - round(self.offset_s * NS_PER_S) + step_ns)
+        wall_ns = WALL_NS + round((self.began_s - self.offset_s) * NS_PER_S)
+        return Now(CLIENT_MONO_NS + ticked, wall_ns + ticked + step_ns)
 
     def client_correction_s(self, at_ns: int) -> float:
         """Tell what a perfect time service on the client would."""

@@ -13,6 +13,18 @@ def new_session(*, rearm: bool = False) -> ClientSession:
     return ClientSession("alice", 7, rearm=rearm, start_ns=100)
 
 
+def test_it_waits_for_the_condition_of_the_network() -> None:
+    """A session that waits asks for nothing until the condition is in force, says why, and waits only once."""
+    session = ClientSession("alice", 7, rearm=False, start_ns=100, waits=True)
+    assert (session.next_wake_ns(), session.request_due(200)) == (None, None)
+    session.note_condition("the server does not delay the video: no")
+    assert (session.because, session.request_due(200)) == ("the server does not delay the video: no", None)
+    session.note_condition("")
+    assert session.request_due(200) is not None
+    session.note_condition("later")
+    assert (session.because, session.next_wake_ns()) == ("", 200 + NS_PER_S)
+
+
 def state(safety: SafetyState, speed_mps: float = 0.0) -> State:
     return State(1, 1, speed_mps, 0.0, "drive", safety, "because", -1, "")
 

@@ -15,7 +15,7 @@ from lavt.domain import Now
 from lavt.node import WAKE, Node
 from lavt.transport.channels import CHANNELS, QUEUE_LENGTH
 
-OUTSIDE_OF_THE_NODES = {"clock_source", "operator", "runtime"}
+OUTSIDE_OF_THE_NODES = {"clock_source", "injector", "operator", "runtime"}
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +83,9 @@ def test_table_names_nodes(nodes: Sequence[Node]) -> None:
 
 
 def test_everything_but_records_is_heard() -> None:
-    """A channel has a receiver unless it is written down only, or is a question to the host's source of time."""
+    """A channel has a receiver unless it is written down only, or is for the host's clock or queues."""
     deaf = {name for name, row in CHANNELS.items() if not row.receivers}
-    assert deaf == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {"clock_query"}
+    assert deaf == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {"clock_query", "inject"}
 
 
 def test_ground_truth_stays_on_the_server() -> None:

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.domain import PATH_POINTS, Command, SessionReply, SessionRequest, State
+from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.streams import stream
 from lavt.transport.messages import MAX_MESSAGE_BYTES, VERSION, decode, encode
 
-AnyMessage = Command | State | SessionRequest | SessionReply
+AnyMessage = Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply
 
 COMMAND = Command(
     epoch=7,
@@ -44,7 +44,25 @@ REQUEST = SessionRequest(operation="hold", who="operator-1", instance=2**64 - 1,
 REPLY = SessionReply(
     granted=True, because="", epoch=3, token=bytes(16), video_port=5600, host="a-b-c", emergency_stop=0
 )
-MESSAGES: dict[type, AnyMessage] = {type(each): each for each in (COMMAND, STATE, REQUEST, REPLY)}
+NETEM = NetemRequest(
+    who="operator-1",
+    instance=5,
+    condition="L4",
+    lease_ms=5000,
+    delay_ms=150.0,
+    jitter_ms=1.5,
+    jitter_correlation=0.25,
+    jitter_distribution="normal",
+    loss=0.01,
+    loss_burst_packets=3.0,
+    rate_bps=10**6,
+    reorder=0.0,
+    state_delay_ms=150.0,
+)
+NETEM_REPLY = NetemReply(granted=False, because="no")
+MESSAGES: dict[type, AnyMessage] = {
+    type(each): each for each in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)
+}
 
 U64 = st.integers(0, 2**64 - 1)
 TIME = st.integers(0, 2**63 - 1)
@@ -158,6 +176,7 @@ NOT_AN_INTEGER: list[Any] = [True, False, 1.0, NAN, "1", b"1", None, [], {}, -(2
 NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 - 1]
 NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
 NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
+NOT_A_NAME = [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {
@@ -189,7 +208,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     },
     SessionRequest: {
         "operation": [*NOT_A_TEXT, "", "steal"],
-        "who": [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"],
+        "who": NOT_A_NAME,
         "instance": [*NOT_AN_INTEGER, -1],
         "number": NOT_A_TIME,
     },
@@ -202,6 +221,22 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "host": [*NOT_A_TEXT, "x" * 65],
         "emergency_stop": NOT_A_TIME,
     },
+    NetemRequest: {
+        "who": NOT_A_NAME,
+        "instance": [*NOT_AN_INTEGER, -1],
+        "condition": [*NOT_A_TEXT, "x" * 33],
+        "lease_ms": [*NOT_AN_INTEGER, -1, 60_001],
+        "delay_ms": [*NOT_A_NUMBER, -0.1, 60_000.1],
+        "jitter_ms": [*NOT_A_NUMBER, -0.1, 60_000.1],
+        "jitter_correlation": [*NOT_A_NUMBER, -0.1, 1.1],
+        "jitter_distribution": [*NOT_A_TEXT, "", "gauss"],
+        "loss": [*NOT_A_NUMBER, -0.1, 1.1],
+        "loss_burst_packets": [*NOT_A_NUMBER, -0.1, 1000.1],
+        "rate_bps": [*NOT_AN_INTEGER, -1, 10**11 + 1],
+        "reorder": [*NOT_A_NUMBER, -0.1, 1.1],
+        "state_delay_ms": [*NOT_A_NUMBER, -0.1, 60_000.1],
+    },
+    NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "because": [*NOT_A_TEXT, "x" * 401]},
 }  # fmt: skip
 
 

@@ -117,12 +117,13 @@ def test_state(pair: Pair) -> None:
     pair.client_heard.next(("state", b"state\xff"), lambda: pair.server.send(Send("state", b"state\xff")))
 
 
-def test_session(pair: Pair) -> None:
+@pytest.mark.parametrize(("channel", "answer"), [("session", "session_reply"), ("netem", "netem_reply")])
+def test_queries(pair: Pair, channel: str, answer: str) -> None:
     """A client's question reaches the server, and the server's answer reaches the client who asked."""
-    question = Send("session", b"who holds?")
-    _, peer = pair.server_heard.next(("session", b"who holds?"), lambda: pair.client.send(question))
-    pair.server.send(Send("session_reply", b"you", peer))
-    pair.client_heard.next(("session_reply", b"you"))
+    question = Send(channel, b"who holds?")
+    _, peer = pair.server_heard.next((channel, b"who holds?"), lambda: pair.client.send(question))
+    pair.server.send(Send(answer, b"you", peer))
+    pair.client_heard.next((answer, b"you"))
 
 
 def test_answer_to_nobody(pair: Pair) -> None:

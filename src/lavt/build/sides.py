@@ -9,6 +9,7 @@ from functools import lru_cache
 from lavt.build.addresses import resolved_address
 from lavt.build.entropy import Entropy
 from lavt.build.fidelity import VIDEO, Fidelity
+from lavt.build.injection import injection_client, injection_node
 from lavt.build.vehicles import check_vehicle, looks_of
 from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
@@ -23,6 +24,7 @@ from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ClockSyncNode
 from lavt.nodes.driver import DriverNode
+from lavt.nodes.injection import InjectionClient, InjectionNode
 from lavt.nodes.receiver import ReceiverNode
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
@@ -36,11 +38,12 @@ class ServerNodes:
     camera: CameraNode
     actuator: ActuatorNode
     clock_sync: ClockSyncNode
+    injection: InjectionNode
 
     @property
     def all(self) -> Sequence[Node]:
         """All nodes, for a runtime."""
-        return (self.camera, self.actuator, self.clock_sync)
+        return (self.camera, self.actuator, self.clock_sync, self.injection)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +53,12 @@ class ClientNodes:
     receiver: ReceiverNode
     driver: DriverNode
     clock_sync: ClockSyncNode
+    injection: InjectionClient
 
     @property
     def all(self) -> Sequence[Node]:
         """All nodes, for a runtime."""
-        return (self.receiver, self.driver, self.clock_sync)
+        return (self.receiver, self.driver, self.clock_sync, self.injection)
 
 
 @lru_cache(maxsize=64)  # a sweep asks for each of its runs
@@ -143,6 +147,7 @@ def build_server(
             after_collision=config.vehicle.after_collision,
         ),
         ClockSyncNode(start.mono_ns),
+        injection_node(config.injection, simulated=able.simulated, video_port=video_port),
     )
 
 
@@ -154,12 +159,14 @@ def build_client(
     pictures, detector = fidelity.receiver(config), fidelity.detector(config)
     drive_controller = build_controller(controller)
     start = now()
+    instance = entropy.number(64)
     session = ClientSession(
         config.who,
-        entropy.number(64),
+        instance,
         rearm=controller.rearm,
         start_ns=start.mono_ns,
         clear_stop=controller.clear_emergency_stop,
+        waits=config.injection.condition != "",
     )
     return ClientNodes(
         ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
@@ -171,4 +178,5 @@ def build_client(
             CLIENT_LIMITS,
         ),
         ClockSyncNode(start.mono_ns),
+        injection_client(config.injection, config.who, instance, start.mono_ns),
     )

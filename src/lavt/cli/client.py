@@ -36,9 +36,7 @@ def client(
     console.take_precedence()
     settings = load_config(ClientConfig, config, changes or [])
     clock = MachineClock()
-    with Side(
-        "client", settings, out, clock, vehicle=settings.vehicle_id, who=settings.who, zenoh=settings.zenoh
-    ) as side:
+    with Side(settings, out, clock) as side:
         side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
         nodes = build_client(settings, clock.now, MachineEntropy())
         signal.signal(signal.SIGUSR1, lambda *_: side.tell("operator", "emergency_stop"))

@@ -37,6 +37,11 @@ def run(
     title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)
+    tell(result, out, as_json=as_json)
+
+
+def tell(result: dict[str, Any], out: Path, *, as_json: bool) -> None:
+    """Print the result of a run."""
     if as_json:
         console.show_json(result)
     else:

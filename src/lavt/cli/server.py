@@ -37,7 +37,7 @@ def server(
     console.take_precedence()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
-    with Side("server", settings, out, clock, vehicle=settings.vehicle_id, who="server", zenoh=settings.zenoh) as side:
+    with Side(settings, out, clock) as side:
         port = side.open_video("feedback", bind=(settings.video.bind, settings.video.port))
         nodes = build_server(settings, clock.now, MachineEntropy(), host=kernel_identity(), video_port=port)
         run_side(side, nodes.all, once=once, as_json=as_json, ready={"video_port": port})

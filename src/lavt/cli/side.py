@@ -12,7 +12,7 @@ import yaml
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
-from lavt.config import ClientConfig, ServerConfig, ZenohConfig
+from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import Now
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
@@ -24,6 +24,7 @@ from lavt.nodes.client_session import ClientSession
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.clock_offset import read_clock
+from lavt.transport.injector import Injector
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
@@ -42,18 +43,13 @@ class Side:
 
     def __init__(
         self,
-        name: Literal["server", "client"],
         config: ServerConfig | ClientConfig,
         out: Path | None,
         clock: MachineClock,
-        *,
-        vehicle: str,
-        who: str,
-        zenoh: ZenohConfig,
     ) -> None:
         self.clock = clock
         self.runtime: RealRuntime | None = None
-        self._name = name
+        self._name: Literal["server", "client"] = "client" if isinstance(config, ClientConfig) else "server"
         self._config = config
         self._out = out
         self._writer: RecordWriter | None = None
@@ -65,12 +61,13 @@ class Side:
         self._zenoh = ZenohLink(
             clock,
             self._deliver,
-            side=name,
-            path=find(Path(zenoh.session)),
-            router=zenoh.router,
-            vehicle=vehicle,
-            who=who,
+            side=self._name,
+            path=find(Path(config.zenoh.session)),
+            router=config.zenoh.router,
+            vehicle=config.vehicle_id,
+            who=config.who if isinstance(config, ClientConfig) else self._name,
         )
+        self._injector = Injector(clock, self._deliver, None)
         self.tap = LiveTap(NoRecorder())
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
@@ -87,7 +84,7 @@ class Side:
         self._queue = QueuedRecorder(self.tap)
         self.runtime = RealRuntime(self.clock, nodes, self._queue, read_clock)
         self._zenoh.start()
-        self.runtime.start({"video": self._udp, "zenoh": self._zenoh})
+        self.runtime.start({"video": self._udp, "zenoh": self._zenoh, "netem": self._injector})
         self._udp.start()
         return self.runtime
 
@@ -118,6 +115,7 @@ class Side:
             self.runtime.stop()
         if self._udp is not None:
             self._udp.close()
+        self._injector.close()
         self._zenoh.close()
         if self._queue is not None and self._udp is not None:
             for name, link in (("video", self._udp), ("zenoh", self._zenoh)):

@@ -133,7 +133,7 @@ class SafetyGate:
     def _hold(self, request: SessionRequest, vehicle: VehicleState) -> str:
         if self._holds(request):
             return ""
-        if self.holder is not None and (self.state in ACTIVE or not self.stands(vehicle)):
+        if self.holder is not None and not self.at_rest(vehicle):
             return f"held by {self.holder[0]}, and the vehicle is not disarmed at standstill"
         self.holder = (request.who, request.instance)
         self.token = self._new_token()
@@ -314,6 +314,10 @@ class SafetyGate:
 
     def _pedal(self, deceleration_mps2: float) -> float:
         return min(1.0, deceleration_mps2 / self.limiter.max_braking_mps2)
+
+    def at_rest(self, vehicle: VehicleState) -> bool:
+        """Whether the vehicle stands and nobody drives it or is about to."""
+        return self.state not in ACTIVE and self.stands(vehicle)
 
     def stands(self, vehicle: VehicleState) -> bool:
         """Whether the vehicle is at standstill."""

@@ -10,7 +10,7 @@ from lavt.control.safety import ACTIVE, SafetyGate, Verdict
 from lavt.domain import NS_PER_MS, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.reports import Admission, Event, FrameWritten, Route
+from lavt.nodes.reports import Admission, Event, FrameWritten, Rest, Route
 from lavt.transport.messages import decode, encode
 from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
@@ -86,6 +86,7 @@ class ActuatorNode:
         self._look_ns = start_ns
         self._pose_wanted = True
         self._ending: str | None = None
+        self._rest: Rest | None = None
         self._driving = False
         self.chains: Mapping[str, Sequence[Hop]] = {
             "control": (
@@ -206,6 +207,10 @@ class ActuatorNode:
         if told:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
+            rest = Rest(self.gate.at_rest(self.vehicle.state()), self.gate.holder)
+            if rest != self._rest:
+                self._rest = rest
+                sends.append(Send("rest", rest))
             if truth is not None:
                 sends.append(Send("truth", truth))
             if self._route is not None:

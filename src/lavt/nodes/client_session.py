@@ -16,10 +16,13 @@ ASK_PERIOD_NS = NS_PER_S
 class ClientSession:
     """Asks for the vehicle until it is granted, and again until the vehicle is armed: asking twice changes nothing.
 
-    With `rearm` it begins anew after a safe stop; with `clear_stop` it clears an emergency stop that it finds.
+    With `rearm` it begins anew after a safe stop; with `clear_stop` it clears an emergency stop that it finds. With
+    `waits` it does not ask before the network's condition is in force.
     """
 
-    def __init__(self, who: str, instance: int, *, rearm: bool, start_ns: int, clear_stop: bool = False) -> None:
+    def __init__(
+        self, who: str, instance: int, *, rearm: bool, start_ns: int, clear_stop: bool = False, waits: bool = False
+    ) -> None:
         self.phase: Phase = "seeking"
         self.epoch = 0
         self.emergency_stop = 0
@@ -31,6 +34,7 @@ class ClientSession:
         self._instance = instance
         self._rearm = rearm
         self._clear_stop = clear_stop
+        self._waits = waits
         self._ask_ns = start_ns
         self._highest_emergency_stop = 0
 
@@ -41,7 +45,7 @@ class ClientSession:
 
     def next_wake_ns(self) -> int | None:
         """When the next query is due."""
-        return self._ask_ns if self.phase in ("seeking", "arming") else None
+        return self._ask_ns if self.phase in ("seeking", "arming") and not self._waits else None
 
     def request_due(self, now_ns: int) -> SessionRequest | None:
         """Give the query that is due at `now_ns`."""
@@ -52,6 +56,11 @@ class ClientSession:
         if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
             return SessionRequest("clear_emergency_stop", self._who, self._instance, self._highest_emergency_stop)
         return SessionRequest("hold", self._who, self._instance, 0)
+
+    def note_condition(self, because: str) -> None:
+        """The network's condition is in force, or `because` says why it is not; once begun, it is not waited for."""
+        if self._waits:
+            self._waits, self.because = because != "", because
 
     def note_reply(self, reply: SessionReply, _now_ns: int) -> None:
         """Take over what the server granted, or why it did not."""

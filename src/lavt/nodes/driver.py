@@ -100,6 +100,7 @@ class DriverNode:
             "state": (("note", self._note_state),),
             "session_reply": (("note", self._note_reply),),
             "operator": (("stop", self._stop_now),),
+            "condition_in_force": (("note", self._note_condition),),
             WAKE: (("command", self._wake),),
         }
 
@@ -236,6 +237,9 @@ class DriverNode:
             return
         self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
         self.session.note_state(state, now.mono_ns)
+
+    def _note_condition(self, message: Message, _now: Now) -> None:
+        self.session.note_condition(message.payload)
 
     def _note_reply(self, message: Message, now: Now) -> list[Send]:
         try:

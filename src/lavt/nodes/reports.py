@@ -124,6 +124,28 @@ class PathToken:
 
 
 @value
+class Rest:
+    """Whether the vehicle stands and nobody drives it, and who holds it."""
+
+    at_rest: bool
+    holder: tuple[str, int] | None
+
+
+@value
+class InjectionSample:
+    """What this machine does to a flow that it sends, as asked and as measured; written at each change, and again."""
+
+    mono_ns: int
+    condition: str
+    """Empty: none is in force any more."""
+    flow: str
+    asked_ms: float
+    measured_ms: float | None
+    because: str
+    """Why it is not in force; empty: it is."""
+
+
+@value
 class ClockSample:
     """A clock report beside a reading of both clocks."""
 

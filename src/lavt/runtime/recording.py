@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
-from lavt.domain import Command, Now, SessionReply, SessionRequest, State
+from lavt.domain import Command, NetemReply, NetemRequest, Now, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 from lavt.transport.messages import decode
 from lavt.value import value
@@ -68,13 +68,18 @@ WIRE: dict[str, Callable[[bytes], object]] = {
     "state": _decoded(State),
     "session": _decoded(SessionRequest),
     "session_reply": _without_token,
+    "netem": _decoded(NetemRequest),
+    "netem_reply": _decoded(NetemReply),
 }
 """How the bytes of a channel that crosses the network are written down."""
 
 UNRECORDED = frozenset(
-    {"pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report"}
-)
-"""Written down elsewhere (the truth, the pictures' units, the clock samples), or secret."""
+    {
+        "pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report",
+        "rest", "condition_in_force", "inject", "injected",
+    }
+)  # fmt: skip
+"""Written down elsewhere (the truth, the pictures' units, the samples of clocks and queues), or secret."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:

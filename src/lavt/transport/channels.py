@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Carrier = Literal["local", "video", "zenoh", "clock", "record"]
+Carrier = Literal["local", "video", "zenoh", "clock", "netem", "record"]
 """local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. clock: the host's source
-of clock reports. record: nobody listens, it is written down."""
+of clock reports. netem: the host's own queues. record: nobody listens, it is written down."""
 
 Waiting = Literal["queue", "newest"]
 """queue: kept in order, the oldest dropped when full. newest: a new one replaces the one that waits."""
@@ -35,12 +35,14 @@ CHANNELS: dict[str, Channel] = {
     "pose": Channel("local", "actuator", ("camera",), "newest"),
     "frame": Channel("local", "camera", ("actuator",)),
     "video_token": Channel("local", "actuator", ("camera",)),
+    "rest": Channel("local", "actuator", ("injection",), "newest"),
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),
     "picture_lost": Channel("local", "driver", ("receiver",)),
     "operator": Channel("local", "operator", ("driver",)),  # a person asks for an emergency stop
     "path_token": Channel("local", "driver", ("receiver",)),
+    "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # across the network
     "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
     "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
@@ -48,9 +50,14 @@ CHANNELS: dict[str, Channel] = {
     "state": Channel("zenoh", "actuator", ("driver",), "newest"),
     "session": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
+    "netem": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
+    "netem_reply": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
     # each host and its own clock
     "clock_query": Channel("clock", "clock_sync"),
     "clock_report": Channel("local", "clock_source", ("clock_sync",)),
+    # each host and its own queues
+    "inject": Channel("netem", "injection"),
+    "injected": Channel("local", "injector", ("injection",)),
     # written down only
     "video": Channel("record", "camera"),
     "admission": Channel("record", "actuator"),
@@ -60,6 +67,7 @@ CHANNELS: dict[str, Channel] = {
     "picture": Channel("record", "driver"),
     "lane": Channel("record", "driver"),
     "clock": Channel("record", "clock_sync"),
+    "injection": Channel("record", "injection"),
     "counts": Channel("record", "runtime"),
     "timeline": Channel("record", "runtime"),
 }

@@ -16,13 +16,14 @@ from typing import Any, TypeVar
 
 import msgpack
 
-from lavt.domain import PATH_POINTS, Command, SessionReply, SessionRequest, State
+from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 
 VERSION = 1
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """What a vehicle and a client may be called: nothing that means something in a Zenoh key."""
+LONGEST_DELAY_MS = 60_000.0
 
 Check = Callable[[Any], bool]
 
@@ -42,6 +43,10 @@ def _text(longest: int) -> Check:
 
 def _one_of(*choices: str) -> Check:
     return lambda value: type(value) is str and value in choices
+
+
+def _name(value: object) -> bool:
+    return type(value) is str and NAME.match(value) is not None
 
 
 def _curvatures(value: object) -> bool:
@@ -88,7 +93,7 @@ CHECKS: dict[type, dict[str, Check]] = {
     },
     SessionRequest: {
         "operation": _one_of("hold", "release", "emergency_stop", "clear_emergency_stop"),
-        "who": lambda value: type(value) is str and NAME.match(value) is not None,
+        "who": _name,
         "instance": U64,
         "number": TIME,
     },
@@ -101,16 +106,32 @@ CHECKS: dict[type, dict[str, Check]] = {
         "host": _text(64),
         "emergency_stop": TIME,
     },
+    NetemRequest: {
+        "who": _name,
+        "instance": U64,
+        "condition": _text(32),
+        "lease_ms": _integer(0, 60_000),
+        "delay_ms": _number(0.0, LONGEST_DELAY_MS),
+        "jitter_ms": _number(0.0, LONGEST_DELAY_MS),
+        "jitter_correlation": UNIT,
+        "jitter_distribution": _one_of("uniform", "normal", "pareto", "paretonormal"),
+        "loss": UNIT,
+        "loss_burst_packets": _number(0.0, 1000.0),
+        "rate_bps": _integer(0, 10**11),
+        "reorder": UNIT,
+        "state_delay_ms": _number(0.0, LONGEST_DELAY_MS),
+    },
+    NetemReply: {"granted": lambda value: type(value) is bool, "because": _text(400)},
 }
 
 _FIELDS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*(field.name for field in fields(kind))) for kind in CHECKS
 }
 
-Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply)
+Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemRequest, NetemReply)
 
 
-def encode(message: Command | State | SessionRequest | SessionReply) -> bytes:
+def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
     """Put `message` into bytes for the wire."""
     packed: bytes = msgpack.packb([VERSION, *_FIELDS[type(message)](message)])
     return packed

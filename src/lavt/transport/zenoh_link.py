@@ -6,6 +6,7 @@ safety: after an outage it may deliver seconds of old commands, and its liveline
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import re
@@ -27,6 +28,9 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 ROUTER_READY_S = 5.0
+ANSWERS = {"session": "session_reply", "netem": "netem_reply"}
+"""The queries, by the last part of their keys, and what answers them."""
+ASKED = {answer: query for query, answer in ANSWERS.items()}
 QUERIES_KEPT = 64
 """So many queries wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
 CONTROL: dict[str, Any] = {
@@ -161,18 +165,18 @@ class ZenohLink:
         listener: Any = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
         self._publisher = self._session.declare_publisher(f"{self._base}/{said}", **qos)
         self._declared.append(self._session.declare_subscriber(f"{self._base}/{heard}", listener))
-        if self._side == "server":
-            asked = zenoh.handlers.Callback(self._asked, indirect=False)
-            self._declared.append(self._session.declare_queryable(f"{self._base}/session", asked))
+        for channel in ANSWERS if self._side == "server" else ():
+            asked: Any = zenoh.handlers.Callback(functools.partial(self._asked, channel), indirect=False)
+            self._declared.append(self._session.declare_queryable(f"{self._base}/{channel}", asked))
         self._declared.append(self._session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, send: Send) -> None:
         """Carry a message of this side; what cannot be sent now is counted, for there is always a newer one."""
         try:
-            if send.channel == "session":
-                self._ask(send.payload)
-            elif send.channel == "session_reply":
-                self._reply(send.peer, send.payload)
+            if send.channel in ANSWERS:
+                self._ask(send.channel, send.payload)
+            elif send.channel in ASKED:
+                self._reply(ASKED[send.channel], send.peer, send.payload)
             else:
                 self._publisher.put(send.payload)
         except zenoh.ZError:
@@ -187,20 +191,20 @@ class ZenohLink:
     def _hear(self, channel: str, sample: zenoh.Sample) -> None:
         self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
 
-    def _ask(self, payload: bytes) -> None:
-        answered = zenoh.handlers.Callback(self._answered, indirect=False)
+    def _ask(self, channel: str, payload: bytes) -> None:
+        answered: Any = zenoh.handlers.Callback(functools.partial(self._answered, channel), indirect=False)
         self._session.get(
-            f"{self._base}/session", answered, payload=payload, timeout=REPLY_TIMEOUT_S,
+            f"{self._base}/{channel}", answered, payload=payload, timeout=REPLY_TIMEOUT_S,
             consolidation=zenoh.ConsolidationMode.NONE,
         )  # fmt: skip
 
-    def _answered(self, reply: zenoh.Reply) -> None:
+    def _answered(self, channel: str, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
-            self._deliver("session_reply", reply.ok.payload.to_bytes(), self._clock.now(), None)
+            self._deliver(ANSWERS[channel], reply.ok.payload.to_bytes(), self._clock.now(), None)
         else:
-            self.counts["session_unanswered"] += 1
+            self.counts[f"{channel}_unanswered"] += 1
 
-    def _asked(self, query: zenoh.Query) -> None:
+    def _asked(self, channel: str, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         number = next(self._number)
         with self._queries_lock:
@@ -208,11 +212,11 @@ class ZenohLink:
             oldest = self._queries.pop(next(iter(self._queries))) if len(self._queries) > QUERIES_KEPT else None
         if oldest is not None:
             oldest.drop()
-        self._deliver("session", payload, self._clock.now(), number)
+        self._deliver(channel, payload, self._clock.now(), number)
 
-    def _reply(self, number: int, payload: bytes) -> None:
+    def _reply(self, channel: str, number: int, payload: bytes) -> None:
         with self._queries_lock:
             query = self._queries.pop(number, None)
         if query is not None:
-            query.reply(f"{self._base}/session", payload)
+            query.reply(f"{self._base}/{channel}", payload)
             query.drop()

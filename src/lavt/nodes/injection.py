@@ -1,0 +1,261 @@
+"""The network's condition: the client asks for it, and each side sees that its own machine's queues follow.
+
+A condition lasts as long as the client goes on asking for it: a lease that nobody renews ends, and everything is put
+back. Neither node touches a queue; the link that carries `inject` does, and tells what it measured.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+
+from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
+from lavt.errors import BadMessage
+from lavt.node import WAKE, Hop, Message, Peer, Send
+from lavt.nodes.reports import InjectionSample, Rest
+from lavt.transport.injector import Inject, Injected
+from lavt.transport.messages import decode, encode
+from lavt.transport.netem import Flow, Law, Protocol
+from lavt.value import value
+
+MEASURE_PERIOD_NS = 5 * NS_PER_S
+"""A condition in force is measured as often."""
+ASK_PERIOD_NS = NS_PER_S
+LEASE_MS = 5_000
+"""The client asks once a second: four may be lost."""
+LONGEST_BECAUSE = 300
+
+
+class _Queues:
+    """What this machine's queues were told, and whether they do it."""
+
+    def __init__(self) -> None:
+        self.flows: tuple[Flow, ...] = ()
+        self.condition = ""
+        self.in_force = False
+        self.measure_ns: int | None = None
+        self._number = 0
+
+    def tell(self, condition: str, flows: tuple[Flow, ...]) -> list[Send]:
+        self.condition, self.flows, self.in_force, self.measure_ns = condition, flows, False, None
+        self._number += 1
+        return self._inject()
+
+    def measure_when_due(self, now_ns: int) -> list[Send]:
+        if self.measure_ns is None or now_ns < self.measure_ns:
+            return []
+        self.measure_ns = None  # set anew by the answer
+        return self._inject()
+
+    def note(self, done: Injected, now: Now) -> list[Send] | None:
+        """Take in what became of the newest order; None where it was an older one."""
+        if done.number != self._number:
+            return None
+        self.in_force = done.because == ""
+        self.measure_ns = now.mono_ns + MEASURE_PERIOD_NS if self.condition and self.in_force else None
+        asked: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
+        measured = dict(done.measured_ms)
+        return [
+            Send(
+                "injection",
+                InjectionSample(now.mono_ns, self.condition, name, asked_ms, measured.get(name), done.because),
+            )
+            for name, asked_ms in asked.items()
+        ]
+
+    def _inject(self) -> list[Send]:
+        return [Send("inject", Inject(self._number, self.condition, self.flows))]
+
+
+@value
+class Lease:
+    """Who has the network's condition in hand, and until when."""
+
+    holder: tuple[str, int]
+    until_ns: int
+
+
+class InjectionNode:
+    """The server's: lets one client at a time say what happens to what this machine sends.
+
+    A vehicle that is not `simulated` must stand disarmed for a change; that a lease ends is never in its way.
+    """
+
+    name = "injection"
+
+    def __init__(
+        self,
+        *,
+        allowed: bool,
+        simulated: bool,
+        video_port: int,
+        control: tuple[Protocol, int],
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._allowed = allowed
+        self._simulated = simulated
+        self._video_port = video_port
+        self._control = control
+        self._queues = _Queues()
+        self._lease: Lease | None = None
+        self._rest = Rest(False, None)
+        self._waiting: list[Peer] = []
+        self.chains: Mapping[str, Sequence[Hop]] = {
+            "netem": (("answer", self._answer),),
+            "injected": (("note", self._note_injected),),
+            "rest": (("note", self._note_rest),),
+            WAKE: (("look", self._look),),
+        }
+
+    def next_wake_ns(self) -> int | None:
+        """When the lease ends, or the condition is measured again."""
+        ends_ns = None if self._lease is None else self._lease.until_ns
+        return _first(ends_ns, self._queues.measure_ns)
+
+    def _answer(self, message: Message, now: Now) -> list[Send]:
+        try:
+            request = decode(NetemRequest, message.payload)
+        except BadMessage:
+            self.counts["netem_requests_unreadable"] += 1
+            return []
+        flows = self._flows(request)
+        changes = flows != self._queues.flows or request.condition != self._queues.condition
+        refusal = self._refusal(request, changes=changes)
+        self.counts[f"netem {'refused' if refusal else 'granted'}"] += 1
+        if refusal:
+            return [_reply(refusal, message.peer)]
+        self._lease = Lease((request.who, request.instance), now.mono_ns + request.lease_ms * NS_PER_MS)
+        if not changes and self._queues.in_force:
+            return [_reply("", message.peer)]
+        self._waiting.append(message.peer)
+        return self._queues.tell(request.condition, flows) if changes else []
+
+    def _refusal(self, request: NetemRequest, *, changes: bool) -> str:
+        if not self._allowed:
+            return "this server lets nobody inject delay: its config must say injection.remote: true"
+        asking = (request.who, request.instance)
+        if self._lease is not None and self._lease.holder != asking:
+            return f"{self._lease.holder[0]} has the condition in hand until its lease ends"
+        if self._rest.holder is not None and self._rest.holder != asking:
+            return f"{self._rest.holder[0]} holds the vehicle"
+        if changes and not (self._simulated or self._rest.at_rest):
+            return "a vehicle that is not simulated must stand disarmed for this"
+        return ""
+
+    def _flows(self, request: NetemRequest) -> tuple[Flow, ...]:
+        video = Law(
+            request.delay_ms,
+            request.jitter_ms,
+            request.jitter_correlation,
+            request.jitter_distribution,  # type: ignore[arg-type]  # checked by `decode`
+            request.loss,
+            request.loss_burst_packets,
+            request.rate_bps,
+            request.reorder,
+        )
+        return _that_do_something(
+            Flow("video", "udp", self._video_port, "source", video),
+            Flow("state", *self._control, "source", Law(request.state_delay_ms)),
+        )
+
+    def _note_rest(self, message: Message, _now: Now) -> None:
+        self._rest = message.payload
+
+    def _note_injected(self, message: Message, now: Now) -> list[Send]:
+        done: Injected = message.payload
+        sends = self._queues.note(done, now)
+        if sends is None:
+            return []
+        waiting, self._waiting = self._waiting, []
+        if done.because:
+            self._lease = None
+            self.counts["netem_failed"] += 1
+        return [*sends, *(_reply(done.because, peer) for peer in waiting)]
+
+    def _look(self, _message: Message, now: Now) -> list[Send]:
+        if self._lease is not None and now.mono_ns >= self._lease.until_ns:
+            self._lease = None
+            self.counts["netem_leases_ended"] += 1
+            return self._queues.tell("", ())
+        return self._queues.measure_when_due(now.mono_ns)
+
+
+class InjectionClient:
+    """The client's: has the control delayed by its own machine, and asks the server for the rest, again and again.
+
+    The driver begins when both are in force; without a condition it need not wait.
+    """
+
+    name = "injection"
+
+    def __init__(
+        self,
+        who: str,
+        instance: int,
+        *,
+        condition: str,
+        control: Flow,
+        video: Law,
+        state_delay_ms: float,
+        start_ns: int,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self.because = "the network's condition is not in force yet" if condition else ""
+        self._condition = condition
+        self._flows = _that_do_something(control)
+        self._queues = _Queues()
+        law = asdict(video)
+        self._request = encode(NetemRequest(who, instance, condition, LEASE_MS, **law, state_delay_ms=state_delay_ms))
+        self._ask_ns: int | None = start_ns if condition else None
+        self._told = False
+        self.chains: Mapping[str, Sequence[Hop]] = {
+            "netem_reply": (("note", self._note_reply),),
+            "injected": (("note", self._note_injected),),
+            WAKE: (("ask", self._ask),),
+        }
+
+    def next_wake_ns(self) -> int | None:
+        """When the lease is renewed, or what this machine does is measured again."""
+        return _first(self._ask_ns, self._queues.measure_ns)
+
+    def _ask(self, _message: Message, now: Now) -> list[Send]:
+        sends = self._queues.measure_when_due(now.mono_ns)
+        if self._ask_ns is None or now.mono_ns < self._ask_ns:
+            return sends
+        self._ask_ns = now.mono_ns + ASK_PERIOD_NS
+        if not self._told:
+            self._told = True
+            return self._queues.tell(self._condition, self._flows)
+        return [*sends, Send("netem", self._request)] if self._queues.in_force else sends
+
+    def _note_injected(self, message: Message, now: Now) -> list[Send]:
+        done: Injected = message.payload
+        sends = self._queues.note(done, now)
+        if done.because:
+            self.because = f"this machine does not delay the control: {done.because}"
+            self.counts["netem_failed"] += 1
+        self._ask_ns = now.mono_ns
+        return sends or []
+
+    def _note_reply(self, message: Message, _now: Now) -> list[Send]:
+        try:
+            reply = decode(NetemReply, message.payload)
+        except BadMessage:
+            self.counts["netem_replies_unreadable"] += 1
+            return []
+        granted = reply.granted and self._queues.in_force
+        self.because = "" if granted else f"the server does not delay the video: {reply.because}"
+        return [Send("condition_in_force", self.because)]
+
+
+def _first(*times_ns: int | None) -> int | None:
+    return min((each for each in times_ns if each is not None), default=None)
+
+
+def _that_do_something(*flows: Flow) -> tuple[Flow, ...]:
+    return tuple(flow for flow in flows if flow.law != Law())
+
+
+def _reply(because: str, peer: Peer) -> Send:
+    return Send("netem_reply", encode(NetemReply(because == "", because[:LONGEST_BECAUSE])), peer)

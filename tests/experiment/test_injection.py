@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lavt.experiment.injection import recorded_reasons
+from lavt.experiment.record import Record
+from lavt.experiment.table import Table, table_of
+
+ASKED_MS = {"video": 150.0, "control": 75.0}
+BEGAN_S, ENDED_S = 10, 20
+Sample = tuple[float, str, str, float, float | None, str]
+VIDEO: list[Sample] = [(5, "L4", "video", 150.0, 150.2, ""), (15, "L4", "video", 150.0, 150.4, "")]
+CONTROL: list[Sample] = [(1, "L4", "control", 75.0, 75.1, "")]
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    mono_ns = [row["mono_ns"] for row in rows]
+    return table_of(rows, mono_ns, mono_ns)
+
+
+def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
+    keys = ("mono_ns", "condition", "flow", "asked_ms", "measured_ms", "because")
+    rows = [dict(zip(keys, (round(sample[0] * 1e9), *sample[1:]), strict=True)) for sample in samples]
+    tables = {"injection": table(rows)} if rows else {}
+    if drove:
+        events = (("drive_began", BEGAN_S, ""), ("ending", ENDED_S, "completed"))
+        tables["event"] = table([{"mono_ns": s * 10**9, "kind": kind, "detail": detail} for kind, s, detail in events])
+    return Record(Path("none"), True, tables, {})
+
+
+def reasons(video: Sequence[Sample], control: Sequence[Sample], asked_ms: Mapping[str, float] = ASKED_MS) -> list[str]:
+    return recorded_reasons(record(video, drove=True), record(control), "L4", asked_ms)
+
+
+def test_a_condition_that_was_in_force_all_the_time_is_no_reason() -> None:
+    """Both queues said before the drive that they do as asked, and nothing else until its end; after it all is free."""
+    assert reasons(VIDEO, CONTROL) == []
+    assert reasons([(2, "", "", 0.0, None, ""), *VIDEO, (21, "", "", 0.0, None, "")], CONTROL) == []
+
+
+@pytest.mark.parametrize(
+    ("video", "control", "said"),
+    [
+        ([], CONTROL, "the server did not say that condition L4 was in force"),
+        (VIDEO, [], "the client did not say that condition L4 was in force"),
+        (VIDEO[1:], CONTROL, "the server did not say that condition L4 was in force"),
+        ([*VIDEO, (18, "", "", 0.0, None, "")], CONTROL, "condition L4 was not in force on the server all the time"),
+        ([(5, "L5", "video", 225.0, 225.1, ""), *VIDEO[1:]], CONTROL, "condition L4 was not in force on the server all"),
+        ([VIDEO[0], (15, "L4", "video", 150.0, None, "no tc")], CONTROL, "on the server all the time: no tc"),
+        (VIDEO, [*CONTROL, (9, "L4", "control", 75.0, 75.1, "lost")], "not in force on the client all the time: lost"),
+        ([(5, "L4", "video", 150.0, 152.0, "")], CONTROL, "video was delayed by 152.0 ms where 150 ms was asked"),
+        (VIDEO, [(1, "L4", "control", 75.0, None, "")], "nobody measured the injected delay of control"),
+    ],
+)
+def test_each_way_of_not_being_in_force_is_a_reason(video: list[Sample], control: list[Sample], said: str) -> None:
+    """A side that says nothing before the drive, another condition, a failure or another delay makes the run invalid."""
+    assert [reason for reason in reasons(video, control) if said in reason]
+
+
+def test_what_was_not_asked_for_need_not_be_measured() -> None:
+    """Under a condition that delays the video only, nobody has to measure the control."""
+    assert reasons(VIDEO, [(1, "L4", "", 0.0, None, "")], {"video": 150.0, "control": 0.0}) == []

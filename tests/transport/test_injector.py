@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import queue
+from collections.abc import Sequence
+from typing import Any
+
+from lavt.clock import MachineClock
+from lavt.domain import Now
+from lavt.errors import UserError
+from lavt.node import Send
+from lavt.transport.injector import Inject, Injected, Injector
+from lavt.transport.netem import Flow, Law
+
+VIDEO = Flow("video", "udp", 5600, "source", Law(150.0))
+
+
+class NamedQueues:
+    """A stand-in for the kernel's queues, which have a test of their own in `tests/kernel`."""
+
+    def __init__(self, failure: str = "") -> None:
+        self.did: list[Any] = []
+        self._failure = failure
+
+    def apply(self, flows: Sequence[Flow], condition: str) -> None:
+        """Note it, or fail."""
+        if self._failure:
+            raise UserError(self._failure)
+        self.did.append((condition, tuple(flows)))
+
+    def measure_ms(self) -> dict[str, float | None]:
+        """Give what is always found."""
+        return {"video": 150.1}
+
+    def clear(self) -> None:
+        """Note it."""
+        self.did.append("clear")
+
+
+def ordered(queues: NamedQueues | None, *orders: Inject) -> list[Injected]:
+    """Give what an injector says of each order, having been closed."""
+    said: queue.Queue[Injected] = queue.Queue()
+
+    def deliver(_channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
+        said.put(payload)
+
+    injector = Injector(MachineClock(), deliver, queues)
+    for order in orders:
+        injector.send(Send("inject", order))
+    injector.close()
+    return [said.get_nowait() for _ in orders]
+
+
+def test_orders_are_done_in_order_measured_and_put_back_at_the_end() -> None:
+    """Each order is applied and measured, one without flows clears, and closing puts everything back."""
+    queues = NamedQueues()
+    said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
+    assert said == [Injected(1, "", (("video", 150.1),)), Injected(2, "", ())]
+    assert queues.did == [("L2", (VIDEO,)), "clear", "clear"]
+
+
+def test_a_failure_is_told() -> None:
+    """What the queues cannot do is told in their words, and does not end the side."""
+    assert ordered(NamedQueues("there is no tc"), Inject(1, "L2", (VIDEO,))) == [Injected(1, "there is no tc", ())]
+
+
+def test_without_an_interface_only_nothing_can_be_ordered() -> None:
+    """Where no interface is configured, a delay is refused with what to do, and none is granted."""
+    said = ordered(None, Inject(1, "L2", (VIDEO,)), Inject(2, "L0", ()))
+    assert said[0].because == "no interface is configured for it: set injection.interface"
+    assert said[1].because == ""
