@@ -57,14 +57,15 @@ RunCommand = Callable[[Command], str]
 
 NO_ROOT = "only root may change queues: run it with sudo, or use the relay, which needs no root"
 NO_NETEM = (
-    "this kernel has no netem, prio or u32: load them (`modprobe -a sch_netem sch_prio cls_u32`), use a kernel that has "
-    "them, or use the relay, which needs none"
+    "this kernel has no netem, prio or u32: load them (`modprobe -a sch_netem sch_prio cls_u32`), use a kernel that "
+    "has them, or use the relay, which needs none"
 )
 TELLING: Final = (
     ("Cannot find device", "there is no interface {interface}: `ip link` names those there are"),
     ("Operation not permitted", NO_ROOT),
     ("qdisc kind is unknown", NO_NETEM),
     ("TC classifier not found", NO_NETEM),
+    ("No distribution data", "tc has no table of this distribution: install iproute2 whole, or name another"),
     ("No such file or directory", NO_NETEM),
     ("Cannot send dump request", NO_NETEM),
 )

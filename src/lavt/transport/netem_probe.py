@@ -157,14 +157,10 @@ def _judge(probe: Probe, found: Measured | None) -> list[str]:
         spread_ms = found.p95_ms - found.p5_ms
         reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) where {law.jitter_ms:g} ms was asked")
     if not _is_share(found.lost, found.sent, law.loss, _clumping(law)):
-        reasons.append(
-            f"{name}: {found.lost} of {found.sent} packets were lost where a share of {law.loss:g} was asked"
-        )
+        reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost where {law.loss:.1%} was asked")
     arrived = found.sent - found.lost
     if not _is_share(found.early, arrived, law.reorder, 1.0):
-        reasons.append(
-            f"{name}: {found.early} of {arrived} packets overtook where a share of {law.reorder:g} was asked"
-        )
+        reasons.append(f"{name}: {found.early} of {arrived} packets overtook where {law.reorder:.1%} was asked")
     if found.reordered and not law.reorder:
         reasons.append(f"{name}: {found.reordered} packets were overtaken")
     return reasons

@@ -92,8 +92,8 @@ class StateFiles:
             lock = os.open(self.directory / "netem.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise UserError(
-                f"{self.directory} cannot be written ({error.strerror}): netem needs root; run it with sudo, or use the "
-                "relay, which needs none"
+                f"{self.directory} cannot be written ({error.strerror}): netem needs root; run it with sudo, or use "
+                "the relay, which needs none"
             ) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -145,7 +145,7 @@ def netem_arguments(law: Law) -> list[str]:
         words += ["loss", "random", f"{_plain(100 * law.loss)}%"]
     if law.reorder:
         words += ["reorder", f"{_plain(100 * law.reorder)}%"]
-    return [*words, "rate", f"{law.rate_bps or ORDER_RATE_BPS}bit"]
+    return [*words, "rate", f"{law.rate_bps}bit" if law.rate_bps else "10gbit"]
 
 
 def add_filter(interface: str, each: Filter) -> Command:
