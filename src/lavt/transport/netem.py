@@ -1,0 +1,135 @@
+"""What netem is to do: laws, the flows that they are for, and what is refused. `netem_tc.py` says it to tc."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Final, Literal
+
+from lavt.errors import UserError
+from lavt.value import value
+
+ORDER_RATE_BPS: Final = 10_000_000_000
+"""The rate of a flow without one: netem keeps order only where it has a rate. A packet costs a microsecond."""
+
+Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
+DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
+
+
+@value
+class Law:
+    """What happens to the packets of a flow; all zero is nothing."""
+
+    delay_ms: float = 0.0
+    jitter_ms: float = 0.0
+    """Standard deviation; of a uniform law the half width."""
+    jitter_correlation: float = 0.0
+    """Of the delay with itself 20 ms before; see `netem_wander.py`."""
+    jitter_distribution: Distribution = "normal"
+    loss: float = 0.0
+    loss_burst_packets: float = 0.0
+    """Mean length of a burst (Gilbert and Elliott's model); 0 or 1: each packet is lost by itself."""
+    rate_bps: int = 0
+    """0: no limit."""
+    reorder: float = 0.0
+    """Share of packets that are not delayed, and so overtake."""
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether nothing happens to a packet."""
+        return not (self.delay_ms or self.jitter_ms or self.loss or self.rate_bps or self.reorder)
+
+    @property
+    def longest_ms(self) -> float:
+        """A delay that next to no packet exceeds."""
+        return self.delay_ms + 4 * self.jitter_ms
+
+
+@value
+class Flow:
+    """Packets of one protocol from (`source`) or to (`destination`) a port, as one machine sends them."""
+
+    name: Literal["video", "control", "state"]
+    protocol: Literal["udp", "tcp"]
+    port: int
+    end: Literal["source", "destination"]
+    law: Law
+
+    @property
+    def words(self) -> str:
+        """The flow in words."""
+        return f"{self.name} ({self.protocol} {self.end} port {self.port})"
+
+
+@value
+class Port:
+    """A port that must never be held, and whose it is."""
+
+    protocol: Literal["udp", "tcp"]
+    port: int
+    whose: str
+
+
+NEVER: Final = (Port("udp", 123, "NTP"), Port("tcp", 22, "ssh"))
+"""Never held on any machine; the clock probe's port is added by whoever knows it."""
+
+
+def check_law(name: str, law: Law) -> None:
+    """Raise `UserError` for what netem cannot do."""
+    numbers = [getattr(law, each.name) for each in fields(law) if each.name != "jitter_distribution"]
+    if not all(math.isfinite(number) and number >= 0 for number in numbers):
+        raise UserError(f"{name}: no quantity of netem is below zero or infinite: correct {law}")
+    if max(law.loss, law.reorder, law.jitter_correlation) >= 1:
+        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {law}")
+    if law.jitter_distribution not in DISTRIBUTIONS:
+        raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
+    if law.jitter_ms > law.delay_ms:
+        raise UserError(
+            f"{name}: a jitter of {law.jitter_ms:g} ms on a delay of {law.delay_ms:g} ms would need delays below zero: "
+            "give a longer delay or less jitter"
+        )
+    if law.reorder and not law.delay_ms:
+        raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
+    if law.jitter_correlation and (law.jitter_distribution != "normal" or not law.jitter_ms):
+        raise UserError(f"{name}: correlated jitter is normal: give jitter_ms, and jitter_distribution normal")
+    if law.loss_burst_packets > 1 and gilbert(law)[0] > 1:
+        raise UserError(
+            f"{name}: a loss of {law.loss:g} in bursts of {law.loss_burst_packets:g} packets leaves no room between "
+            "them: give longer bursts or less loss"
+        )
+    if law.rate_bps and not 8 <= law.rate_bps <= ORDER_RATE_BPS:
+        raise UserError(f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {law.rate_bps}")
+
+
+def check_flows(flows: Sequence[Flow], never: Sequence[Port] = ()) -> None:
+    """Raise `UserError` for a law that netem cannot do, and for a flow that covers what must never be held."""
+    if not flows:
+        raise UserError("there is no flow to hold: name at least one")
+    taken: dict[tuple[str, int, str], Flow] = {}
+    for flow in flows:
+        check_law(flow.name, flow.law)
+        if not 1 <= flow.port <= 65_535:
+            raise UserError(f"{flow.name}: {flow.port} is no port: give one between 1 and 65535")
+        for port in (*NEVER, *never):
+            if (flow.protocol, flow.port) == (port.protocol, port.port):
+                raise UserError(
+                    f"{flow.words} would cover {port.whose} (port {port.port}), which must never be delayed: "
+                    "give one of the two another port"
+                )
+        other = taken.setdefault((flow.protocol, flow.port, flow.end), flow)
+        if other is not flow:
+            raise UserError(f"{flow.words} has the same packets as {other.words}: give one of the two another port")
+    if len({flow.name for flow in flows}) < len(flows):
+        raise UserError("two flows have one name: name each once")
+
+
+def bursts(law: Law) -> bool:
+    """Whether packets are lost in bursts."""
+    return law.loss > 0 and law.loss_burst_packets > 1
+
+
+def gilbert(law: Law) -> tuple[float, float]:
+    """Give the chances of a burst's begin and end at a packet that lead to a law's loss and mean burst."""
+    ends = 1 / law.loss_burst_packets
+    return law.loss * ends / (1 - law.loss), ends
