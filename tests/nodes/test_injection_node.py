@@ -16,6 +16,7 @@ from lavt.transport.netem import Flow, Law
 
 L4 = NetemRequest("alice", 7, "L4", LEASE_MS, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
 VIDEO = Flow("video", "udp", 5600, "source", Law(150.0))
+STATE = Flow("state", "udp", 7448, "source", Law())
 CONTROL = Flow("control", "udp", 7448, "destination", Law(75.0))
 STANDS = Rest(True, None)
 
@@ -30,7 +31,7 @@ def ask(node: InjectionNode, request: NetemRequest, after_ns: int = 0, peer: Any
 
 def done(node: InjectionNode | InjectionClient, number: int, because: str = "", after_ns: int = 0) -> list[Send]:
     measured = () if because else (("video", 150.2),)
-    return give(node, "injected", Injected(number, because, measured), at(after_ns))
+    return give(node, "injected", Injected(number, because, "", measured), at(after_ns))
 
 
 def refusals(sends: list[Send]) -> list[str]:
@@ -52,17 +53,20 @@ def in_force(request: NetemRequest = L4) -> InjectionNode:
 def test_a_condition_is_granted_when_the_queues_do_it() -> None:
     """The server's queues are told, and whoever asked is answered when they have said that they do it."""
     node = server()
-    assert ask(node, L4) == [Send("inject", Inject(1, "L4", (VIDEO,)))]
+    assert ask(node, L4) == [Send("inject", Inject(1, "L4", (VIDEO, STATE)))]
     sends = done(node, 1)
     assert refusals(sends) == [""]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
-    assert of(sends, "injection") == [InjectionSample(at(0).mono_ns, "L4", "video", 150.0, 150.2, "")]
+    assert of(sends, "injection") == [
+        InjectionSample(at(0).mono_ns, "L4", "video", 150.0, 150.2, ""),
+        InjectionSample(at(0).mono_ns, "L4", "state", 0.0, None, ""),
+    ]
 
 
 def test_the_state_goes_with_the_video_where_that_is_asked() -> None:
     """A state delay is that of what the server's router sends, from the port at which it listens."""
     [send] = ask(server(), replace(L4, state_delay_ms=150.0))
-    assert send.payload.flows == (VIDEO, Flow("state", "udp", 7448, "source", Law(150.0)))
+    assert send.payload.flows == (VIDEO, replace(STATE, law=Law(150.0)))
 
 
 def test_asking_again_renews_the_lease_and_changes_nothing() -> None:
@@ -80,16 +84,16 @@ def test_a_lease_that_is_not_renewed_clears_everything_and_somebody_else_may_ask
     bob = replace(L4, who="bob", instance=8)
     assert refusals(ask(node, bob, NS_PER_S)) == ["alice has the condition in hand until its lease ends"]
     assert give(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", Inject(2, "", ()))]
-    sends = give(node, "injected", Injected(2, "", ()), at(LEASE_MS * NS_PER_MS + 1))
+    sends = give(node, "injected", Injected(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
     assert of(sends, "injection") == [InjectionSample(at(LEASE_MS * NS_PER_MS + 1).mono_ns, "", "", 0.0, None, "")]
     assert node.next_wake_ns() is None
-    assert of(ask(node, bob, 6 * NS_PER_S), "inject") == [Inject(3, "L4", (VIDEO,))]
+    assert of(ask(node, bob, 6 * NS_PER_S), "inject") == [Inject(3, "L4", (VIDEO, STATE))]
 
 
 def test_a_change_of_the_condition_is_made_live() -> None:
     """Another condition by the same client is told to the queues, which change without being cleared in between."""
     [send] = ask(in_force(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
-    assert send == Send("inject", Inject(2, "L5", (replace(VIDEO, law=Law(225.0)),)))
+    assert send == Send("inject", Inject(2, "L5", (replace(VIDEO, law=Law(225.0)), STATE)))
 
 
 def test_what_is_in_force_is_measured_again_and_again() -> None:
@@ -97,14 +101,18 @@ def test_what_is_in_force_is_measured_again_and_again() -> None:
     node = in_force()
     ask(node, L4, 4 * NS_PER_S)
     again = give(node, WAKE, None, at(5 * NS_PER_S))
-    assert again == [Send("inject", Inject(1, "L4", (VIDEO,)))]
-    assert len(of(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 1
+    assert again == [Send("inject", Inject(1, "L4", (VIDEO, STATE)))]
+    assert len(of(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
 
 
 @pytest.mark.parametrize(
     ("settings", "rest", "said"),
     [
-        ({"allowed": False}, STANDS, "this server lets nobody inject delay: its config must say injection.remote: true"),
+        (
+            {"allowed": False},
+            STANDS,
+            "this server lets nobody inject delay: its config must say injection.remote: true",
+        ),
         ({"simulated": False}, Rest(False, None), "a vehicle that is not simulated must stand disarmed for this"),
         ({}, Rest(True, ("bob", 8)), "bob holds the vehicle"),
     ],
@@ -132,13 +140,21 @@ def test_a_real_vehicle_that_stands_may_have_its_network_changed_and_keeps_it_wh
     ]
 
 
+def test_what_is_measured_otherwise_than_asked_is_written_down_and_changes_nothing() -> None:
+    """A measurement that is not as asked goes into the record; the condition stays in force."""
+    node = in_force()
+    sends = give(node, "injected", Injected(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
+    assert of(sends, "injection")[0].because == "video was late"
+    assert refusals(ask(node, L4, NS_PER_S)) == [""]
+
+
 def test_queues_that_fail_are_told_and_the_lease_is_free() -> None:
     """Where the queues cannot do it, whoever asked hears why, the record too, and anybody may ask again."""
     node = server()
     ask(node, L4)
     sends = done(node, 1, because="there is no tc")
     assert refusals(sends) == ["there is no tc"]
-    assert of(sends, "injection") == [InjectionSample(at(0).mono_ns, "L4", "video", 150.0, None, "there is no tc")]
+    assert {sample.because for sample in of(sends, "injection")} == {"there is no tc"}
     assert of(ask(node, replace(L4, who="bob")), "netem_reply") == []
 
 
@@ -170,12 +186,12 @@ def asking(control: Flow = CONTROL) -> InjectionClient:
 
 
 def test_the_client_delays_its_own_control_first_and_then_asks_once_a_second() -> None:
-    """The server is asked when this machine's queue is in force, and once a second from then on; the driver may begin."""
+    """The server is asked when this machine's queue is in force, and once a second from then on; then it may begin."""
     client = asking()
     assert client.next_wake_ns() == at(0).mono_ns
     assert give(client, WAKE, None, at(0)) == [Send("inject", Inject(1, "L4", (CONTROL,)))]
     assert of(give(client, WAKE, None, at(NS_PER_S)), "netem") == []
-    give(client, "injected", Injected(1, "", (("control", 75.1),)), at(NS_PER_S))
+    give(client, "injected", Injected(1, "", "", (("control", 75.1),)), at(NS_PER_S))
     [payload] = of(give(client, WAKE, None, at(NS_PER_S)), "netem")
     assert decode(NetemRequest, payload) == L4
     assert client.next_wake_ns() == at(2 * NS_PER_S).mono_ns
@@ -188,14 +204,9 @@ def test_a_refusal_is_told_to_the_driver() -> None:
     """Where the server refuses, the driver is told why, and the server is asked again."""
     client = asking()
     give(client, WAKE, None, at(0))
-    give(client, "injected", Injected(1, "", ()), at(0))
+    give(client, "injected", Injected(1, "", "", ()), at(0))
     refused = give(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
     assert refused == [Send("condition_in_force", "the server does not delay the video: no")]
-
-
-def test_a_control_that_is_not_delayed_needs_no_queue() -> None:
-    """Under a condition without control delay the client's queues are told to do nothing."""
-    assert give(asking(replace(CONTROL, law=Law())), WAKE, None, at(0)) == [Send("inject", Inject(1, "L4", ()))]
 
 
 def test_without_a_condition_nothing_is_asked() -> None:

@@ -9,9 +9,13 @@ from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.injector import Inject, Injected, Injector
-from lavt.transport.netem import Flow, Law
+from lavt.transport.netem import Flow, Law, Port
+from lavt.transport.netem_control import Verified
+from lavt.transport.netem_probe import Measured
 
 VIDEO = Flow("video", "udp", 5600, "source", Law(150.0))
+NOTHING = Flow("video", "udp", 5600, "source", Law())
+PROBE = Port("udp", 5602, "the clock probe")
 
 
 class NamedQueues:
@@ -21,15 +25,16 @@ class NamedQueues:
         self.did: list[Any] = []
         self._failure = failure
 
-    def apply(self, flows: Sequence[Flow], condition: str) -> None:
+    def apply(self, flows: Sequence[Flow], *, never: Sequence[Port], condition: str) -> None:
         """Note it, or fail."""
         if self._failure:
             raise UserError(self._failure)
-        self.did.append((condition, tuple(flows)))
+        self.did.append((condition, tuple(flows), tuple(never)))
 
-    def measure_ms(self) -> dict[str, float | None]:
-        """Give what is always found."""
-        return {"video": 150.1}
+    def verify(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> Verified:
+        """Give what is always found, beside what is asked about."""
+        self.did.append(("verify", tuple(flows), tuple(never)))
+        return Verified(["read back otherwise"], {"video": Measured(count, 0, 0, 0, 150.0, 150.1, 150.2)})
 
     def clear(self) -> None:
         """Note it."""
@@ -43,7 +48,7 @@ def ordered(queues: NamedQueues | None, *orders: Inject) -> list[Injected]:
     def deliver(_channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         said.put(payload)
 
-    injector = Injector(MachineClock(), deliver, queues)
+    injector = Injector(MachineClock(), deliver, queues, [PROBE])
     for order in orders:
         injector.send(Send("inject", order))
     injector.close()
@@ -54,17 +59,17 @@ def test_orders_are_done_in_order_measured_and_put_back_at_the_end() -> None:
     """Each order is applied and measured, one without flows clears, and closing puts everything back."""
     queues = NamedQueues()
     said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
-    assert said == [Injected(1, "", (("video", 150.1),)), Injected(2, "", ())]
-    assert queues.did == [("L2", (VIDEO,)), "clear", "clear"]
+    assert said == [Injected(1, "", "read back otherwise", (("video", 150.1),)), Injected(2, "", "", ())]
+    assert queues.did == [("L2", (VIDEO,), (PROBE,)), ("verify", (VIDEO,), (PROBE,)), "clear", "clear"]
 
 
 def test_a_failure_is_told() -> None:
     """What the queues cannot do is told in their words, and does not end the side."""
-    assert ordered(NamedQueues("there is no tc"), Inject(1, "L2", (VIDEO,))) == [Injected(1, "there is no tc", ())]
+    assert ordered(NamedQueues("there is no tc"), Inject(1, "L2", (VIDEO,))) == [Injected(1, "there is no tc", "", ())]
 
 
 def test_without_an_interface_only_nothing_can_be_ordered() -> None:
     """Where no interface is configured, a delay is refused with what to do, and none is granted."""
-    said = ordered(None, Inject(1, "L2", (VIDEO,)), Inject(2, "L0", ()))
+    said = ordered(None, Inject(1, "L2", (VIDEO,)), Inject(2, "L0", (NOTHING,)))
     assert said[0].because == "no interface is configured for it: set injection.interface"
     assert said[1].because == ""

@@ -60,9 +60,7 @@ NETEM = NetemRequest(
     state_delay_ms=150.0,
 )
 NETEM_REPLY = NetemReply(granted=False, because="no")
-MESSAGES: dict[type, AnyMessage] = {
-    type(each): each for each in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)
-}
+MESSAGES: dict[type, AnyMessage] = {type(each): each for each in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)}
 
 U64 = st.integers(0, 2**64 - 1)
 TIME = st.integers(0, 2**63 - 1)

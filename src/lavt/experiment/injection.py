@@ -1,4 +1,7 @@
-"""Whether the delay that two machines injected was what was asked, from what their queues measured of themselves."""
+"""Whether the delay that two machines injected was what was asked, from what they measured of their own queues.
+
+Each sample was judged when it was taken (`transport/netem_probe.judge`): here it counts when, and of which condition.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ import numpy as np
 from lavt.experiment.metrics import driving_interval
 from lavt.experiment.record import Record
 from lavt.experiment.table import Table
-from lavt.experiment.validity import injection_reasons
 
 SENT_BY = {"video": "server", "control": "client"}
 """Whose queue delays it."""
@@ -34,9 +36,9 @@ def recorded_reasons(server: Record, client: Record, condition: str, asked_ms: M
             reasons.append(f"the {side} did not say that condition {condition} was in force")
         elif others or doubts:
             because = f": {doubts[0]}" if doubts else ""
-            reasons.append(f"condition {condition} was not in force on the {side} all the time{because}")
-    measured_ms = {flow: _median_ms(samples[side], flow) for flow, side in SENT_BY.items()}
-    return reasons + injection_reasons({flow: ms for flow, ms in asked_ms.items() if ms}, measured_ms)
+            reasons.append(f"condition {condition} was not in force as asked on the {side} all the time{because}")
+    unmeasured = [flow for flow, side in SENT_BY.items() if asked_ms[flow] and not _is_measured(samples[side], flow)]
+    return reasons + [f"nobody measured the injected delay of {flow}" for flow in unmeasured]
 
 
 def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
@@ -47,8 +49,6 @@ def _in_force(table: Table, began_ns: int, ended_ns: int) -> Table:
     return table.where((mono_ns >= first_ns) & (mono_ns <= ended_ns))
 
 
-def _median_ms(table: Table, flow: str) -> float | None:
+def _is_measured(table: Table, flow: str) -> bool:
     chosen = np.array([each == flow for each in table.texts("flow")], np.bool_)
-    measured_ms = table.where(chosen).floats("measured_ms")
-    known = measured_ms[np.isfinite(measured_ms)]
-    return float(np.median(known)) if len(known) else None
+    return bool(np.isfinite(table.where(chosen).floats("measured_ms")).any())

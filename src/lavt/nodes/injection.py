@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage
@@ -16,7 +17,7 @@ from lavt.node import WAKE, Hop, Message, Peer, Send
 from lavt.nodes.reports import InjectionSample, Rest
 from lavt.transport.injector import Inject, Injected
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem import Flow, Law, Protocol
+from lavt.transport.netem import Flow, Law
 from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
@@ -54,14 +55,16 @@ class _Queues:
             return None
         self.in_force = done.because == ""
         self.measure_ns = now.mono_ns + MEASURE_PERIOD_NS if self.condition and self.in_force else None
-        asked: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
-        measured = dict(done.measured_ms)
+        asked_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
+        measured_ms = dict(done.measured_ms)
         return [
             Send(
                 "injection",
-                InjectionSample(now.mono_ns, self.condition, name, asked_ms, measured.get(name), done.because),
+                InjectionSample(
+                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.because or done.doubts
+                ),
             )
-            for name, asked_ms in asked.items()
+            for name, each_ms in asked_ms.items()
         ]
 
     def _inject(self) -> list[Send]:
@@ -90,7 +93,7 @@ class InjectionNode:
         allowed: bool,
         simulated: bool,
         video_port: int,
-        control: tuple[Protocol, int],
+        control: tuple[Literal["udp", "tcp"], int],
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._allowed = allowed
@@ -133,7 +136,7 @@ class InjectionNode:
 
     def _refusal(self, request: NetemRequest, *, changes: bool) -> str:
         if not self._allowed:
-            return "this server lets nobody inject delay: its config must say injection.remote: true"
+            return "this server lets nobody inject delay: set injection.remote: true in its config"
         asking = (request.who, request.instance)
         if self._lease is not None and self._lease.holder != asking:
             return f"{self._lease.holder[0]} has the condition in hand until its lease ends"
@@ -154,7 +157,7 @@ class InjectionNode:
             request.rate_bps,
             request.reorder,
         )
-        return _that_do_something(
+        return (
             Flow("video", "udp", self._video_port, "source", video),
             Flow("state", *self._control, "source", Law(request.state_delay_ms)),
         )
@@ -203,7 +206,7 @@ class InjectionClient:
         self.counts: Counter[str] = Counter()
         self.because = "the network's condition is not in force yet" if condition else ""
         self._condition = condition
-        self._flows = _that_do_something(control)
+        self._control = control
         self._queues = _Queues()
         law = asdict(video)
         self._request = encode(NetemRequest(who, instance, condition, LEASE_MS, **law, state_delay_ms=state_delay_ms))
@@ -226,7 +229,7 @@ class InjectionClient:
         self._ask_ns = now.mono_ns + ASK_PERIOD_NS
         if not self._told:
             self._told = True
-            return self._queues.tell(self._condition, self._flows)
+            return self._queues.tell(self._condition, (self._control,))
         return [*sends, Send("netem", self._request)] if self._queues.in_force else sends
 
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
@@ -251,10 +254,6 @@ class InjectionClient:
 
 def _first(*times_ns: int | None) -> int | None:
     return min((each for each in times_ns if each is not None), default=None)
-
-
-def _that_do_something(*flows: Flow) -> tuple[Flow, ...]:
-    return tuple(flow for flow in flows if flow.law != Law())
 
 
 def _reply(because: str, peer: Peer) -> Send:

@@ -142,7 +142,7 @@ class InjectionSample:
     asked_ms: float
     measured_ms: float | None
     because: str
-    """Why it is not in force; empty: it is."""
+    """Why it is not in force, or what was measured to be otherwise than asked; empty: all is well."""
 
 
 @value

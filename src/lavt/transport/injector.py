@@ -12,10 +12,15 @@ from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import LavtError
 from lavt.node import Send
-from lavt.transport.netem import Flow
+from lavt.transport.netem import Flow, Port
+from lavt.transport.netem_control import Verified
 from lavt.value import value
 
 Deliver = Callable[[str, Any, Now, Any], None]
+
+FRAMES = 20
+"""So many measure a flow, in a fifth of a second."""
+NO_INTERFACE = "no interface is configured for it: set injection.interface"
 
 log = logging.getLogger(__name__)
 
@@ -31,36 +36,44 @@ class Inject:
 
 @value
 class Injected:
-    """What became of an order: empty `because`, and it is in force; and for each flow the median that was measured."""
+    """What became of an order."""
 
     number: int
     because: str
+    """Why it is not in force; empty: it is."""
+    doubts: str
+    """What was measured to be otherwise than asked."""
     measured_ms: tuple[tuple[str, float | None], ...]
+    """The median of each flow."""
 
 
 class Queues(Protocol):
     """What can delay what this machine sends."""
 
-    def apply(self, flows: Sequence[Flow], condition: str) -> None:
+    def apply(self, flows: Sequence[Flow], *, never: Sequence[Port], condition: str) -> object:
         """Put flows in force, or change them; raises `LavtError`."""
         ...
 
-    def measure_ms(self) -> dict[str, float | None]:
-        """Tell the median delay of each flow."""
+    def verify(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> Verified:
+        """Measure what happens to packets of flows, and of what must not be held."""
         ...
 
-    def clear(self) -> None:
+    def clear(self) -> object:
         """Put everything back."""
         ...
 
 
 class Injector:
-    """Does one order after the other, where there are `queues`; without them only having none can be ordered."""
+    """Does one order after the other, where there are `queues`; without them only no delay can be ordered.
 
-    def __init__(self, clock: Clock, deliver: Deliver, queues: Queues | None) -> None:
+    `never` are ports that no order may cover.
+    """
+
+    def __init__(self, clock: Clock, deliver: Deliver, queues: Queues | None, never: Sequence[Port] = ()) -> None:
         self._clock = clock
         self._deliver = deliver
         self._queues = queues
+        self._never = tuple(never)
         self._orders: queue.Queue[Inject | None] = queue.Queue()
         self._thread = threading.Thread(target=self._work, name="injector", daemon=True)
         self._thread.start()
@@ -81,17 +94,19 @@ class Injector:
 
     def _work(self) -> None:
         while (order := self._orders.get()) is not None:
-            because, measured = self._do(order)
-            self._deliver("injected", Injected(order.number, because, measured), self._clock.now(), None)
+            self._deliver("injected", self._do(order), self._clock.now(), None)
 
-    def _do(self, order: Inject) -> tuple[str, tuple[tuple[str, float | None], ...]]:
+    def _do(self, order: Inject) -> Injected:
+        flows = order.flows
         if self._queues is None:
-            return ("no interface is configured for it: set injection.interface" if order.flows else ""), ()
+            return Injected(order.number, "" if all(flow.law.is_nothing for flow in flows) else NO_INTERFACE, "", ())
         try:
-            if not order.flows:
+            if not flows:
                 self._queues.clear()
-                return "", ()
-            self._queues.apply(order.flows, order.condition)
-            return "", tuple(self._queues.measure_ms().items())
+                return Injected(order.number, "", "", ())
+            self._queues.apply(flows, never=self._never, condition=order.condition)
+            found = self._queues.verify(flows, never=self._never, count=FRAMES)
         except LavtError as error:
-            return str(error), ()
+            return Injected(order.number, str(error), "", ())
+        measured_ms = tuple((flow.name, found.measured[flow.name].median_ms) for flow in flows)
+        return Injected(order.number, "", "; ".join(found.reasons), measured_ms)
