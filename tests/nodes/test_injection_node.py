@@ -111,7 +111,7 @@ def test_what_is_in_force_is_measured_again_and_again() -> None:
         (
             {"allowed": False},
             STANDS,
-            "this server lets nobody inject delay: its config must say injection.remote: true",
+            "this server lets nobody inject delay: set injection.remote: true in its config",
         ),
         ({"simulated": False}, Rest(False, None), "a vehicle that is not simulated must stand disarmed for this"),
         ({}, Rest(True, ("bob", 8)), "bob holds the vehicle"),
