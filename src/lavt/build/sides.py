@@ -21,7 +21,7 @@ from lavt.node import Node
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.clock_sync import ClockSyncNode
+from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.receiver import ReceiverNode
 from lavt.transport.reorder import ReorderBuffer
@@ -170,5 +170,5 @@ def build_client(
             session,
             CLIENT_LIMITS,
         ),
-        ClockSyncNode(start.mono_ns),
+        ProbingClockSyncNode(start.mono_ns),
     )

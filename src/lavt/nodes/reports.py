@@ -121,15 +121,3 @@ class PathToken:
 
     token: bytes
     port: int
-
-
-@value
-class ClockSample:
-    """A clock report beside a reading of both clocks."""
-
-    mono_ns: int
-    wall_ns: int
-    host: str
-    source: str
-    correction_s: float
-    bound_s: float | None

@@ -72,9 +72,12 @@ WIRE: dict[str, Callable[[bytes], object]] = {
 """How the bytes of a channel that crosses the network are written down."""
 
 UNRECORDED = frozenset(
-    {"pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report"}
-)
-"""Written down elsewhere (the truth, the pictures' units, the clock samples), or secret."""
+    {
+        "pose", "view", "video_token", "path_token", "access_unit", "picture_lost",
+        "clock_query", "clock_report", "probe_request", "probe_reply",
+    }
+)  # fmt: skip
+"""Written down elsewhere (the truth, the pictures' units, clock samples and exchanges), or secret."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
