@@ -273,6 +273,34 @@ class ClientInjectionConfig(InjectionConfig):
     state_delay: Literal["none", "with_video"] = "none"
 
 
+class ClockConfig(Section):
+    """Who says how far this machine's clock is off, and where the clocks of both machines are compared."""
+
+    source: Literal["chrony", "ptp", "external", "probe"] = "chrony"
+    """probe: nobody says it, the offset is the probe's alone."""
+    correction_ms: float | None = Field(None, ge=-86_400_000, le=86_400_000)
+    """With `external`: reference time less this machine's wall clock."""
+    bound_ms: float | None = Field(None, ge=0, le=86_400_000)
+    """With `external`: how far the correction can be from the truth."""
+    probe_port: int = Field(5602, ge=0, le=65535)
+    """The server's UDP port for the probe; nothing may delay it."""
+
+    @model_validator(mode="after")
+    def _external(self) -> ClockConfig:
+        given = [self.correction_ms is not None, self.bound_ms is not None]
+        if self.source == "external" and not all(given):
+            raise ValueError("source external needs correction_ms and bound_ms")
+        if self.source != "external" and any(given):
+            raise ValueError("correction_ms and bound_ms belong to source external: set it, or leave them out")
+        return self
+
+
+class ClientClockConfig(ClockConfig):
+    """The same on the client, which must know the server's port."""
+
+    probe_port: int = Field(5602, ge=1, le=65535)
+
+
 class ServerVideoConfig(VideoConfig):
     """The video as the server sends it."""
 
@@ -291,6 +319,7 @@ class ServerConfig(Section):
     video: ServerVideoConfig = ServerVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
     injection: ServerInjectionConfig = ServerInjectionConfig()
+    clock: ClockConfig = ClockConfig()
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
     seed: int = Field(1, ge=0, lt=2**63)
@@ -315,6 +344,7 @@ class ClientConfig(Section):
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
     injection: ClientInjectionConfig = ClientInjectionConfig()
+    clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()
 
 

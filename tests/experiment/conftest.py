@@ -13,6 +13,7 @@ import pytest
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, Now
 from lavt.experiment.record import RecordWriter
 from lavt.nodes.reports import VideoUnit
+from lavt.transport.clock_probe import ClockProbe
 
 WALL_NS = 1_700_000_000_000_000_000
 SERVER_MONO_NS = 1_000 * NS_PER_S
@@ -51,6 +52,14 @@ class Drive:
     client_unpolled_s: tuple[int, int] = (0, 0)
     capture_ms: float | None = None
     """From a frame's exposure to its stamp; None: the camera does not tell."""
+    server_clock: tuple[tuple[str, Any], ...] = ()
+    """Further fields of the server's clock samples, or others than the usual."""
+    client_clock: tuple[tuple[str, Any], ...] = ()
+    probes: bool = True
+    """Whether the client's probe was answered, five times a second."""
+    there_ms: float = 0.3
+    """How long a probe took to the server."""
+    back_ms: float = 0.3
     late: int = 0
     """So often the physics was late."""
     began_s: float = 0.0
@@ -96,7 +105,8 @@ def write_server(drive: Drive, path: Path) -> None:
             continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
-        writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.server_clock)}
+        writer.write("clock", given, now)
     writer.write("event", {"mono_ns": drive.server(0).mono_ns, "kind": "drive_began", "detail": ""}, drive.server(0))
     writer.write(
         "event", {"mono_ns": drive.server(5).mono_ns, "kind": "lane_invasion", "detail": "left"}, drive.server(5)
@@ -189,7 +199,10 @@ def write_client(drive: Drive, path: Path) -> None:
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
-        writer.write("clock", {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock}, now)
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.client_clock)}
+        writer.write("clock", given, now)
+    for index in range(-5, round(drive.seconds * 5) + 6 if drive.probes else -5):
+        write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
         read = drive.client(number * FRAME_NS + drive.tau_v_of_frame_ns(number))
@@ -213,6 +226,21 @@ def write_client(drive: Drive, path: Path) -> None:
         timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
         writer.write("timeline", {**timeline, "hops": hops}, read)
     writer.close()
+
+
+def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
+    sent_ns = index * NS_PER_S // 5
+    reached_ns = sent_ns + round(drive.there_ms * NS_PER_MS)
+    answered_ns = reached_ns + NS_PER_MS // 10
+    arrived_ns = answered_ns + round(drive.back_ms * NS_PER_MS)
+    probe = ClockProbe(
+        index % 2**32,
+        drive.client(sent_ns).wall_ns,
+        drive.server(reached_ns).wall_ns,
+        drive.server(answered_ns).wall_ns,
+        drive.client(arrived_ns).wall_ns,
+    )
+    writer.write("clock_probe", probe, drive.client(arrived_ns))
 
 
 @pytest.fixture(scope="session")

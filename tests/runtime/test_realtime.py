@@ -73,7 +73,7 @@ class Ticker:
 def start() -> tuple[RealRuntime, Ticker, Kept]:
     clock, kept = MachineClock(), Kept()
     node = Ticker(clock.now().mono_ns)
-    runtime = RealRuntime(clock, [node], kept, lambda: ClockReport("host", "none", 0.0, None))
+    runtime = RealRuntime(clock, [node], kept, lambda: ClockReport(0, 0, "host", "none"))
     runtime.start({"zenoh": kept})
     return runtime, node, kept
 

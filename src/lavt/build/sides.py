@@ -22,7 +22,7 @@ from lavt.node import Node
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.camera import CameraNode
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.clock_sync import ClockSyncNode
+from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
 from lavt.nodes.receiver import ReceiverNode
@@ -177,6 +177,6 @@ def build_client(
             session,
             CLIENT_LIMITS,
         ),
-        ClockSyncNode(start.mono_ns),
+        ProbingClockSyncNode(start.mono_ns),
         injection_client(config.injection, config.who, instance, start.mono_ns),
     )

@@ -38,6 +38,7 @@ def client(
     clock = MachineClock()
     with Side(settings, out, clock) as side:
         side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
+        side.open_probe("probe_reply", bind=("", 0), remote=(settings.video.server, settings.clock.probe_port))
         nodes = build_client(settings, clock.now, MachineEntropy())
         signal.signal(signal.SIGUSR1, lambda *_: side.tell("operator", "emergency_stop"))
         run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)

@@ -39,5 +39,6 @@ def server(
     clock = MachineClock()
     with Side(settings, out, clock) as side:
         port = side.open_video("feedback", bind=(settings.video.bind, settings.video.port))
+        probe_port = side.open_probe("probe_request", bind=(settings.video.bind, settings.clock.probe_port))
         nodes = build_server(settings, clock.now, MachineEntropy(), host=kernel_identity(), video_port=port)
-        run_side(side, nodes.all, once=once, as_json=as_json, ready={"video_port": port})
+        run_side(side, nodes.all, once=once, as_json=as_json, ready={"video_port": port, "probe_port": probe_port})

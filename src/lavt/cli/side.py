@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import yaml
 
+from lavt.build.clock_source import clock_source
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -23,7 +24,6 @@ from lavt.node import Node
 from lavt.nodes.client_session import ClientSession
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recording import QueuedRecorder
-from lavt.transport.clock_offset import read_clock
 from lavt.transport.injector import Injector
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
@@ -54,7 +54,7 @@ class Side:
         self._out = out
         self._writer: RecordWriter | None = None
         self._queue: QueuedRecorder | None = None
-        self._udp: UdpLink | None = None
+        self._udp: dict[str, UdpLink] = {}
         if out is not None:
             check_directory(out)
         quiet_logs()
@@ -72,20 +72,27 @@ class Side:
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
         """Open the video's socket, whose datagrams come in on `channel`, and tell its port."""
-        self._udp = UdpLink(self.clock, channel, self._deliver, bind=bind, remote=remote)
-        return self._udp.port
+        return self._open("video", channel, bind, remote)
+
+    def open_probe(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
+        """Open the socket over which the clocks are compared, and tell its port."""
+        return self._open("probe", channel, bind, remote)
+
+    def _open(self, name: str, channel: str, bind: tuple[str, int], remote: tuple[str, int] | None) -> int:
+        self._udp[name] = UdpLink(self.clock, channel, self._deliver, bind=bind, remote=remote, name=name)
+        return self._udp[name].port
 
     def start(self, nodes: Sequence[Node]) -> RealRuntime:
         """Begin the record, start the runtime, then let messages in."""
-        assert self._udp is not None, "the video is opened before the nodes are built"  # noqa: S101
         if self._out is not None:
             self._writer = self._open_record(self._out)
             self.tap = LiveTap(self._writer)
         self._queue = QueuedRecorder(self.tap)
-        self.runtime = RealRuntime(self.clock, nodes, self._queue, read_clock)
+        self.runtime = RealRuntime(self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock))
         self._zenoh.start()
-        self.runtime.start({"video": self._udp, "zenoh": self._zenoh, "netem": self._injector})
-        self._udp.start()
+        self.runtime.start({**self._udp, "zenoh": self._zenoh, "netem": self._injector})
+        for link in self._udp.values():
+            link.start()
         return self.runtime
 
     def tell(self, channel: str, payload: Any) -> None:
@@ -113,13 +120,14 @@ class Side:
     ) -> None:
         if self.runtime is not None:
             self.runtime.stop()
-        if self._udp is not None:
-            self._udp.close()
         self._injector.close()
+        for each in self._udp.values():
+            each.close()
         self._zenoh.close()
-        if self._queue is not None and self._udp is not None:
-            for name, link in (("video", self._udp), ("zenoh", self._zenoh)):
-                self._queue.write("counts", {"link": name, **link.counts}, self.clock.now())
+        if self._queue is not None:
+            counts = {**{name: link.counts for name, link in self._udp.items()}, "zenoh": self._zenoh.counts}
+            for name, counted in counts.items():
+                self._queue.write("counts", {"link": name, **counted}, self.clock.now())
             self._queue.close(self.clock.now())
             if self._writer is not None and not self._queue.failed:
                 self._writer.close()

@@ -1,81 +1,154 @@
-"""Times of two hosts on one scale, from the clock samples of a run's records.
-
-Reference time is a host's wall clock plus its correction, so Delta = t_server - t_client = correction_client -
-correction_server. Both hosts sample their correction at least once a second; between samples it is interpolated.
-"""
+"""Which Delta a run goes by, and what the other opinion on it is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from lavt.domain import NS_PER_S, FloatArray
-from lavt.experiment.table import MISSING, IntArray, Table
+from lavt.domain import NS_PER_MS
+from lavt.experiment.offset import NO_OFFSET, Exchanges, Offset, by_probe, by_sources, exchanges, known_samples
+from lavt.experiment.record import Record
+from lavt.experiment.table import IntArray, Table
 
-
-@dataclass(frozen=True, slots=True)
-class Correction:
-    """What must be added to one host's wall clock: samples in order of `wall_ns`."""
-
-    wall_ns: IntArray
-    correction_ns: FloatArray
-
-    def at(self, wall_ns: IntArray) -> IntArray:
-        """Correction in ns at wall times of this host: linear between samples, constant before and after them."""
-        origin_ns = self.wall_ns[0]  # floats hold differences of wall times exactly, wall times themselves not
-        between = np.interp(wall_ns - origin_ns, self.wall_ns - origin_ns, self.correction_ns)
-        return np.asarray(np.rint(between), np.int64)
-
-    def reference_ns(self, wall_ns: IntArray) -> IntArray:
-        """Turn wall times of this host into reference time; what is missing stays missing."""
-        known = wall_ns != MISSING
-        reference = np.full(len(wall_ns), MISSING, np.int64)
-        reference[known] = wall_ns[known] + self.at(wall_ns[known])
-        return reference
+SAME_KERNEL = "same kernel"
+PROBE = "probe"
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The corrections of both hosts, and how wrong their difference can be at most (None: nobody knows)."""
+    """Delta of a run by name of its source, the probe's opinion, and over which wall times of client and server.
 
-    server: Correction
-    client: Correction
-    bound_s: float | None
-
-
-_SAME = Correction(np.zeros(1, np.int64), np.zeros(1))
-
-
-def clocks(server: Table, client: Table) -> Clocks | None:
-    """Put two hosts on one scale, from their channels `clock`; None where one of them gave no sample.
-
-    Hosts that report the same name share a kernel, and so a clock: Delta is 0 and so is its bound. Otherwise the bound
-    is the largest of the server's plus the largest of the client's over the run.
+    `offset` is None where nobody knows Delta, `probe` where the probe had no answer during the drive.
     """
-    if len(server) == 0 or len(client) == 0:
-        return None
+
+    source: str | None
+    offset: Offset | None
+    probe: Offset | None
+    probed: Exchanges
+    """Exchanges during the drive."""
+    client_wall_ns: IntArray
+    """Beginning and end of the drive, on each host's wall clock."""
+    server_wall_ns: IntArray
+
+    @property
+    def bound_ms(self) -> float | None:
+        """How wrong Delta can be at most during the drive; None: nobody knows."""
+        return None if self.offset is None else self._bound_ms(self.offset)
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """What `result.json` says as `delta`."""
+        return {
+            "source": self.source,
+            "ms": self._middle_ms(self.offset),
+            "bound_ms": self.bound_ms,
+            "drift_ppm": None if self.offset is None else self._drift_ppm(self.offset),
+            "probe_ms": self._middle_ms(self.probe),
+            "probe_bound_ms": None if self.probe is None else self._bound_ms(self.probe),
+        }
+
+    def disagreement_ms(self) -> tuple[float, float, float] | None:
+        """Delta, the probe's Delta and the sum of both bounds where these leave no room for both; None: they agree.
+
+        Every exchange of the drive is held against Delta at its own moment: the one that is farthest out.
+        """
+        if self.offset is None or self.source == PROBE or len(self.probed) == 0:
+            return None
+        delta_ns = self.offset.at(self.probed.client_wall_ns)
+        bound_ns = self.offset.bound_at(self.probed.client_wall_ns) + self.probed.round_trip_ns / 2
+        beyond_ns = np.abs(delta_ns - self.probed.delta_ns) - bound_ns
+        worst = int(np.argmax(np.nan_to_num(beyond_ns, nan=-np.inf)))
+        if not beyond_ns[worst] > 0:
+            return None
+        delta_ms, probe_ms, bound_ms = (
+            float(each[worst]) / NS_PER_MS for each in (delta_ns, self.probed.delta_ns, bound_ns)
+        )
+        return delta_ms, probe_ms, bound_ms
+
+    def _moments(self, offset: Offset) -> IntArray:
+        """Moments of an offset during the drive, and the drive's ends."""
+        inner = (offset.client_wall_ns > self.client_wall_ns[0]) & (offset.client_wall_ns < self.client_wall_ns[1])
+        return np.union1d(offset.client_wall_ns[inner], self.client_wall_ns)
+
+    def _bound_ms(self, offset: Offset) -> float | None:
+        largest_ns = float(np.max(offset.bound_at(self._moments(offset))))
+        return largest_ns / NS_PER_MS if np.isfinite(largest_ns) else None
+
+    def _middle_ms(self, offset: Offset | None) -> float | None:
+        if offset is None:
+            return None
+        began_ns, ended_ns = self.client_wall_ns.tolist()
+        return float(offset.at(np.array([(began_ns + ended_ns) // 2]))[0]) / NS_PER_MS
+
+    def _drift_ppm(self, offset: Offset) -> float | None:
+        """Slope of the straight line through Delta during the drive."""
+        moments = self._moments(offset)
+        gone_ns = (moments - moments[0]).astype(float)
+        return None if gone_ns[-1] <= 0 else float(np.polyfit(gone_ns, offset.at(moments), 1)[0]) * 1e6
+
+
+def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Clocks:
+    """Find Delta of a run that was driven between two times of the server's monotonic clock.
+
+    Hosts that report the same name share a kernel, and so a clock: Delta is 0 and so is its bound. Else what the hosts'
+    sources of time say counts, where both know it with a bound all through the drive and neither leaves it to the
+    probe; else the probe alone; else what the sources say without a bound.
+    """
+    of_server, of_client = server.table("clock"), client.table("clock")
+    server_wall_ns = np.array([wall_ns(server, began_ns), wall_ns(server, max(began_ns, ended_ns))])
+    every = exchanges(client.table("clock_probe"))
+    probed = every.within(*server_wall_ns.tolist())
+    probe = _by_probe(every, server_wall_ns) if len(probed) else None
+    sources = None if _left_to_the_probe(of_server, of_client) else by_sources(of_server, of_client)
+    source: str | None
+    offset: Offset | None
+    if _one_host(of_server, of_client):
+        source, offset = SAME_KERNEL, NO_OFFSET
+    elif sources is not None and (_is_bounded(sources, server_wall_ns) or probe is None):
+        names = {name for samples in (of_server, of_client) for name in known_samples(samples).texts("source")}
+        source, offset = " and ".join(sorted(names)), sources
+    else:
+        source, offset = (None, None) if probe is None else (PROBE, probe)
+    client_wall_ns = server_wall_ns if offset is None else _on_client(offset, server_wall_ns)
+    return Clocks(source, offset, probe, probed, client_wall_ns, server_wall_ns)
+
+
+def wall_ns(record: Record, mono_ns: int) -> int:
+    """Wall time of a record's host at a time of its monotonic clock, by the nearest of its clock samples and events."""
+    nearest, found_ns = None, mono_ns
+    for table in (record.table("clock"), record.table("event")):
+        for message_mono_ns, message_wall_ns in zip(table.mono_ns.tolist(), table.wall_ns.tolist(), strict=True):
+            distance_ns = abs(message_mono_ns - mono_ns)
+            if nearest is None or distance_ns < nearest:
+                nearest, found_ns = distance_ns, message_wall_ns - message_mono_ns + mono_ns
+    return found_ns
+
+
+def _one_host(server: Table, client: Table) -> bool:
     hosts = set(server.texts("host")) | set(client.texts("host"))
-    if len(hosts) == 1 and "" not in hosts:
-        return Clocks(_SAME, _SAME, 0.0)
-    corrections = (_correction(server), _correction(client))
-    if corrections[0] is None or corrections[1] is None:
-        return None
-    bounds_s = (_largest(server.floats("bound_s")), _largest(client.floats("bound_s")))
-    known = bounds_s[0] is not None and bounds_s[1] is not None
-    return Clocks(corrections[0], corrections[1], (bounds_s[0] or 0.0) + (bounds_s[1] or 0.0) if known else None)
+    return len(server) > 0 and len(client) > 0 and len(hosts) == 1 and "" not in hosts
 
 
-def _correction(samples: Table) -> Correction | None:
-    wall_ns = samples.ints("wall_ns")
-    correction_s = samples.floats("correction_s")
-    known = (wall_ns != MISSING) & np.isfinite(correction_s)
-    if not known.any():
-        return None
-    order = np.argsort(wall_ns[known], kind="stable")
-    return Correction(wall_ns[known][order], correction_s[known][order] * NS_PER_S)
+def _left_to_the_probe(server: Table, client: Table) -> bool:
+    return PROBE in {*server.texts("source"), *client.texts("source")}
 
 
-def _largest(bound_s: FloatArray) -> float | None:
-    """Largest bound; None as soon as one sample has none, because then the run has times without a bound."""
-    return None if len(bound_s) == 0 or np.isnan(bound_s).any() else float(bound_s.max())
+def _is_bounded(offset: Offset, server_wall_ns: IntArray) -> bool:
+    """Tell whether the bound is known, and from before the drive's beginning on."""
+    known = np.isfinite(offset.bound_ns)
+    return bool(known.all()) and bool(offset.client_wall_ns[0] <= _on_client(offset, server_wall_ns)[0])
+
+
+def _on_client(offset: Offset, server_wall_ns: IntArray) -> IntArray:
+    """Turn wall times of the server into those of the client, where Delta hardly changes within itself."""
+    guess_ns = server_wall_ns - offset.at(server_wall_ns)
+    return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)
+
+
+def _by_probe(every: Exchanges, server_wall_ns: IntArray) -> Offset | None:
+    """By the probe, at the drive's beginning and end too: an exchange long before says little of them."""
+    nearest = np.clip(np.searchsorted(every.server_wall_ns, server_wall_ns), 0, len(every) - 1)
+    edges = server_wall_ns - np.rint(every.delta_ns[nearest]).astype(np.int64)
+    return by_probe(every, edges)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS, FloatArray
-from lavt.experiment.clocks import Clocks
+from lavt.experiment.offset import Offset
 from lavt.experiment.table import MISSING, IntArray, Table
 
 
@@ -53,20 +53,18 @@ def decoded_pictures(pictures: Table) -> Table:
     return pictures.where(np.array([decoded is not False for decoded in pictures.objects("decoded")], np.bool_))
 
 
-def video_latency_ns(pictures: Table, clocks: Clocks) -> IntArray:
-    """tau_v of every readable picture: stamp written on the server to stamp read on the client, in reference time."""
+def video_latency_ns(pictures: Table, offset: Offset) -> IntArray:
+    """tau_v of every readable picture: stamp written to stamp read, both by the server's clock."""
     readable = pictures.where(pictures.flags("readable") & (pictures.ints("read_wall_ns") != MISSING))
-    read_ns = clocks.client.reference_ns(readable.ints("read_wall_ns"))
-    return read_ns - clocks.server.reference_ns(readable.ints("stamp_ns"))
+    return offset.on_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
 
 
-def control_latency_ns(admissions: Table, clocks: Clocks, began_ns: int, ended_ns: int) -> IntArray:
+def control_latency_ns(admissions: Table, offset: Offset, began_ns: int, ended_ns: int) -> IntArray:
     """tau_c of every command received, obeyed or refused: sent by the client to received by the server."""
     received_ns = admissions.ints("received_mono_ns")
     known = (admissions.ints("sent_wall_ns") != MISSING) & (admissions.ints("received_wall_ns") != MISSING)
     within = admissions.where(known & (received_ns >= began_ns) & (received_ns <= ended_ns))
-    sent_ns = clocks.client.reference_ns(within.ints("sent_wall_ns"))
-    return clocks.server.reference_ns(within.ints("received_wall_ns")) - sent_ns
+    return within.ints("received_wall_ns") - offset.on_server_ns(within.ints("sent_wall_ns"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +113,7 @@ def loops(frames: Table, admissions: Table, ended_ns: int) -> Loops:
     return Loops(commands.ints("stamp_ns"), stamped_ns[chosen], commands)
 
 
-def closure_ns(pictures: Table, paired: Loops, clocks: Clocks) -> IntArray:
+def closure_ns(pictures: Table, paired: Loops, offset: Offset) -> IntArray:
     """How far tau_v + client time + tau_c + actuator time is from the loop latency, for every frame that has them all.
 
     The offset cancels in the sum; a clock that stepped, or a command that names another picture's times, does not.
@@ -125,9 +123,8 @@ def closure_ns(pictures: Table, paired: Loops, clocks: Clocks) -> IntArray:
     commands = paired.commands
     needed = [read_wall_ns, *(commands.ints(name) for name in ("sent_wall_ns", "stamp_received_wall_ns"))]
     known = np.all([times != MISSING for times in needed], axis=0) if len(commands) else np.zeros(0, np.bool_)
-    tau_v_ns = clocks.client.reference_ns(read_wall_ns) - clocks.server.reference_ns(paired.stamp_ns)
-    sent_ns = clocks.client.reference_ns(commands.ints("sent_wall_ns"))
-    tau_c_ns = clocks.server.reference_ns(commands.ints("received_wall_ns")) - sent_ns
+    tau_v_ns = offset.on_server_ns(read_wall_ns) - paired.stamp_ns
+    tau_c_ns = commands.ints("received_wall_ns") - offset.on_server_ns(commands.ints("sent_wall_ns"))
     total_ns = tau_v_ns + paired.client_ns + tau_c_ns + paired.actuator_ns
     return np.asarray((total_ns - paired.loop_ns)[known], np.int64)
 

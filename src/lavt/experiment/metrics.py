@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.clocks import clocks
+from lavt.experiment.clocks import Clocks, clocks
 from lavt.experiment.latency import (
     closure_ns,
     control_latency_ns,
@@ -31,12 +31,12 @@ class Measured:
     """What was measured in a run.
 
     `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of how far the
-    parts of the loop are from the whole; `clock_bound_ms` the bound of Delta; both None where they are not known.
+    parts of the loop are from the whole, None where it is not known.
     """
 
     entry: Mapping[str, Any]
     closure_p95_ms: float | None
-    clock_bound_ms: float | None
+    clocks: Clocks
 
 
 def driving_interval(server: Record) -> tuple[int, int, str | None]:
@@ -64,14 +64,16 @@ def measure(server: Record, client: Record) -> Measured:
     """Compute every metric of a run. What cannot be known (no truth, no clock samples, no picture) is None."""
     began_ns, ended_ns, ending = driving_interval(server)
     drove = began_ns <= ended_ns
-    latencies, closure_p95_ms, clock_bound_ms = _latencies(server, client, began_ns, ended_ns)
+    on_one_scale = clocks(server, client, began_ns, ended_ns)
+    latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, on_one_scale)
     entry = {
         "ending": ending,
         **_tracking(server, began_ns, ended_ns),
         "duration_s": (ended_ns - began_ns) / NS_PER_S if drove else None,
         **latencies,
+        "delta": on_one_scale.entry,
     }
-    return Measured(entry, closure_p95_ms, clock_bound_ms)
+    return Measured(entry, closure_p95_ms, on_one_scale)
 
 
 def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
@@ -91,21 +93,19 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
 
 
 def _latencies(
-    server: Record, client: Record, began_ns: int, ended_ns: int
-) -> tuple[dict[str, Any], float | None, float | None]:
+    server: Record, client: Record, began_ns: int, ended_ns: int, on_one_scale: Clocks
+) -> tuple[dict[str, Any], float | None]:
     all_frames, admissions = server.table("frame"), server.table("admission")
     frames = frames_within(all_frames, began_ns, ended_ns)
     pictures = decoded_pictures(pictures_of(client.table("picture"), frames))
     paired = loops(frames, admissions, ended_ns)
     age = picture_age(all_frames, admissions, began_ns, ended_ns)
-    on_one_scale = clocks(server.table("clock"), client.table("clock"))
     nothing = np.zeros(0, np.int64)
-    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = nothing, nothing, None, None
-    if on_one_scale is not None:
-        tau_v_ns = video_latency_ns(pictures, on_one_scale)
-        tau_c_ns = control_latency_ns(admissions, on_one_scale, began_ns, ended_ns)
-        bound_ms = None if on_one_scale.bound_s is None else on_one_scale.bound_s * 1e3
-        closures_ns = closure_ns(pictures, paired, on_one_scale)
+    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = nothing, nothing, on_one_scale.bound_ms, None
+    if on_one_scale.offset is not None:
+        tau_v_ns = video_latency_ns(pictures, on_one_scale.offset)
+        tau_c_ns = control_latency_ns(admissions, on_one_scale.offset, began_ns, ended_ns)
+        closures_ns = closure_ns(pictures, paired, on_one_scale.offset)
         if len(closures_ns):
             closure_p95_ms = float(np.percentile(np.abs(closures_ns), 95)) / NS_PER_MS
     entry = {
@@ -117,7 +117,7 @@ def _latencies(
         "frames_decoded": len(pictures),
         "frames_unreadable": int(np.sum(~pictures.flags("readable"))),
     }
-    return entry, closure_p95_ms, bound_ms
+    return entry, closure_p95_ms
 
 
 def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, Any]:

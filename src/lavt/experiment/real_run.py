@@ -75,7 +75,8 @@ def start_loop(
         "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)),
         *(["--once"] if once else []), "--out", str(out / "server"), program=server_program,
     )  # fmt: skip
-    video_port = server.ready()["ready"]["video_port"]
+    ready = server.ready()["ready"]
+    video_port, probe_port = ready["video_port"], ready["probe_port"]
     relay = None
     control_port = int(remote.partition("?")[0].rpartition(":")[2])
     if run.network.injection == "relay":
@@ -86,7 +87,7 @@ def start_loop(
         video_port, control_port = ports["video"], ports["control"]
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
     client_router, local = start_client_router(processes, dialled)
-    config = client_config(run, router=local, video_port=video_port)
+    config = client_config(run, router=local, video_port=video_port, probe_port=probe_port)
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
     client.ready()

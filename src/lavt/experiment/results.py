@@ -48,6 +48,7 @@ MEASURES = (
     "picture_age_ms",
     "tau_v_ms",
     "tau_c_ms",
+    "delta",
     "frames_sent",
     "frames_decoded",
     "frames_unreadable",

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from lavt.config import (
     ClientCameraConfig,
+    ClientClockConfig,
     ClientConfig,
     ClientVideoConfig,
+    ClockConfig,
     RunConfig,
     ServerConfig,
     ServerVideoConfig,
@@ -20,18 +22,20 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
         camera=run.camera,
         video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
         zenoh=ZenohConfig(router=router),
+        clock=ClockConfig(probe_port=0),
         safety=run.safety,
         record=run.record,
         seed=seed,
     )
 
 
-def client_config(run: RunConfig, *, router: str = "", video_port: int = 0) -> ClientConfig:
+def client_config(run: RunConfig, *, router: str = "", video_port: int = 0, probe_port: int = 5602) -> ClientConfig:
     """Give the client's part of a run."""
     return ClientConfig(
         controller=run.controller,
         camera=ClientCameraConfig(**run.camera.model_dump()),
         video=ClientVideoConfig(port=video_port, reorder_hold_ms=run.video.reorder_hold_ms),
         zenoh=ZenohConfig(router=router),
+        clock=ClientClockConfig(probe_port=probe_port),
         record=run.record,
     )

@@ -158,6 +158,8 @@ def virtual_links(network: Network) -> dict[str, VirtualLink]:
         "feedback": link(network.unheld),
         "session": link(network.control),
         "session_reply": link(network.state),
+        "probe_request": link(network.unheld),
+        "probe_reply": link(network.unheld),
     }
 
 

@@ -143,15 +143,3 @@ class InjectionSample:
     measured_ms: float | None
     because: str
     """Why it is not in force, or what was measured to be otherwise than asked; empty: all is well."""
-
-
-@value
-class ClockSample:
-    """A clock report beside a reading of both clocks."""
-
-    mono_ns: int
-    wall_ns: int
-    host: str
-    source: str
-    correction_s: float
-    bound_s: float | None

@@ -75,11 +75,11 @@ WIRE: dict[str, Callable[[bytes], object]] = {
 
 UNRECORDED = frozenset(
     {
-        "pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "clock_query", "clock_report",
-        "rest", "condition_in_force", "inject", "injected",
+        "pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "rest", "condition_in_force",
+        "clock_query", "clock_report", "probe_request", "probe_reply", "inject", "injected",
     }
 )  # fmt: skip
-"""Written down elsewhere (the truth, the pictures' units, the samples of clocks and queues), or secret."""
+"""Written down elsewhere (the truth, the pictures' units, samples of clocks and queues, exchanges), or secret."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:

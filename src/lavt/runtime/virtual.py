@@ -261,7 +261,8 @@ def modelled_clock_source(clock: HostClock, host: str, error_s: float, bound_s: 
     """Model chrony on a virtual host: it reports the truth plus `error_s`, which lies inside its stated `bound_s`."""
 
     def report(true_ns: int) -> ClockReport:
-        ahead_ns = clock.at(true_ns).wall_ns - (clock.wall_start_ns + true_ns)
-        return ClockReport(host, "model", -ahead_ns / NS_PER_S + error_s, bound_s)
+        now = clock.at(true_ns)
+        ahead_ns = now.wall_ns - (clock.wall_start_ns + true_ns)
+        return ClockReport(now.mono_ns, now.wall_ns, host, "model", -ahead_ns / NS_PER_S + error_s, bound_s)
 
     return report

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Carrier = Literal["local", "video", "zenoh", "clock", "netem", "record"]
-"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. clock: the host's source
-of clock reports. netem: the host's own queues. record: nobody listens, it is written down."""
+Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "record"]
+"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. probe: the UDP flow that
+compares the clocks. clock: the host's source of clock reports. netem: the host's own queues. record: nobody listens,
+it is written down."""
 
 Waiting = Literal["queue", "newest"]
 """queue: kept in order, the oldest dropped when full. newest: a new one replaces the one that waits."""
@@ -16,6 +17,8 @@ QUEUE_LENGTH = 4096
 """More than a second of packets."""
 COMMANDS = 64
 """A second of commands: older ones would be refused anyway."""
+PROBES = 64
+"""One that has to wait for more than a few others tells little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,9 @@ CHANNELS: dict[str, Channel] = {
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
     "netem": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
     "netem_reply": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
-    # each host and its own clock
+    # the clocks: each host's own, and the client's against the server's
+    "probe_request": Channel("probe", "clock_sync", ("clock_sync",), length=PROBES),
+    "probe_reply": Channel("probe", "clock_sync", ("clock_sync",), length=PROBES),
     "clock_query": Channel("clock", "clock_sync"),
     "clock_report": Channel("local", "clock_source", ("clock_sync",)),
     # each host and its own queues
@@ -68,6 +73,7 @@ CHANNELS: dict[str, Channel] = {
     "lane": Channel("record", "driver"),
     "clock": Channel("record", "clock_sync"),
     "injection": Channel("record", "injection"),
+    "clock_probe": Channel("record", "clock_sync"),
     "counts": Channel("record", "runtime"),
     "timeline": Channel("record", "runtime"),
 }

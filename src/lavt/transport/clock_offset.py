@@ -1,65 +1,100 @@
-"""What a host can say of its own clock: which kernel's clock it is, and how far chrony finds it from the reference."""
+"""What a host can say of its own clock: which kernel's clock it is, and how far its source of time finds it off."""
 
 from __future__ import annotations
 
-import math
-import subprocess
+import ipaddress
+from functools import lru_cache
 from pathlib import Path
 
+from lavt.domain import Now
 from lavt.value import value
 
 
 @value
 class ClockReport:
-    """What the host's source of time says of the host's clock."""
+    """What a host's source of time says of its clock, beside the reading of both clocks that it belongs to."""
 
+    mono_ns: int
+    wall_ns: int
     host: str
     """Identity of the kernel whose clock this is."""
     source: str
-    correction_s: float
-    """Reference time less the host's wall clock."""
-    bound_s: float | None
-    """How far the correction can be wrong; None: not known."""
+    """Who says it: "chrony", "ptp", "external", "probe" (the host leaves it to the probe), "model" in virtual time."""
+    correction_s: float | None = None
+    """Reference time less the host's wall clock; None: the source does not know it."""
+    bound_s: float | None = None
+    """How far the correction can be from the truth; None: nobody knows."""
+    status: str = ""
+    """What the source says instead, in words, where there is no correction."""
+    asking_s: float = 0.0
+    """For how long the source was asked; the reading of the clocks is that of the middle."""
+    follows: str = ""
+    """Address of the host, or identity of the PTP grandmaster, that the clock is compared with."""
+    addresses: tuple[str, ...] = ()
+    """The host's own, without loopback: whether the other side follows this host."""
+    skew_ppm: float | None = None
+    """How wrong the source's estimate of the clock's rate can be."""
+    age_s: float | None = None
+    """Since the source last heard what it follows."""
+    peer_delay_s: float | None = None
+    """Round trip to what it follows, in the source's last sample."""
+    peer_dispersion_s: float | None = None
+    """What else that sample can be wrong by."""
+    good_samples: int | None = None
+    """How many samples the source has accepted so far."""
+    poll_s: float | None = None
+    """How often the source asks for one."""
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-CHRONYC = ("chronyc", "-c", "tracking")
-TRACKING_FIELDS = 14
+IPV4_ROUTES = Path("/proc/net/fib_trie")
+IPV6_ADDRESSES = Path("/proc/net/if_inet6")
 
 
 def kernel_identity() -> str:
     """Identity of the running kernel: processes that share it share a clock; empty where the system has none."""
+    return _text_of(BOOT_ID).strip()
+
+
+def host_addresses() -> tuple[str, ...]:
+    """Addresses of this host, without loopback, in order; empty where the system does not tell."""
+    return _addresses(_text_of(IPV4_ROUTES), _text_of(IPV6_ADDRESSES))
+
+
+@lru_cache(maxsize=4)  # asked every second; they hardly ever change
+def _addresses(ipv4_routes: str, ipv6_addresses: str) -> tuple[str, ...]:
+    """Read the kernel's tables: an address is the line before "/32 host LOCAL", or 32 hex digits at a line's start."""
+    lines = ipv4_routes.splitlines()
+    found = {
+        before.removeprefix("|--").strip()
+        for before, line in zip(map(str.strip, lines), map(str.strip, lines[1:]), strict=False)
+        if line == "/32 host LOCAL" and before.startswith("|--")
+    }
+    for line in ipv6_addresses.splitlines():
+        digits = line.partition(" ")[0]
+        if len(digits) == 32:
+            found.add(":".join(digits[start : start + 4] for start in range(0, 32, 4)))
+    return tuple(sorted({address for each in found if (address := plain_address(each))} - _LOOPBACK))
+
+
+_LOOPBACK = {"127.0.0.1", "::1"}
+
+
+def plain_address(text: str) -> str:
+    """Write an address as all write it who must be compared; empty where it is none."""
     try:
-        return BOOT_ID.read_text().strip()
-    except OSError:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
         return ""
 
 
-def parse_tracking(host: str, line: str) -> ClockReport:
-    """Read the answer of `chronyc -c tracking`: field 5 is the correction, positive where the local clock is slow.
+def unknown_clock(now: Now, host: str, source: str, status: str) -> ClockReport:
+    """Make the report of a source that cannot tell."""
+    return ClockReport(now.mono_ns, now.wall_ns, host, source, status=status, addresses=host_addresses())
 
-    The bound is the root distance: half the root delay plus the root dispersion (chronyc's manual, "tracking").
-    Before chrony has synchronised, and where the line is not what chrony writes, the correction is 0 and the bound
-    unknown.
-    """
-    unknown = ClockReport(host, "chrony, not synchronised", 0.0, None)
-    fields = line.strip().split(",")
-    if len(fields) != TRACKING_FIELDS or fields[13] != "Normal" or fields[0] == "00000000":
-        return unknown
+
+def _text_of(path: Path) -> str:
     try:
-        correction_s, delay_s, dispersion_s = (float(fields[index]) for index in (4, 10, 11))
-    except ValueError:
-        return unknown
-    if not (math.isfinite(correction_s) and 0 <= delay_s < math.inf and 0 <= dispersion_s < math.inf):
-        return unknown
-    return ClockReport(host, "chrony", correction_s, delay_s / 2 + dispersion_s)
-
-
-def read_clock() -> ClockReport:
-    """Ask chrony on this host; without it the report says so, and has no bound."""
-    host = kernel_identity()
-    try:
-        answer = subprocess.run(CHRONYC, capture_output=True, text=True, timeout=1, check=True)  # noqa: S603 (a constant)
-        return parse_tracking(host, answer.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError):
-        return ClockReport(host, "none", 0.0, None)
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""

@@ -1,4 +1,4 @@
-"""The video's UDP sockets, one on each side, with the kernel's time of arrival."""
+"""UDP sockets, one on each side for the video and one for the probe, with the kernel's time of arrival."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ LONGEST_DATAGRAM = 65_535
 class UdpLink:
     """A UDP socket and a thread that receives.
 
-    `channel` names what comes in. `peer` of what goes out is an address, or for a client, whose server is known by
-    `remote`, the port (0: the one in `remote`). A client hears its server only: what comes from elsewhere is counted,
-    not delivered. Raises `UserError` for a port that cannot be opened and a host that is not known.
+    `channel` names what comes in, `name` says what the port is for. `peer` of what goes out is an address, or for a
+    client, whose server is known by `remote`, the port (0: the one in `remote`). A client hears its server only: what
+    comes from elsewhere is counted, not delivered. Raises `UserError` for a port that cannot be opened
+    and a host that is not known.
     """
 
     def __init__(
@@ -38,6 +39,7 @@ class UdpLink:
         *,
         bind: tuple[str, int],
         remote: tuple[str, int] | None = None,
+        name: str = "video",
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._clock = clock
@@ -53,7 +55,7 @@ class UdpLink:
         except (OSError, ValueError) as error:
             self._socket.close()
             raise UserError(
-                f"the video port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
+                f"the {name} port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
             ) from error
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)

@@ -1,0 +1,35 @@
+"""From the config's `clock` to what is asked, once a second, how far this machine's clock is off."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from lavt.clock import Clock
+from lavt.config import ClockConfig
+from lavt.transport.chrony import read_chrony
+from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, unknown_clock
+from lavt.transport.ptp import read_ptp
+
+MS_PER_S = 1000.0
+
+
+def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport]:
+    """Give the function that asks the source which the config names."""
+
+    def external() -> ClockReport:
+        now = clock.now()
+        correction_s, bound_s = (config.correction_ms or 0.0) / MS_PER_S, (config.bound_ms or 0.0) / MS_PER_S
+        return ClockReport(
+            *now, kernel_identity(), "external", correction_s, bound_s, addresses=host_addresses()
+        )  # fmt: skip
+
+    def left_to_the_probe() -> ClockReport:
+        return unknown_clock(clock.now(), kernel_identity(), "probe", "left to the probe by clock.source")
+
+    sources = {
+        "chrony": lambda: read_chrony(clock),
+        "ptp": lambda: read_ptp(clock),
+        "external": external,
+        "probe": left_to_the_probe,
+    }
+    return sources[config.source]

@@ -1,0 +1,226 @@
+"""Delta = t_server - t_client at any moment of a run, and how wrong it can be: by clock samples or by probes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavt.domain import NS_PER_S, FloatArray
+from lavt.experiment.table import MISSING, BoolArray, IntArray, Table
+
+DRIFT_ALLOWANCE = 500e-6
+"""How fast Delta may change without anybody saying so: a kernel's own steering (ntpd, timesyncd) goes up to 500 ppm,
+two crystals differ by less. Only chrony may be faster, and says by how much it corrects."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """Delta at moments of the client's wall clock, in order, and how far from the truth the line between them can be.
+
+    `bound_ns` is NaN where nobody knows.
+    """
+
+    client_wall_ns: IntArray
+    delta_ns: FloatArray
+    bound_ns: FloatArray
+
+    def at(self, client_wall_ns: IntArray) -> IntArray:
+        """Delta in ns at wall times of the client: linear between moments, constant before and after them."""
+        return np.asarray(np.rint(_between(client_wall_ns, self.client_wall_ns, self.delta_ns)), np.int64)
+
+    def bound_at(self, client_wall_ns: IntArray) -> FloatArray:
+        """How wrong Delta can be then, in ns."""
+        return _between(client_wall_ns, self.client_wall_ns, self.bound_ns)
+
+    def on_server_ns(self, client_wall_ns: IntArray) -> IntArray:
+        """Turn wall times of the client into those of the server; what is missing stays missing."""
+        known = client_wall_ns != MISSING
+        server_ns = np.full(len(client_wall_ns), MISSING, np.int64)
+        server_ns[known] = client_wall_ns[known] + self.at(client_wall_ns[known])
+        return server_ns
+
+
+NO_OFFSET = Offset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
+"""That of two hosts which share a clock."""
+
+
+def _between(wanted: IntArray, moments: IntArray, values: FloatArray) -> FloatArray:
+    origin = moments[0]  # floats hold differences of wall times exactly, wall times themselves not
+    return np.asarray(np.interp((wanted - origin).astype(float), (moments - origin).astype(float), values), np.float64)
+
+
+# By the hosts' own sources of time.
+
+
+@dataclass(frozen=True, slots=True)
+class _Correction:
+    """What must be added to one host's wall clock, at moments of reference time, in ns."""
+
+    reference_ns: IntArray
+    correction_ns: FloatArray
+    own_bound_ns: FloatArray
+    peer_bound_ns: FloatArray
+    """That of the path to the other host, where the source follows that one and tells; else NaN."""
+    asked_ns: FloatArray
+    """What the correction can have changed by while the source was asked for it."""
+
+    def at(self, reference_ns: IntArray, values: FloatArray) -> FloatArray:
+        """Give a quantity of the samples at other moments: linear between them, constant before and after."""
+        return _between(reference_ns, self.reference_ns, values)
+
+
+def by_sources(server: Table, client: Table) -> Offset | None:
+    """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
+
+    Its moments are those of the samples of both. The bound is that of the path between the hosts where one follows the
+    other, else the sum of both hosts' own, and what the line between two samples can miss (`docs/metrics.md`).
+    """
+    hosts = [_correction(server, client), _correction(client, server)]
+    if hosts[0] is None or hosts[1] is None:
+        return None
+    of_server, of_client = hosts[0], hosts[1]
+    moments = np.union1d(of_server.reference_ns, of_client.reference_ns)
+    bound_ns = of_server.at(moments, of_server.own_bound_ns) + of_client.at(moments, of_client.own_bound_ns)
+    for follower in (of_server, of_client):
+        peer_bound_ns = follower.at(moments, follower.peer_bound_ns)
+        bound_ns = np.where(np.isfinite(peer_bound_ns), peer_bound_ns, bound_ns)
+    for each in (of_server, of_client):
+        bound_ns = bound_ns + each.at(moments, each.asked_ns) + _missed_ns(moments, each)
+    correction_ns = of_client.at(moments, of_client.correction_ns)
+    delta_ns = correction_ns - of_server.at(moments, of_server.correction_ns)
+    return Offset(moments - np.rint(correction_ns).astype(np.int64), delta_ns, bound_ns)
+
+
+def known_samples(samples: Table) -> Table:
+    """Samples from the first that knows the correction on; none where a later one does not."""
+    known = np.isfinite(samples.floats("correction_s")) & (samples.ints("wall_ns") != MISSING)
+    whole = known.any() and known[np.argmax(known) :].all()
+    return samples.where(known if whole else np.zeros(len(samples), np.bool_))
+
+
+def follows(samples: Table, other: Table) -> BoolArray:
+    """Tell for each of a host's samples whether its source follows the other host."""
+    addresses = {address for entry in other.objects("addresses") for address in entry or ()}
+    return np.array([each in addresses for each in samples.texts("follows")], np.bool_)
+
+
+def _correction(samples: Table, other: Table) -> _Correction | None:
+    samples = known_samples(samples)
+    if len(samples) == 0:
+        return None
+    correction_ns = samples.floats("correction_s") * NS_PER_S
+    reference_ns = samples.ints("wall_ns") + np.rint(correction_ns).astype(np.int64)
+    order = np.argsort(reference_ns, kind="stable")
+    reference_ns, correction_ns, samples = reference_ns[order], correction_ns[order], _ordered(samples, order)
+    half_asking_ns = np.nan_to_num(samples.floats("asking_s")) * NS_PER_S / 2
+    rates = np.abs(_rates(reference_ns, correction_ns))
+    asked_ns = half_asking_ns * np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
+    drift_s = samples.floats("skew_ppm") / 1e6 * samples.floats("age_s")
+    path_s = samples.floats("peer_delay_s") / 2 + samples.floats("peer_dispersion_s") + drift_s
+    path_s[~follows(samples, other)] = np.nan
+    own_bound_ns = samples.floats("bound_s") * NS_PER_S
+    return _Correction(reference_ns, correction_ns, own_bound_ns, path_s * NS_PER_S, asked_ns)
+
+
+def _ordered(samples: Table, order: IntArray) -> Table:
+    columns = {name: column[order] for name, column in samples.columns.items()}
+    return Table(samples.mono_ns[order], samples.wall_ns[order], columns)
+
+
+def _rates(moments: IntArray, values: FloatArray) -> FloatArray:
+    """Slope of each line from a sample to the next."""
+    return np.diff(values) / np.maximum(np.diff(moments), 1)
+
+
+def _missed_ns(moments: IntArray, samples: _Correction) -> FloatArray:
+    """How far the truth can be from the line between two samples.
+
+    A correction that is worked off at one rate and then at another bends once: a quarter of the change of rate times
+    the time between the samples is the farthest that a bend can be from the line.
+    """
+    if len(samples.reference_ns) < 3:
+        return np.zeros(len(moments))
+    rates = _rates(samples.reference_ns, samples.correction_ns)
+    bends = np.abs(np.append(rates[1:], rates[-1]) - np.append(rates[0], rates[:-1]))
+    missed_ns = bends * np.diff(samples.reference_ns) / 4
+    interval = np.clip(np.searchsorted(samples.reference_ns, moments, "right") - 1, 0, len(missed_ns) - 1)
+    return np.asarray(missed_ns[interval], np.float64)
+
+
+# By the probe.
+
+
+@dataclass(frozen=True, slots=True)
+class Exchanges:
+    """Exchanges of the probe, in order: when, on both wall clocks, and what each says of Delta, in ns."""
+
+    client_wall_ns: IntArray
+    server_wall_ns: IntArray
+    delta_ns: FloatArray
+    round_trip_ns: IntArray
+
+    def __len__(self) -> int:
+        return len(self.client_wall_ns)
+
+    def within(self, began_wall_ns: int, ended_wall_ns: int) -> Exchanges:
+        """Those of an interval of the server's wall clock."""
+        chosen = (self.server_wall_ns >= began_wall_ns) & (self.server_wall_ns <= ended_wall_ns)
+        return self.where(chosen)
+
+    def where(self, chosen: BoolArray | IntArray) -> Exchanges:
+        """Choose some."""
+        return Exchanges(
+            self.client_wall_ns[chosen], self.server_wall_ns[chosen], self.delta_ns[chosen], self.round_trip_ns[chosen]
+        )
+
+
+def exchanges(probes: Table) -> Exchanges:
+    """Read the channel `clock_probe`; a clock that was set in the middle of an exchange spoils it, where that shows."""
+    names = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
+    sent, received, answered, arrived = (probes.ints(name) for name in names)
+    found = Exchanges(
+        sent + (arrived - sent) // 2,
+        received + (answered - received) // 2,
+        ((received - sent) + (answered - arrived)) / 2,
+        (arrived - sent) - (answered - received),
+    )
+    good = np.all([times != MISSING for times in (sent, received, answered, arrived)], axis=0)
+    good &= found.round_trip_ns >= 0
+    order = np.argsort(found.client_wall_ns[good], kind="stable")
+    return found.where(np.flatnonzero(good)[order])
+
+
+def by_probe(every: Exchanges, also_at: IntArray) -> Offset | None:
+    """Delta by the probe alone: at each exchange, and at further times of the client, by the exchange that says most.
+
+    An exchange says Delta to half its round trip, and later or earlier to as much more as clocks may drift apart.
+    """
+    if len(every) == 0:
+        return None
+    moments = np.union1d(every.client_wall_ns, also_at)
+    origin = moments[0]
+    at, when = (moments - origin).astype(float), (every.client_wall_ns - origin).astype(float)
+    half_ns = every.round_trip_ns / 2
+    choices = []
+    for sign in (1, -1):  # the best exchange up to a moment, and the best from it on
+        best = _running_least(half_ns - DRIFT_ALLOWANCE * when) if sign == 1 else _least_from(half_ns, when)
+        place = np.searchsorted(when, at, "right") - 1 if sign == 1 else np.searchsorted(when, at, "left")
+        chosen = best[np.clip(place, 0, len(when) - 1)]
+        bound_ns = half_ns[chosen] + DRIFT_ALLOWANCE * np.abs(at - when[chosen])
+        choices.append((chosen, bound_ns))
+    (before, before_ns), (after, after_ns) = choices
+    delta_ns = every.delta_ns[np.where(before_ns <= after_ns, before, after)]
+    gaps_ns = np.diff(at)
+    widest_ns = np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns))
+    return Offset(moments, delta_ns, np.minimum(before_ns, after_ns) + DRIFT_ALLOWANCE * widest_ns / 2)
+
+
+def _running_least(values: FloatArray) -> IntArray:
+    """Where the least of all values up to each is."""
+    return np.maximum.accumulate(np.where(values == np.minimum.accumulate(values), np.arange(len(values)), 0))
+
+
+def _least_from(half_ns: FloatArray, when: FloatArray) -> IntArray:
+    """Where the exchange is that says most of each moment of those at and after it."""
+    return len(when) - 1 - _running_least((half_ns + DRIFT_ALLOWANCE * when)[::-1])[::-1]
