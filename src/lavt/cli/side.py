@@ -25,6 +25,8 @@ from lavt.nodes.client_session import ClientSession
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.injector import Injector
+from lavt.transport.netem import Port
+from lavt.transport.netem_control import Netem
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
@@ -57,6 +59,7 @@ class Side:
         self._udp: dict[str, UdpLink] = {}
         if out is not None:
             check_directory(out)
+        queues = _queues(config)
         quiet_logs()
         self._zenoh = ZenohLink(
             clock,
@@ -67,7 +70,7 @@ class Side:
             vehicle=config.vehicle_id,
             who=config.who if isinstance(config, ClientConfig) else self._name,
         )
-        self._injector = Injector(clock, self._deliver, None)
+        self._injector = Injector(clock, self._deliver, queues, _never_delayed(config))
         self.tap = LiveTap(NoRecorder())
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
@@ -131,6 +134,21 @@ class Side:
             self._queue.close(self.clock.now())
             if self._writer is not None and not self._queue.failed:
                 self._writer.close()
+
+
+def _queues(config: ServerConfig | ClientConfig) -> Netem | None:
+    """Give the queues of the configured interface; raises `UserError` where nothing could be applied to it."""
+    if not config.injection.interface:
+        return None
+    netem = Netem(config.injection.interface)
+    for sentence in netem.check():
+        console.say(sentence)
+    return netem
+
+
+def _never_delayed(config: ServerConfig | ClientConfig) -> list[Port]:
+    port = config.clock.probe_port
+    return [Port("udp", port, "the clock probe")] if port else []
 
 
 def _in_words(status: Mapping[str, Any], ending: str | None) -> str:
