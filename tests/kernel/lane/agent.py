@@ -1,0 +1,34 @@
+"""A machine's agent: calls functions of the lane there, for tests that run on the other machine."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import traceback
+from multiprocessing.connection import Connection, Listener
+
+PORT = 7700
+
+
+def serve(address: str, key: bytes) -> None:
+    """Answer (function, arguments, keywords) with (what it raised or None, what it returned)."""
+    with Listener((address, PORT), authkey=key) as listener:
+        while True:
+            threading.Thread(target=_answer, args=(listener.accept(),), daemon=True).start()
+
+
+def _answer(connection: Connection) -> None:
+    while True:
+        try:
+            function, arguments, keywords = connection.recv()
+        except EOFError:
+            return
+        try:
+            connection.send((None, function(*arguments, **keywords)))
+        except Exception:
+            connection.send((traceback.format_exc(), None))
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1], os.environ["LAVT_KERNEL_KEY"].encode())

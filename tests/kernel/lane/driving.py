@@ -1,0 +1,109 @@
+"""A drive between the two machines: routers, server and client, each where it belongs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lavt.experiment.metrics import Measured, measure
+from lavt.experiment.record import Record, read_record
+from lavt.experiment.results import run_result
+from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
+REMOTE_FOLDER = "/run/tmp/drives"
+ROUTER_PORT = 7448
+BEGIN_S, LONGEST_S = 60, 240
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The four programs of a drive."""
+
+    server_router: Started
+    server: Started
+    client_router: Started
+    client: Started
+
+    def all(self) -> tuple[Started, ...]:
+        """List them in the order in which they were started."""
+        return self.server_router, self.server, self.client_router, self.client
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive: its run directory with both records, and what was computed from them."""
+
+    out: Path
+    server: Record
+    client: Record
+    measured: Measured
+    result: dict[str, Any]
+
+
+def start_loop(
+    server: Machine,
+    client: Machine,
+    out: Path,
+    *,
+    server_changes: Sequence[str] = (),
+    client_changes: Sequence[str] = (),
+) -> Loop:
+    """Start the four programs; `out` is a new directory's name on both machines."""
+    server_router = _start(server, "router", "zenoh-configs/router-server.json5")
+    server_router.first_line()
+    changes = [f"vehicle.route={SHORT_ROAD}", *server_changes]
+    server_program = _start(server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes)
+    dialled = json.dumps([f"udp/{server.address}:{ROUTER_PORT}?rel=1;mixed_rel=1"])
+    client_router = _start(
+        client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={dialled}"]
+    )
+    client_router.first_line()
+    server_program.first_line()
+    changes = [f"video.server={server.address}", *client_changes]
+    client_program = _start(client, "client", "configs/client.yaml", "--out", f"{out}/client", changes=changes)
+    client_program.first_line()
+    return Loop(server_router, server_program, client_router, client_program)
+
+
+def wait_for_the_end(loop: Loop) -> None:
+    """Wait until the server has seen the drive's end; raises `MachineError` where one of the others ends before."""
+
+    def ended() -> bool:
+        if not loop.server.running:
+            return True
+        for each in loop.all():
+            if not each.running and each is not loop.server:
+                raise MachineError(f"{' '.join(each.command)} ended in the middle of the drive: {each.errors}")
+        return False
+
+    wait_until(f"the drive has ended: {loop.server.command}", ended, LONGEST_S, every_ns=500_000_000)
+
+
+def collect(loop: Loop, client: Machine, out: Path) -> Drive:
+    """End the programs in order, bring the records together, and compute the result."""
+    for each in reversed(loop.all()):
+        each.stop()
+    (out / "server" / "server.mcap").rename(out / "server.mcap")
+    (out / "client.mcap").write_bytes(client.read(out / "client" / "client.mcap"))
+    server_record, client_record = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+    identity: Mapping[str, Any] = {"run": out.name, "time": "real", "route": SHORT_ROAD.stem}
+    return Drive(
+        out,
+        server_record,
+        client_record,
+        measure(server_record, client_record),
+        run_result(identity, server_record, client_record),
+    )
+
+
+def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> Started:
+    sets = [part for change in changes for part in ("--set", change)]
+    return machine.start(
+        [machine.python, "-B", "-m", "lavt", command, *arguments, *sets, "--json"],
+        environment={"OPENCV_FOR_THREADS_NUM": "1"},
+    )
