@@ -56,7 +56,7 @@ class Drive:
     """Further fields of the server's clock samples, or others than the usual."""
     client_clock: tuple[tuple[str, Any], ...] = ()
     probes: bool = True
-    """Whether the client's probe was answered, five times a second."""
+    """Whether the client's probe was answered, twice a second."""
     there_ms: float = 0.3
     """How long a probe took to the server."""
     back_ms: float = 0.3
@@ -198,7 +198,7 @@ def write_client(drive: Drive, path: Path) -> None:
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
         given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.client_clock)}
         writer.write("clock", given, now)
-    for index in range(-5, round(drive.seconds * 5) + 6 if drive.probes else -5):
+    for index in range(-2, round(drive.seconds * 2) + 3 if drive.probes else -2):
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
@@ -226,7 +226,7 @@ def write_client(drive: Drive, path: Path) -> None:
 
 
 def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
-    sent_ns = index * NS_PER_S // 5
+    sent_ns = index * NS_PER_S // 2
     reached_ns = sent_ns + round(drive.there_ms * NS_PER_MS)
     answered_ns = reached_ns + NS_PER_MS // 10
     arrived_ns = answered_ns + round(drive.back_ms * NS_PER_MS)

@@ -65,7 +65,7 @@ def test_each_fault_of_the_infrastructure_is_told(
     ],
 )
 def test_small_faults_are_borne(make_run: MakeRun, tmp_path: Path, settings: dict[str, Any]) -> None:
-    """Fewer than 1 % of the ticks missed, a clock that moved by less than the bounds, or one missed poll leave it valid."""
+    """Fewer than 1 % of the ticks missed, a clock moved by less than the bounds, or one missed poll leave it valid."""
     assert reasons(make_run, tmp_path, **settings) == []
 
 
