@@ -52,9 +52,9 @@ class Drive:
     client_unpolled_s: tuple[int, int] = (0, 0)
     capture_ms: float | None = None
     """From a frame's exposure to its stamp; None: the camera does not tell."""
-    server_clock: tuple[tuple[str, Any], ...] = ()
-    """Further fields of the server's clock samples, or others than the usual."""
-    client_clock: tuple[tuple[str, Any], ...] = ()
+    server_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
+    """Further fields of the server's clock sample of a second, or others than the usual."""
+    client_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
     probes: bool = True
     """Whether the client's probe was answered, twice a second."""
     there_ms: float = 0.3
@@ -102,7 +102,7 @@ def write_server(drive: Drive, path: Path) -> None:
             continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.server_clock)}
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.server_clock(second)}
         writer.write("clock", given, now)
     writer.write("event", {"mono_ns": drive.server(0).mono_ns, "kind": "drive_began", "detail": ""}, drive.server(0))
     writer.write(
@@ -196,7 +196,7 @@ def write_client(drive: Drive, path: Path) -> None:
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.client_clock)}
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
         writer.write("clock", given, now)
     for index in range(-2, round(drive.seconds * 2) + 3 if drive.probes else -2):
         write_probe(writer, drive, index)

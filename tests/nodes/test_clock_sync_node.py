@@ -85,7 +85,7 @@ def test_a_clock_that_is_set_back_between_arrival_and_answer() -> None:
 
 
 def test_an_exchange_is_written_down_with_all_four_times() -> None:
-    """The client writes down t1 to t4; the offset is half the difference of both ways, the round trip without t2 to t3."""
+    """The client writes down t1 to t4; the offset is half of both ways' difference, the round trip lacks t2 to t3."""
     node = ProbingClockSyncNode(MONO_NS)
     give(node, WAKE, None, at(0))
     sent_ns = at(0).wall_ns

@@ -22,7 +22,7 @@ from lavt.transport.clock_probe import (
 PERIOD_NS = NS_PER_S
 """Between two questions to the host's source of time."""
 PROBES = 2
-"""In that time. In virtual time without pictures each costs 1 % of all there is to do (`benchmarks/virtual_loop.py`)."""
+"""In that time. In virtual time without pictures they cost 2 % of all there is to do (`benchmarks/virtual_loop.py`)."""
 
 
 class ClockSyncNode:
