@@ -52,11 +52,11 @@ class Drive:
     client_unpolled_s: tuple[int, int] = (0, 0)
     capture_ms: float | None = None
     """From a frame's exposure to its stamp; None: the camera does not tell."""
-    server_clock: tuple[tuple[str, Any], ...] = ()
-    """Further fields of the server's clock samples, or others than the usual."""
-    client_clock: tuple[tuple[str, Any], ...] = ()
+    server_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
+    """Further fields of the server's clock sample of a second, or others than the usual."""
+    client_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
     probes: bool = True
-    """Whether the client's probe was answered, five times a second."""
+    """Whether the client's probe was answered, twice a second."""
     there_ms: float = 0.3
     """How long a probe took to the server."""
     back_ms: float = 0.3
@@ -105,7 +105,7 @@ def write_server(drive: Drive, path: Path) -> None:
             continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.server_clock)}
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.server_clock(second)}
         writer.write("clock", given, now)
     writer.write("event", {"mono_ns": drive.server(0).mono_ns, "kind": "drive_began", "detail": ""}, drive.server(0))
     writer.write(
@@ -199,9 +199,9 @@ def write_client(drive: Drive, path: Path) -> None:
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **dict(drive.client_clock)}
+        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
         writer.write("clock", given, now)
-    for index in range(-5, round(drive.seconds * 5) + 6 if drive.probes else -5):
+    for index in range(-2, round(drive.seconds * 2) + 3 if drive.probes else -2):
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns
@@ -229,7 +229,7 @@ def write_client(drive: Drive, path: Path) -> None:
 
 
 def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
-    sent_ns = index * NS_PER_S // 5
+    sent_ns = index * NS_PER_S // 2
     reached_ns = sent_ns + round(drive.there_ms * NS_PER_MS)
     answered_ns = reached_ns + NS_PER_MS // 10
     arrived_ns = answered_ns + round(drive.back_ms * NS_PER_MS)

@@ -112,7 +112,9 @@ def test_forgetting_the_clock_offset_is_noticed(tmp_path: Path) -> None:
     def forget(loop: VirtualLoop) -> None:
         for side, host in loop.runtime.hosts.items():
             host.clock_source = partial(
-                lambda name, clock, true_ns: ClockReport(*clock.at(true_ns), name, "forgetful", 0.0, 0.0001),
+                lambda name, clock, true_ns: ClockReport(
+                    clock.at(true_ns).mono_ns, clock.at(true_ns).wall_ns, name, "forgetful", 0.0, 0.0001
+                ),
                 side,
                 host.clock,
             )

@@ -42,16 +42,16 @@ def test_a_report_is_written_down_as_it_is() -> None:
     assert send == Send("clock", REPORT)
 
 
-def test_the_client_probes_five_times_a_second() -> None:
-    """The client sends a probe every 200 ms, each with its own number and its time, and asks its source once a second."""
+def test_the_client_probes_twice_a_second() -> None:
+    """The client sends a probe every 500 ms, with a number and its time, and asks its source every second time."""
     node = ProbingClockSyncNode(MONO_NS)
     sent = []
     for tick in range(10):
-        assert node.next_wake_ns() == at(tick * NS_PER_S // 5).mono_ns
-        sent += give(node, WAKE, None, at(tick * NS_PER_S // 5 + 3))
-    assert [send.channel for send in sent].count("clock_query") == 2
+        assert node.next_wake_ns() == at(tick * NS_PER_S // 2).mono_ns
+        sent += give(node, WAKE, None, at(tick * NS_PER_S // 2 + 3))
+    assert [send.channel for send in sent].count("clock_query") == 5
     requests = [decode_request(send.payload) for send in sent if send.channel == "probe_request"]
-    assert requests == [(tick + 1, at(tick * NS_PER_S // 5 + 3).wall_ns) for tick in range(10)]
+    assert requests == [(tick + 1, at(tick * NS_PER_S // 2 + 3).wall_ns) for tick in range(10)]
 
 
 def test_late_probes_are_not_made_up_for() -> None:
@@ -60,8 +60,7 @@ def test_late_probes_are_not_made_up_for() -> None:
     give(node, WAKE, None, at(0))
     sent = give(node, WAKE, None, at(3_700 * NS_PER_MS))
     assert [send.channel for send in sent] == ["clock_query", "probe_request"]
-    assert node.next_wake_ns() == at(3_800 * NS_PER_MS).mono_ns
-    assert [send.channel for send in give(node, WAKE, None, at(3_800 * NS_PER_MS))] == ["probe_request"]
+    assert node.next_wake_ns() == at(4_000 * NS_PER_MS).mono_ns
 
 
 def test_the_server_answers_with_its_times_and_what_its_source_said_last() -> None:
@@ -86,7 +85,7 @@ def test_a_clock_that_is_set_back_between_arrival_and_answer() -> None:
 
 
 def test_an_exchange_is_written_down_with_all_four_times() -> None:
-    """The client writes down t1 to t4; the middle is half of both ways' difference, the round trip leaves out t2 to t3."""
+    """The client writes down t1 to t4; the offset is half of both ways' difference, the round trip lacks t2 to t3."""
     node = ProbingClockSyncNode(MONO_NS)
     give(node, WAKE, None, at(0))
     sent_ns = at(0).wall_ns
@@ -114,7 +113,7 @@ def test_what_is_no_answer_is_counted() -> None:
 
 
 def test_the_server_counts_garbage() -> None:
-    """What is no request is counted and not answered; a reply is not answered either, so that two servers keep still."""
+    """What is no request is counted and not answered; nor is a reply, so that two servers keep still."""
     node = ClockSyncNode(MONO_NS)
     for data in (b"", b"LC", bytes(48), encode_reply(ProbeReply(1, 2, 3, 4, None, None)), encode_request(1, 2) + b"x"):
         assert not give(node, "probe_request", data, at(0))
@@ -125,5 +124,5 @@ def test_unanswered_probes_are_counted_and_forgotten() -> None:
     """Where no answer comes the client remembers the last two seconds, and counts the rest as unanswered."""
     node = ProbingClockSyncNode(MONO_NS)
     for tick in range(50):
-        give(node, WAKE, None, at(tick * NS_PER_S // 5))
-    assert node.counts["probes_unanswered"] == 40
+        give(node, WAKE, None, at(tick * NS_PER_S // 2))
+    assert node.counts["probes_unanswered"] == 46

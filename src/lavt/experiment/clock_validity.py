@@ -89,7 +89,7 @@ def offset_reasons(server: Record, client: Record, clocks: Clocks) -> list[str]:
         words = ", ".join(f"{side}: {status}" for side, status in said.items())
         return [f"the offset between the clocks is not known ({words}), and the probe had no answer"]
     unfit = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
-    return unfit or [*_bound_reasons(clocks), *_agreement_reasons(clocks)]
+    return unfit or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
 
 
 def _status(samples: Table) -> str:
@@ -180,12 +180,16 @@ def _bound_reasons(clocks: Clocks) -> list[str]:
     return []
 
 
+def _unchecked_reasons(clocks: Clocks) -> list[str]:
+    if clocks.probe is not None:
+        return []
+    return [
+        "the probe had no answer during the drive, so that nobody has checked the offset between the clocks: open "
+        "the server's UDP port clock.probe_port"
+    ]
+
+
 def _agreement_reasons(clocks: Clocks) -> list[str]:
-    if clocks.probe is None:
-        return [
-            "the probe had no answer during the drive, so that nobody has checked the offset between the clocks: open "
-            "the server's UDP port clock.probe_port"
-        ]
     apart_ms = clocks.disagreement_ms()
     if apart_ms is None:
         return []

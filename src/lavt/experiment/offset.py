@@ -73,7 +73,7 @@ class _Correction:
 def by_sources(server: Table, client: Table) -> Offset | None:
     """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
 
-    Its moments are those of the samples of both. The bound is that of the path between the hosts where one follows the
+    Its moments are those of the samples of both, from when both know theirs. The bound is that of the path between the hosts where one follows the
     other, else the sum of both hosts' own, and what the line between two samples can miss (`docs/metrics.md`).
     """
     hosts = [_correction(server, client), _correction(client, server)]
@@ -81,6 +81,7 @@ def by_sources(server: Table, client: Table) -> Offset | None:
         return None
     of_server, of_client = hosts[0], hosts[1]
     moments = np.union1d(of_server.reference_ns, of_client.reference_ns)
+    moments = moments[moments >= max(of_server.reference_ns[0], of_client.reference_ns[0])]
     bound_ns = of_server.at(moments, of_server.own_bound_ns) + of_client.at(moments, of_client.own_bound_ns)
     for follower in (of_server, of_client):
         peer_bound_ns = follower.at(moments, follower.peer_bound_ns)

@@ -1,0 +1,101 @@
+"""`lavt clock`: how good the clocks are, before anything is measured with them."""
+
+from __future__ import annotations
+
+import queue
+from contextlib import closing
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+import typer
+
+from lavt.build.clock_source import clock_source
+from lavt.cli import console
+from lavt.clock import MachineClock, pause
+from lavt.config import ClockConfig
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.errors import BadMessage, WorkError
+from lavt.experiment.clock_check import check_host, compare
+from lavt.node import Send
+from lavt.transport.clock_probe import ClockProbe, ProbeReply, decode_reply, encode_request
+from lavt.transport.udp_link import UdpLink, look_up
+
+PROBE_PERIOD_NS = 50 * NS_PER_MS
+LAST_REPLY_NS = 500 * NS_PER_MS
+"""How long the last reply may take."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("clock")(clock)
+
+
+def clock(
+    server: Annotated[str | None, typer.Option(help="Also probe the `lavt server` on this host.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = 5602,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="For how long to probe.")] = 3.0,
+    source: Annotated[
+        Literal["chrony", "ptp"], typer.Option(help="Who is asked about this machine's clock.")
+    ] = "chrony",
+    as_json: console.Json = False,
+) -> None:
+    """Say how this machine's clock is and, with --server, how far from the vehicle's; ends with 1 if not good enough.
+
+    Example: lavt clock --server 192.0.2.7
+    """
+    address = None if server is None else look_up("--server", server)
+    machine = MachineClock()
+    ask = clock_source(ClockConfig(source=source), machine)
+    if address is None:
+        report = ask()
+        finding = check_host(report)
+    else:
+        probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
+        report = ask()
+        if latest is None:
+            raise WorkError(
+                f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its clock.probe_port "
+                f"{port}, and does the firewall let it through?"
+            )
+        finding = compare(report, probes, latest, address)
+    if as_json:
+        console.show_json({**asdict(finding), "clock": asdict(report)})
+    else:
+        for sentence in finding.says:
+            console.show(f"{sentence}.")
+    if not finding.good:
+        raise typer.Exit(1)
+
+
+def probe(
+    machine: MachineClock, address: str, port: int, duration_ns: int
+) -> tuple[list[ClockProbe], ProbeReply | None]:
+    """Probe a server for a while: all whole exchanges, and the last reply; what is no reply to a request is dropped."""
+    replies: queue.SimpleQueue[tuple[bytes, Now]] = queue.SimpleQueue()
+
+    def deliver(_channel: str, payload: Any, arrived: Now, _peer: Any) -> None:
+        replies.put((payload, arrived))
+
+    sent: dict[int, int] = {}
+    link = UdpLink(machine, "probe_reply", deliver, bind=("", 0), remote=(address, port), name="probe")
+    with closing(link):
+        link.start()
+        end_ns = machine.now().mono_ns + duration_ns
+        while machine.now().mono_ns < end_ns:
+            sent[len(sent)] = machine.now().wall_ns
+            link.send(Send("probe_request", encode_request(len(sent) - 1, sent[len(sent) - 1])))
+            pause(PROBE_PERIOD_NS)
+        pause(LAST_REPLY_NS)
+    probes: list[ClockProbe] = []
+    latest = None
+    while not replies.empty():
+        payload, arrived = replies.get()
+        try:
+            reply = decode_reply(payload)
+        except BadMessage:
+            continue
+        if sent.pop(reply.sequence, None) == reply.sent_wall_ns:
+            times = (reply.sent_wall_ns, reply.received_wall_ns, reply.answered_wall_ns, arrived.wall_ns)
+            probes.append(ClockProbe(reply.sequence, *times))
+            latest = reply
+    return probes, latest
