@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import lavt
-from lavt.cli import client, console, demo, perception, relay, report, road, router, run, server, stop, sweep
+from lavt.cli import client, console, demo, netem, perception, relay, report, road, router, run, server, stop, sweep
 
 app = typer.Typer(
     name="lavt",
@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (demo, run, sweep, report, road, perception, server, client, stop, router, relay):
+for command in (demo, run, sweep, report, road, perception, server, client, stop, router, relay, netem):
     command.register(app)
 
 
