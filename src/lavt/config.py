@@ -369,11 +369,35 @@ class RelayConfig(Section):
     seed: int = Field(1, ge=0, lt=2**63)
 
 
+class Impairment(Section):
+    """What the network does to a flow beside a constant delay; see `docs/netem.md`."""
+
+    jitter_ms: float = Field(0.0, ge=0, le=10_000)
+    """Standard deviation of the delay; of a uniform law the half width."""
+    jitter_correlation: float = Field(0.0, ge=0, lt=1)
+    """Of the delay with itself 20 ms before."""
+    jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] = "normal"
+    loss: float = Field(0.0, ge=0, lt=1)
+    loss_burst_packets: float = Field(0.0, ge=0, le=10_000)
+    """Mean length of a burst of lost packets; 0 or 1: each is lost by itself."""
+    rate_bps: int = Field(0, ge=0, le=10_000_000_000)
+    """0: no limit."""
+    reorder: float = Field(0.0, ge=0, lt=1)
+    """Share of packets that are not delayed, and so overtake."""
+
+
 class Condition(Section):
     """What is injected under a condition."""
 
     video_ms: float = Field(ge=0, le=60_000)
     control_ms: float = Field(ge=0, le=60_000)
+    video: Impairment = Impairment()
+    control: Impairment = Impairment()
+
+    @property
+    def is_delay_only(self) -> bool:
+        """Whether nothing but a constant delay is injected."""
+        return self.video == self.control == Impairment()
 
 
 class Costs(Section):

@@ -13,6 +13,7 @@ from lavt.cli import (
     console,
     demo,
     join,
+    netem,
     perception,
     relay,
     report,
@@ -32,7 +33,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (demo, run, sweep, report, join, road, perception, server, client, stop, router, relay, clock):
+COMMANDS = (demo, run, sweep, report, join, road, perception, server, client, stop, router, relay, netem, clock)
+for command in COMMANDS:
     command.register(app)
 
 

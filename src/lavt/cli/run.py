@@ -12,6 +12,7 @@ from lavt.cli.live_view import LiveView
 from lavt.config import RunConfig
 from lavt.config_file import load_config
 from lavt.experiment.directory import check_directory
+from lavt.experiment.netem_run import check_netem
 from lavt.experiment.plan import plan_run
 from lavt.experiment.run import run_once
 
@@ -34,6 +35,8 @@ def run(
     planned = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
     check_directory(out)
+    for restored in check_netem(planned):
+        console.say(f"lavt: {restored}")
     title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)

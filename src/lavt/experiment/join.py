@@ -14,12 +14,10 @@ from lavt.config_file import condition, load_config
 from lavt.errors import UserError
 from lavt.experiment.directory import check_directory, make_directory
 from lavt.experiment.record import read_record
-from lavt.experiment.run import CONFIG, compute_result
+from lavt.experiment.run import CONFIG, NETWORK, compute_result
 from lavt.experiment.table import MISSING
 
 SIDES = ("server", "client")
-NETWORK = "network"
-"""What `inherent` is in a result: the latency of whatever lies between the two machines."""
 
 
 def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:

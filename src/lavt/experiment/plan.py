@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from lavt.build.entropy import run_seed
+from lavt.build.injection import netem_flows
 from lavt.build.sides import check_names
-from lavt.config import RunConfig, SweepConfig
+from lavt.config import Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
+from lavt.transport.netem import check_flows
 
 TAKEN = {"vehicle.route": "routes", "network.condition": "conditions"}
 """What a sweep varies anyway, by keys of its own."""
@@ -32,6 +34,7 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
     """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
     asked = condition(config.network.condition)
     check_names(config.vehicle, config.controller)
+    _check_injection(config, asked)
     nothing = (config.network.inherent, asked.video_ms, asked.control_ms) == ("loopback", 0, 0)
     if config.time == "real" and config.network.injection == "none" and not nothing:
         raise UserError(
@@ -63,6 +66,23 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         **({"axes": dict(axes)} if axes else {}),
     }
     return PlannedRun(name, config, identity, seed)
+
+
+def _check_injection(config: RunConfig, asked: Condition) -> None:
+    """Raise `UserError` where what injects cannot do what the condition or the profile asks."""
+    network = config.network
+    if config.time == "real" and network.injection == "netem":
+        if network.inherent != "loopback":
+            raise UserError(
+                f"netem cannot do the lognormal part of network.inherent {network.inherent}: choose loopback, or "
+                "network.injection relay"
+            )
+        check_flows(netem_flows(asked, "both", video_port=1, control_port=2, state_delay=network.state_delay))
+    elif not asked.is_delay_only:
+        raise UserError(
+            f"condition {network.condition} has more than a constant delay, which only the kernel can do so far: "
+            "choose network.injection: netem and time: real"
+        )
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:

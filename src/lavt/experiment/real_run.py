@@ -1,10 +1,14 @@
-"""One run in real time on this machine: two routers, a relay, a server and a client, each a process of its own."""
+"""One run in real time on this machine: two routers, a server, a client and a relay, each a process of its own.
+
+Or no relay, where netem on the loopback does its work.
+"""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +22,7 @@ from lavt.config import DelayConfig, RelayConfig
 from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
+from lavt.experiment.netem_run import NETEM, NetemRun, by_netem
 from lavt.experiment.network import Network, injected_network
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import LAVT, Process, Processes
@@ -64,10 +69,11 @@ def start_loop(
     rearm: bool = False,
     once: bool = True,
     server_program: Sequence[str] = LAVT,
+    netem: NetemRun | None = None,
 ) -> Loop:
     """Start everything in order, each part told the ports of those before; records go into `out`.
 
-    Without `once` the server stays after the first drive's end.
+    Without `once` the server stays after the first drive's end. `netem` holds the flows from before the client starts.
     """
     run = planned.config
     server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
@@ -85,6 +91,8 @@ def start_loop(
         )
         ports = relay.ready()["ports"]
         video_port, control_port = ports["video"], ports["control"]
+    elif netem is not None:
+        netem.apply(video_port=video_port, control_port=control_port)
     dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
     client_router, local = start_client_router(processes, dialled)
     config = client_config(run, router=local, video_port=video_port, probe_port=probe_port)
@@ -101,7 +109,7 @@ def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_
 
 
 def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
-    """Drive once, leaving the two records in `out` and, of a relay, what was asked of it and what it did.
+    """Drive once, leaving the two records in `out` and, of relay or netem, what was asked of it and what it did.
 
     Raises `WorkError` where a part ends or nobody gets to drive; what was recorded by then is left in `out` too.
     """
@@ -109,13 +117,17 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
         try:
-            with Processes(work) as processes:
-                loop = start_loop(processes, planned, work, work)
+            with ExitStack() as stack:
+                netem = stack.enter_context(NetemRun(planned)) if by_netem(planned) else None
+                processes = stack.enter_context(Processes(work))
+                loop = start_loop(processes, planned, work, work, netem=netem)
                 _wait_for_the_end(processes, loop, clock, progress)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
                     write_json(out / RELAY, {"asked_ms": _asked_ms(planned), **loop.relay.last_line()})
+                if netem is not None:
+                    write_json(out / NETEM, netem.report())
         finally:
             for record in work.glob("*/*.mcap"):
                 shutil.move(record, out / record.name)

@@ -11,6 +11,8 @@ import yaml
 
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
+from lavt.experiment.injection import recorded_reasons
+from lavt.experiment.netem_run import NETEM, netem_reasons
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.real_run import RELAY, Progress, drive_real, relay_reasons
 from lavt.experiment.record import read_record
@@ -19,6 +21,8 @@ from lavt.experiment.virtual_run import build_loop, drive
 
 CONFIG = "config.yaml"
 RESULT = "result.json"
+NETWORK = "network"
+"""What `inherent` is of a run on two machines: the latency of whatever lies between them."""
 
 
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -50,12 +54,16 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 
 
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
-    """Compute `result.json` from what the run left in `out`: its records and, where there was a relay, its report."""
+    """Compute `result.json` from what the run left in `out`: its records and what the relay or netem said."""
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
     reasons = []
     if identity["injection"] == "relay":
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
         reasons = relay_reasons(relay)
+    elif identity["injection"] == "netem" and identity["inherent"] == NETWORK:
+        reasons = recorded_reasons(server, client, identity["condition"], identity["injected_ms"])
+    elif identity["injection"] == "netem":
+        reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
     return result

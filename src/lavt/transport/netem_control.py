@@ -45,6 +45,7 @@ from lavt.transport.netem_tc import (
     show_qdiscs,
     uniform_table,
 )
+from lavt.transport.netem_wander import Wander
 from lavt.value import value
 
 TC_LIMIT_S: Final = 10.0
@@ -72,10 +73,15 @@ TELLING: Final = (
 """What tc says when it is refused, and what we say."""
 
 
+def tc_environment() -> dict[str, str]:
+    """Give the environment in which tc is found, and speaks English."""
+    return {**os.environ, "PATH": os.environ.get("PATH", "") + ":/usr/sbin:/sbin", "LC_ALL": "C"}
+
+
 def run_tc(command: Command) -> str:
     """Run a command of tc; raises `UserError` for what a user can put right, `WorkError` for everything else."""
-    path = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
-    if shutil.which("tc", path=path) is None:
+    environment = tc_environment()
+    if shutil.which("tc", path=environment["PATH"]) is None:
         raise UserError("there is no tc on this machine: install iproute2, or use the relay, which needs none")
     try:
         ended = subprocess.run(  # noqa: S603 (our own words; the interface's name is checked)
@@ -86,7 +92,7 @@ def run_tc(command: Command) -> str:
             timeout=TC_LIMIT_S,
             check=False,
             stdin=subprocess.DEVNULL,
-            env={**os.environ, "PATH": path, "LC_ALL": "C"},
+            env=environment,
         )
     except subprocess.TimeoutExpired as error:
         raise WorkError(f"`{as_typed(command)}` did not end within {TC_LIMIT_S:.0f} s") from error
@@ -111,7 +117,7 @@ class Netem:
     """The delay of one interface. As a context it puts the interface back at its end, however it ends.
 
     `stays`: what is applied outlives this process, as no program owns it. `directory` holds what is written down for a
-    restart. Raises `UserError` for a name that no interface can have.
+    restart. `seed` is that of correlated jitter. Raises `UserError` for a name that no interface can have.
     """
 
     def __init__(
@@ -122,6 +128,7 @@ class Netem:
         directory: Path = DIRECTORY,
         run: RunCommand = run_tc,
         clock: Clock | None = None,
+        seed: int = 1,
     ) -> None:
         if not re.fullmatch(r"(?!-)[^\s/]{1,15}", interface) or interface in {".", ".."}:
             raise UserError(f"{interface!r} is no name of an interface: `ip link` names those there are")
@@ -131,6 +138,8 @@ class Netem:
         self._owner = NOBODY if stays else this_process()
         self._run = run
         self._clock = clock or MachineClock()
+        self._seed = seed
+        self._wander: Wander | None = None
 
     def __enter__(self) -> Netem:
         return self
@@ -167,6 +176,12 @@ class Netem:
         interface that carries somebody else's queue, or a delay that another program of ours owns.
         """
         check_flows(flows, never)
+        wanders = any(flow.law.jitter_correlation for flow in flows)
+        if wanders and self._owner == NOBODY:
+            raise UserError(
+                "correlated jitter needs a program that stays: `lavt netem apply --hold`, or network.injection: netem"
+            )
+        self._stand_still()
         self.restore()
         with self._files.alone():
             self._check_owner()
@@ -175,21 +190,17 @@ class Netem:
             self._files.write(applied)
             if any(flow.law.jitter_distribution == "uniform" for flow in flows):
                 (self._files.directory / "uniform.dist").write_text(uniform_table())
-            if qdiscs:
-                return self._change(flows, qdiscs)
-            try:
-                return self._do([add_root(self.interface)]) + self._change(flows, [])
-            except LavtError:
-                with suppress(LavtError):
-                    self._do([delete_root(self.interface)])
-                self._files.forget(self.interface)
-                raise
+            ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
+        if wanders:
+            self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
+        return ran
 
     def clear(self, *, at_once: bool = False) -> list[Command]:
         """Put the interface back as it was; give the commands that did it, none where nothing of ours was there.
 
         What is under way is waited for, in order, and nothing is lost; `at_once` loses it.
         """
+        self._stand_still()
         with self._files.alone():
             ran = self._clear(self.interface, at_once=at_once)
             self._files.forget(self.interface)
@@ -260,6 +271,22 @@ class Netem:
                     f"(`tc qdisc del dev {interface} root`), or name another interface"
                 )
         return []
+
+    def _begin(self, flows: Sequence[Flow]) -> list[Command]:
+        """Hold flows on an interface that is free; where that fails it is left as it was."""
+        try:
+            return self._do([add_root(self.interface)]) + self._change(flows, [])
+        except LavtError:
+            with suppress(LavtError):
+                self._do([delete_root(self.interface)])
+            self._files.forget(self.interface)
+            raise
+
+    def _stand_still(self) -> None:
+        """Let no delay wander any more."""
+        if self._wander is not None:
+            self._wander.end()
+            self._wander = None
 
     def _change(self, flows: Sequence[Flow], qdiscs: Sequence[Qdisc]) -> list[Command]:
         """Bring our queues from what they are to what is asked."""
