@@ -1,12 +1,18 @@
-"""What the tests on a real kernel share: the machines, their clocks, chrony, netem and drives between them."""
+"""What the tests on a real kernel share: the two machines, the truth of their clocks, and drives between them.
+
+Each test finds the machines as they were: nothing started by the one before, clocks set back, no queue left.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
+from tests.kernel.lane import clocks, netem
+from tests.kernel.lane.driving import Drive, collect, start_loop, wait_for_the_end
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine
 from tests.require import need
 
@@ -21,22 +27,57 @@ def pytest_runtest_setup() -> None:
 
 
 @pytest.fixture(scope="session")
-def _machines() -> tuple[Machine, Machine]:
+def machines() -> tuple[Machine, Machine]:
+    """Give both machines, with one time; `server_machine` and `client_machine` are what tests take."""
     if LANE != "pair":
         pytest.skip("needs two machines: run tests/kernel/run without --native")
     key = os.environ["LAVT_KERNEL_KEY"].encode()
-    return local_machine("server", "10.9.0.1"), remote_machine("client", "10.9.0.2", "10.9.1.2", key)
+    pair = local_machine("server", "10.9.0.1"), remote_machine("client", "10.9.0.2", "10.9.1.2", key)
+    pair[1].call(clocks.step, offset_ns(*pair))
+    return pair
 
 
 @pytest.fixture
-def server_machine(_machines: tuple[Machine, Machine]) -> Iterator[Machine]:
+def server_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Give the vehicle's machine, which the tests run on."""
-    yield _machines[0]
-    _machines[0].end_all()
+    yield from as_it_was(machines[0])
 
 
 @pytest.fixture
-def client_machine(_machines: tuple[Machine, Machine]) -> Iterator[Machine]:
+def client_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
     """Give the remote machine."""
-    yield _machines[1]
-    _machines[1].end_all()
+    yield from as_it_was(machines[1])
+
+
+def as_it_was(machine: Machine) -> Iterator[Machine]:
+    less_raw_ns = machine.call(clocks.wall_less_raw_ns)
+    yield machine
+    machine.end_all()
+    machine.call(clocks.restore, less_raw_ns)
+    netem.clear(machine)
+
+
+@pytest.fixture
+def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable[[], int]:
+    """Tell how far the server's wall clock is ahead of the client's, from what both read of one counter."""
+    return lambda: offset_ns(server_machine, client_machine)
+
+
+def offset_ns(server: Machine, client: Machine) -> int:
+    client_counter, client_ns = client.call(clocks.reading)
+    server_counter, server_ns = server.call(clocks.reading)
+    gone_ns = (server_counter - client_counter) / clocks.counter_hz() * clocks.NS_PER_S
+    return server_ns - client_ns - round(gone_ns)
+
+
+@pytest.fixture
+def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path) -> Callable[..., Drive]:
+    """Drive once over both machines, from the start of the four programs to the result."""
+
+    def once(name: str = "drive", *, server: tuple[str, ...] = (), client: tuple[str, ...] = ()) -> Drive:
+        out = tmp_path / name
+        loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
+        wait_for_the_end(loop)
+        return collect(loop, client_machine, out)
+
+    return once

@@ -1,13 +1,123 @@
-"""The lane itself."""
+"""The lane itself: two machines that are really two, and tools that tell the truth about them."""
 
 from __future__ import annotations
 
-import subprocess
+from collections.abc import Callable
+
+import pytest
+
+from lavt.clock import pause
+from lavt.domain import NS_PER_MS, NS_PER_S
+from tests.kernel.lane import clocks, ntp_server
+from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
+from tests.kernel.lane.machine import Machine, MachineError
+from tests.kernel.lane.netem import netem_on_all
+
+TrueOffset = Callable[[], int]
+NTP_PORT = 11123
 
 
-def test_each_guest_has_netem() -> None:
-    """x."""
-    subprocess.run(["tc", "qdisc", "add", "dev", "vec0", "root", "netem", "delay", "1ms"], check=True)
-    subprocess.run(["tc", "qdisc", "del", "dev", "vec0", "root"], check=True)
-    subprocess.run(["ping", "-c", "3", "10.9.0.2"], check=True)
-    subprocess.run(["ping", "-c", "3", "10.9.1.2"], check=True)
+def round_trip_ms(machine: Machine, to: Machine) -> float:
+    said = machine.run(["ping", "-c", "11", "-i", "0.05", "-q", to.address])
+    return float(said.rpartition(" = ")[2].split("/")[1])
+
+
+def delta_ns(server: Machine, client: Machine) -> float:
+    return (correction_s(client) - correction_s(server)) * NS_PER_S
+
+
+def test_a_delay_on_one_machine_is_in_the_round_trip_and_gone_afterwards(
+    server_machine: Machine, client_machine: Machine
+) -> None:
+    """Each machine has netem, on a link that the other's delay is not part of."""
+    for machine in (server_machine, client_machine):
+        with netem_on_all(machine, "delay", "50ms"):
+            assert 49 < round_trip_ms(server_machine, client_machine) < 56
+    assert round_trip_ms(server_machine, client_machine) < 5
+
+
+def test_what_fails_on_the_other_machine_is_told_here(client_machine: Machine) -> None:
+    """A program that fails on the client's machine raises with what it said, and so does a function."""
+    with pytest.raises(MachineError, match="ended with 2: .*no-such-file"):
+        client_machine.run(["ls", "/no-such-file"])
+    with pytest.raises(MachineError, match="No such file"):
+        client_machine.read("/no-such-file")
+
+
+def test_a_started_program_ends_with_its_test(client_machine: Machine) -> None:
+    """What a test has started on a machine is gone when the machine is left."""
+    started = client_machine.start(["sleep", "600"])
+    assert started.running
+    client_machine.end_all()
+    assert not started.running
+
+
+def test_a_step_of_one_clock_is_the_change_of_the_true_offset(
+    server_machine: Machine, true_offset_ns: TrueOffset
+) -> None:
+    """Setting the server's clock 250 ms ahead changes the offset between the machines by 250 ms, to 50 us."""
+    before_ns = true_offset_ns()
+    assert abs(before_ns) < 5 * NS_PER_MS
+
+    server_machine.call(clocks.step, 250 * NS_PER_MS)
+
+    assert true_offset_ns() - before_ns == pytest.approx(250 * NS_PER_MS, abs=50_000)
+
+
+def test_the_true_offset_is_what_an_exchange_of_time_stamps_finds(
+    server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
+) -> None:
+    """Four time stamps over the network find the true offset within half their round trip."""
+    server_machine.call(clocks.step, -70 * NS_PER_MS)
+    client_machine.start_python(
+        "tests.kernel.lane.ntp_server", client_machine.address, str(NTP_PORT)
+    ).first_line()
+
+    client_ahead_ns, round_trip_ns = ntp_server.ask(client_machine.address, NTP_PORT)
+
+    assert round_trip_ns < 5 * NS_PER_MS
+    assert -client_ahead_ns == pytest.approx(true_offset_ns(), abs=round_trip_ns / 2)
+
+
+def test_a_drift_of_one_clock_is_the_rate_of_the_true_offset(
+    server_machine: Machine, true_offset_ns: TrueOffset
+) -> None:
+    """A server's clock that runs 30 ppm fast gains 30 us on the client's in each second, to 5 us."""
+    begin_raw_ns, begin_ns = clocks.raw_ns(), true_offset_ns()
+    server_machine.call(clocks.drift, 30)
+    pause(4 * NS_PER_S)
+    gone_s = (clocks.raw_ns() - begin_raw_ns) / NS_PER_S
+
+    assert (true_offset_ns() - begin_ns) / gone_s == pytest.approx(30_000, abs=5_000)
+
+
+def test_chrony_of_the_client_finds_the_offset(
+    server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
+) -> None:
+    """chronyd that follows the server, and touches no clock, finds a server 250 ms ahead to 1 ms."""
+    server_machine.call(clocks.step, 250 * NS_PER_MS)
+    start_chronyd(server_machine, *SERVING)
+    start_chronyd(client_machine, following(server_machine.address))
+    wait_synchronised(client_machine, updates=8)
+
+    assert delta_ns(server_machine, client_machine) == pytest.approx(true_offset_ns(), abs=NS_PER_MS)
+
+
+def test_chrony_finds_the_offset_while_the_server_is_slewed(
+    server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
+) -> None:
+    """While the server's clock slews towards a third one, the difference of both corrections is the true offset."""
+    server_machine.start_python(
+        "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(60 * NS_PER_MS), "20"
+    ).first_line()
+    start_chronyd(
+        server_machine, following("127.0.0.1", NTP_PORT), "maxslewrate 1000", "allow", adjusts_clock=True
+    )  # fmt: skip
+    wait_synchronised(server_machine, updates=4)
+    start_chronyd(client_machine, following(server_machine.address))
+    wait_synchronised(client_machine, updates=8)
+
+    for _ in range(5):
+        assert correction_s(server_machine) > 0.005, "it slews still"
+        assert delta_ns(server_machine, client_machine) == pytest.approx(true_offset_ns(), abs=NS_PER_MS)
+        pause(NS_PER_S)
