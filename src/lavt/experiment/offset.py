@@ -73,8 +73,9 @@ class _Correction:
 def by_sources(server: Table, client: Table) -> Offset | None:
     """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
 
-    Its moments are those of the samples of both, from when both know theirs. The bound is that of the path between the hosts where one follows the
-    other, else the sum of both hosts' own, and what the line between two samples can miss (`docs/metrics.md`).
+    Its moments are those of the samples of both, from when both know theirs. The bound is that of the path between the
+    hosts where one follows the other, else the sum of both hosts' own, and what the line between two samples can
+    miss (`docs/metrics.md`).
     """
     hosts = [_correction(server, client), _correction(client, server)]
     if hosts[0] is None or hosts[1] is None:
@@ -137,14 +138,14 @@ def _rates(moments: IntArray, values: FloatArray) -> FloatArray:
 def _missed_ns(moments: IntArray, samples: _Correction) -> FloatArray:
     """How far the truth can be from the line between two samples.
 
-    A correction that is worked off at one rate and then at another bends once: a quarter of the change of rate times
-    the time between the samples is the farthest that a bend can be from the line.
+    Nobody sees when between them a clock began or ceased to be steered: what a line rises more or less than its
+    neighbours may have come all at once.
     """
     if len(samples.reference_ns) < 3:
         return np.zeros(len(moments))
     rates = _rates(samples.reference_ns, samples.correction_ns)
-    bends = np.abs(np.append(rates[1:], rates[-1]) - np.append(rates[0], rates[:-1]))
-    missed_ns = bends * np.diff(samples.reference_ns) / 4
+    bends = np.abs(np.diff(rates))
+    missed_ns = np.maximum(np.append(bends, 0.0), np.append(0.0, bends)) * np.diff(samples.reference_ns)
     interval = np.clip(np.searchsorted(samples.reference_ns, moments, "right") - 1, 0, len(missed_ns) - 1)
     return np.asarray(missed_ns[interval], np.float64)
 
