@@ -247,8 +247,8 @@ def _clocks(runs: Sequence[Mapping[str, Any]]) -> list[str]:
         clock_table(apart),
         page.paragraph(
             "Delta is the server's clock less the client's in the middle of the drive; ± is the largest bound during "
-            "it, that of every one-way latency of the run. The hosts' sources of time and the probe are two opinions: a "
-            "run in which they contradict each other does not count.",
+            "it, that of every one-way latency of the run. The hosts' sources of time and the probe are two opinions: "
+            "a run in which they contradict each other does not count.",
             note=True,
         ),
     ]
