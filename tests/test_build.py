@@ -4,6 +4,7 @@ import math
 from contextlib import suppress
 from dataclasses import replace
 from itertools import repeat
+from typing import Literal
 
 import pytest
 from hypothesis import given
@@ -11,11 +12,13 @@ from hypothesis import strategies as st
 
 from lavt.build.addresses import parse_address
 from lavt.build.cameras import camera_model
+from lavt.build.clock_source import clock_source
 from lavt.build.entropy import MachineEntropy, SeededEntropy, run_seed
 from lavt.build.fidelity import FIDELITIES
 from lavt.build.sides import build_controller, build_server, check_names
 from lavt.build.vehicles import build_plant, build_unpictured, car_of
-from lavt.config import CameraConfig, ControllerConfig, ServerConfig, VehicleConfig
+from lavt.clock import MachineClock
+from lavt.config import CameraConfig, ClockConfig, ControllerConfig, ServerConfig, VehicleConfig
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
@@ -153,3 +156,27 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
         woken.append(wakes)
     assert woken[0] == woken[2] > 240
     assert woken[1] <= 82
+
+
+def test_an_external_source_of_time_says_what_the_config_says() -> None:
+    """Correction and bound of an external source are those of the config, in seconds."""
+    report = clock_source(ClockConfig(source="external", correction_ms=-2.5, bound_ms=0.5), MachineClock())()
+    assert report is not None
+    assert (report.source, report.correction_s, report.bound_s) == ("external", -0.0025, 0.0005)
+
+
+def test_a_clock_may_be_left_to_the_probe() -> None:
+    """With source probe nobody is asked, and the report knows no correction."""
+    report = clock_source(ClockConfig(source="probe"), MachineClock())()
+    assert report is not None
+    assert (report.source, report.correction_s, report.bound_s) == ("probe", None, None)
+
+
+@pytest.mark.parametrize("source", ["chrony", "ptp"])
+def test_a_source_that_is_not_installed(source: Literal["chrony", "ptp"], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A source by name is asked by its own program; without it the report says that it is not installed."""
+    monkeypatch.setenv("PATH", "")
+    report = clock_source(ClockConfig(source=source), MachineClock())()
+    assert report is not None
+    assert (report.source, report.correction_s) == (source, None)
+    assert report.status.endswith("is not installed")

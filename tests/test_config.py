@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from lavt.build.sides import limits_of
 from lavt.config import (
     ClientConfig,
+    ClockConfig,
     ClocksConfig,
     Costs,
     DelayConfig,
@@ -115,6 +116,29 @@ def refused(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes:
 def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
     """A key that does not exist is refused with its place and the nearest one that does, in sections too."""
     assert f"unknown key {key!r}: did you mean {near!r}?" in refused(text, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("clock: {source: sundial}", "clock.source"),
+        ("clock: {source: external}", "source external needs correction_ms and bound_ms"),
+        ("clock: {source: external, correction_ms: 1.0}", "source external needs correction_ms and bound_ms"),
+        ("clock: {correction_ms: 1.0, bound_ms: 0.1}", "correction_ms and bound_ms belong to source external"),
+        ("clock: {source: external, correction_ms: 1.0, bound_ms: -0.1}", "clock.bound_ms"),
+        ("clock: {probe_port: 70000}", "clock.probe_port"),
+    ],
+)
+@pytest.mark.parametrize("kind", [ServerConfig, ClientConfig])
+def test_sources_of_time(text: str, said: str, kind: type[Section], tmp_path: Path) -> None:
+    """A source of time that does not exist, is not fully described, or is described where it is not named is refused."""
+    assert said in refused(text, tmp_path, kind)
+
+
+def test_a_client_must_know_the_port_of_the_probe(tmp_path: Path) -> None:
+    """Any free port, 0, is for the server alone: a client could not know which it is."""
+    assert "clock.probe_port" in refused("clock: {probe_port: 0}", tmp_path, ClientConfig)
+    assert ServerConfig(clock=ClockConfig(probe_port=0)).clock.probe_port == 0
 
 
 def test_unknown_key_like_no_other(tmp_path: Path) -> None:

@@ -44,12 +44,16 @@ def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual",
 
 @pytest.fixture(scope="module")
 def sweep(make_run: MakeRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give a sweep and its report: three virtual runs, of which one ends early, one in real time, one unfinished."""
+    """Give a sweep and its report: three virtual runs, of which one ends early, three in real time, one unfinished."""
     directory = tmp_path_factory.mktemp("sweep")
     add_run(make_run, directory, "0", seconds=3.0)
     add_run(make_run, directory, "1", seconds=3.0, condition="L1", video_ms=75.0)
     add_run(make_run, directory, "2", seconds=2.0, condition="L1", video_ms=75.0, ending="collision", wobble_m=2.0)
     add_run(make_run, directory, "3", seconds=3.0, time="real", bound_s=0.003)
+    add_run(make_run, directory, "5", seconds=3.0, time="real", client_clock=lambda _second: {"correction_s": None})
+    add_run(
+        make_run, directory, "6", seconds=3.0, time="real", server_host="a", client_host="a", offset_s=0.0, drift=0.0
+    )  # fmt: skip
     (directory / "runs" / "4").mkdir()
     write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2})
     return directory
@@ -83,6 +87,17 @@ def test_real_and_virtual_runs_have_tables_of_their_own(sweep: Path) -> None:
     assert "virtual time, fidelity video: network and clocks are modelled" in html
     assert "real time, injected by relay" in html
     assert "not valid: the offset between the clocks is only known to 6.00 ms" in html
+
+
+def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
+    """Of runs on two machines the page has Delta, its source, bound and drift, and the probe's Delta; of others not."""
+    clocks = page_of(sweep).partition("Clocks of two machines")[2].partition("Versions and machine")[0]
+    rows = re.findall(r"<tr><td.*?</tr>", clocks.replace("\n", ""))
+    cells = [[re.sub("<[^>]*>|\xa0", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
+    assert [row[:2] for row in cells] == [["3", "chrony"], ["5", "probe"]]
+    assert cells[0][2:4] == ["250.030±6.000", "20.00"]
+    assert [cell.partition("±")[0] for cell in (cells[0][4], cells[1][2], cells[1][4])] == ["250.030"] * 3
+    assert "half the round trip" in clocks
 
 
 def test_names_cannot_become_html(sweep: Path) -> None:

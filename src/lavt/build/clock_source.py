@@ -13,8 +13,8 @@ from lavt.transport.ptp import read_ptp
 MS_PER_S = 1000.0
 
 
-def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport]:
-    """Give the function that asks the source which the config names."""
+def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport | None]:
+    """Give the function that asks the source which the config names; it gives None where no answer came in time."""
 
     def external() -> ClockReport:
         now = clock.now()
@@ -26,7 +26,7 @@ def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport]
     def left_to_the_probe() -> ClockReport:
         return unknown_clock(clock.now(), kernel_identity(), "probe", "left to the probe by clock.source")
 
-    sources = {
+    sources: dict[str, Callable[[], ClockReport | None]] = {
         "chrony": lambda: read_chrony(clock),
         "ptp": lambda: read_ptp(clock),
         "external": external,

@@ -45,13 +45,13 @@ def clock(
     """
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
-    ask = clock_source(ClockConfig(source=source), machine)
+    report = clock_source(ClockConfig(source=source), machine)()
+    if report is None:
+        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
     if address is None:
-        report = ask()
         finding = check_host(report)
     else:
         probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
-        report = ask()
         if latest is None:
             raise WorkError(
                 f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its clock.probe_port "

@@ -63,7 +63,7 @@ def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeRepl
     probe = Opinion(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
     sources = _by_sources(report, latest, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
-    says = list(check_host(report).says)
+    says = [check_host(report).says[0]]
     complaints: list[str] = []
     if sources is None:
         if report.correction_s is not None:
@@ -77,13 +77,15 @@ def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeRepl
         says.append(f"Delta by the probe: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms")
         complaints += _path_complaints(report, round_trip_ms, server)
         apart_ms, allowed_ms = abs(sources.ms - probe.ms), sources.bound_ms + probe.bound_ms
-        if apart_ms > allowed_ms:
+        if complaints:
+            says.append(f"these two are {apart_ms:.3f} ms apart")
+        elif apart_ms > allowed_ms:
             complaints.append(f"these two disagree: {apart_ms:.3f} ms, where {allowed_ms:.3f} ms are allowed")
         else:
             says.append(f"these two agree: they are {apart_ms:.3f} ms apart, {allowed_ms:.3f} ms are allowed")
     says.append(f"the shortest of {len(probes)} round trips took {round_trip_ms:.3f} ms")
     used = sources or probe
-    if used.bound_ms > CLOCK_BOUND_LIMIT_MS:
+    if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
         complaints.append(_too_wide(used.bound_ms))
     return Finding(not complaints, (*says, *complaints), sources, probe, round_trip_ms)
 

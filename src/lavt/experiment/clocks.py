@@ -67,13 +67,14 @@ class Clocks:
         )
         return delta_ms, probe_ms, bound_ms
 
-    def _moments(self, offset: Offset) -> IntArray:
-        """Moments of an offset during the drive, and the drive's ends."""
-        inner = (offset.client_wall_ns > self.client_wall_ns[0]) & (offset.client_wall_ns < self.client_wall_ns[1])
-        return np.union1d(offset.client_wall_ns[inner], self.client_wall_ns)
+    def _inner(self, offset: Offset) -> IntArray:
+        """Moments of an offset during the drive."""
+        moments = offset.client_wall_ns
+        return np.asarray(moments[(moments > self.client_wall_ns[0]) & (moments < self.client_wall_ns[1])], np.int64)
 
     def _bound_ms(self, offset: Offset) -> float | None:
-        largest_ns = float(np.max(offset.bound_at(self._moments(offset))))
+        moments = np.union1d(self._inner(offset), self.client_wall_ns)
+        largest_ns = float(np.max(offset.bound_at(moments)))
         return largest_ns / NS_PER_MS if np.isfinite(largest_ns) else None
 
     def _middle_ms(self, offset: Offset | None) -> float | None:
@@ -84,9 +85,11 @@ class Clocks:
 
     def _drift_ppm(self, offset: Offset) -> float | None:
         """Slope of the straight line through Delta during the drive."""
-        moments = self._moments(offset)
-        gone_ns = (moments - moments[0]).astype(float)
-        return None if gone_ns[-1] <= 0 else float(np.polyfit(gone_ns, offset.at(moments), 1)[0]) * 1e6
+        if self.source == SAME_KERNEL:
+            return 0.0
+        moments = self._inner(offset)
+        gone_ns = (moments - moments[:1]).astype(float)
+        return None if len(moments) < 2 else float(np.polyfit(gone_ns, offset.at(moments), 1)[0]) * 1e6
 
 
 def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Clocks:
@@ -100,7 +103,7 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
     server_wall_ns = np.array([wall_ns(server, began_ns), wall_ns(server, max(began_ns, ended_ns))])
     every = exchanges(client.table("clock_probe"))
     probed = every.within(*server_wall_ns.tolist())
-    probe = _by_probe(every, server_wall_ns) if len(probed) else None
+    probe = by_probe(every) if len(probed) else None
     sources = None if _left_to_the_probe(of_server, of_client) else by_sources(of_server, of_client)
     source: str | None
     offset: Offset | None
@@ -145,10 +148,3 @@ def _on_client(offset: Offset, server_wall_ns: IntArray) -> IntArray:
     """Turn wall times of the server into those of the client, where Delta hardly changes within itself."""
     guess_ns = server_wall_ns - offset.at(server_wall_ns)
     return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)
-
-
-def _by_probe(every: Exchanges, server_wall_ns: IntArray) -> Offset | None:
-    """By the probe, at the drive's beginning and end too: an exchange long before says little of them."""
-    nearest = np.clip(np.searchsorted(every.server_wall_ns, server_wall_ns), 0, len(every) - 1)
-    edges = server_wall_ns - np.rint(every.delta_ns[nearest]).astype(np.int64)
-    return by_probe(every, edges)

@@ -18,12 +18,14 @@ two crystals differ by less. Only chrony may be faster, and says by how much it 
 class Offset:
     """Delta at moments of the client's wall clock, in order, and how far from the truth the line between them can be.
 
-    `bound_ns` is NaN where nobody knows.
+    `bound_ns` is NaN where nobody knows. Before the first and after the last moment it grows by `outside` nanoseconds
+    in each.
     """
 
     client_wall_ns: IntArray
     delta_ns: FloatArray
     bound_ns: FloatArray
+    outside: float
 
     def at(self, client_wall_ns: IntArray) -> IntArray:
         """Delta in ns at wall times of the client: linear between moments, constant before and after them."""
@@ -31,7 +33,9 @@ class Offset:
 
     def bound_at(self, client_wall_ns: IntArray) -> FloatArray:
         """How wrong Delta can be then, in ns."""
-        return _between(client_wall_ns, self.client_wall_ns, self.bound_ns)
+        nearest = np.clip(client_wall_ns, self.client_wall_ns[0], self.client_wall_ns[-1])
+        beyond_ns = self.outside * np.abs(client_wall_ns - nearest)
+        return np.asarray(_between(nearest, self.client_wall_ns, self.bound_ns) + beyond_ns, np.float64)
 
     def on_server_ns(self, client_wall_ns: IntArray) -> IntArray:
         """Turn wall times of the client into those of the server; what is missing stays missing."""
@@ -41,7 +45,7 @@ class Offset:
         return server_ns
 
 
-NO_OFFSET = Offset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
+NO_OFFSET = Offset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1), 0.0)
 """That of two hosts which share a clock."""
 
 
@@ -73,15 +77,20 @@ class _Correction:
 def by_sources(server: Table, client: Table) -> Offset | None:
     """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
 
-    Its moments are those of the samples of both, from when both know theirs. The bound is that of the path between the hosts where one follows the
-    other, else the sum of both hosts' own, and what the line between two samples can miss (`docs/metrics.md`).
+    Its moments are those of the samples of both, as long as both know theirs; beyond them it is taken to go on changing
+    at most twice as fast as it did there. The bound is that of the path between the
+    hosts where one follows the other, else the sum of both hosts' own, and what the line between two samples can
+    miss (`docs/metrics.md`).
     """
     hosts = [_correction(server, client), _correction(client, server)]
     if hosts[0] is None or hosts[1] is None:
         return None
     of_server, of_client = hosts[0], hosts[1]
     moments = np.union1d(of_server.reference_ns, of_client.reference_ns)
-    moments = moments[moments >= max(of_server.reference_ns[0], of_client.reference_ns[0])]
+    first, last = (pick(each.reference_ns[at] for each in (of_server, of_client)) for pick, at in ((max, 0), (min, -1)))
+    moments = moments[(moments >= first) & (moments <= last)]
+    if len(moments) == 0:
+        return None
     bound_ns = of_server.at(moments, of_server.own_bound_ns) + of_client.at(moments, of_client.own_bound_ns)
     for follower in (of_server, of_client):
         peer_bound_ns = follower.at(moments, follower.peer_bound_ns)
@@ -90,7 +99,8 @@ def by_sources(server: Table, client: Table) -> Offset | None:
         bound_ns = bound_ns + each.at(moments, each.asked_ns) + _missed_ns(moments, each)
     correction_ns = of_client.at(moments, of_client.correction_ns)
     delta_ns = correction_ns - of_server.at(moments, of_server.correction_ns)
-    return Offset(moments - np.rint(correction_ns).astype(np.int64), delta_ns, bound_ns)
+    outside = 2 * float(np.max(np.abs(_rates(moments, delta_ns))[[0, -1]])) if len(moments) > 1 else DRIFT_ALLOWANCE
+    return Offset(moments - np.rint(correction_ns).astype(np.int64), delta_ns, bound_ns, outside)
 
 
 def known_samples(samples: Table) -> Table:
@@ -137,14 +147,14 @@ def _rates(moments: IntArray, values: FloatArray) -> FloatArray:
 def _missed_ns(moments: IntArray, samples: _Correction) -> FloatArray:
     """How far the truth can be from the line between two samples.
 
-    A correction that is worked off at one rate and then at another bends once: a quarter of the change of rate times
-    the time between the samples is the farthest that a bend can be from the line.
+    Nobody sees when between them a clock began or ceased to be steered: what a line rises more or less than its
+    neighbours may have come all at once.
     """
     if len(samples.reference_ns) < 3:
         return np.zeros(len(moments))
     rates = _rates(samples.reference_ns, samples.correction_ns)
-    bends = np.abs(np.append(rates[1:], rates[-1]) - np.append(rates[0], rates[:-1]))
-    missed_ns = bends * np.diff(samples.reference_ns) / 4
+    bends = np.abs(np.diff(rates))
+    missed_ns = np.maximum(np.append(bends, 0.0), np.append(0.0, bends)) * np.diff(samples.reference_ns)
     interval = np.clip(np.searchsorted(samples.reference_ns, moments, "right") - 1, 0, len(missed_ns) - 1)
     return np.asarray(missed_ns[interval], np.float64)
 
@@ -192,36 +202,24 @@ def exchanges(probes: Table) -> Exchanges:
     return found.where(np.flatnonzero(good)[order])
 
 
-def by_probe(every: Exchanges, also_at: IntArray) -> Offset | None:
-    """Delta by the probe alone: at each exchange, and at further times of the client, by the exchange that says most.
+def by_probe(every: Exchanges) -> Offset | None:
+    """Delta by the probe alone: at the time of each exchange by the one, of all, that says most of it.
 
     An exchange says Delta to half its round trip, and later or earlier to as much more as clocks may drift apart.
     """
     if len(every) == 0:
         return None
-    moments = np.union1d(every.client_wall_ns, also_at)
-    origin = moments[0]
-    at, when = (moments - origin).astype(float), (every.client_wall_ns - origin).astype(float)
+    when_ns = (every.client_wall_ns - every.client_wall_ns[0]).astype(float)
     half_ns = every.round_trip_ns / 2
-    choices = []
-    for sign in (1, -1):  # the best exchange up to a moment, and the best from it on
-        best = _running_least(half_ns - DRIFT_ALLOWANCE * when) if sign == 1 else _least_from(half_ns, when)
-        place = np.searchsorted(when, at, "right") - 1 if sign == 1 else np.searchsorted(when, at, "left")
-        chosen = best[np.clip(place, 0, len(when) - 1)]
-        bound_ns = half_ns[chosen] + DRIFT_ALLOWANCE * np.abs(at - when[chosen])
-        choices.append((chosen, bound_ns))
-    (before, before_ns), (after, after_ns) = choices
-    delta_ns = every.delta_ns[np.where(before_ns <= after_ns, before, after)]
-    gaps_ns = np.diff(at)
-    widest_ns = np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns))
-    return Offset(moments, delta_ns, np.minimum(before_ns, after_ns) + DRIFT_ALLOWANCE * widest_ns / 2)
+    before = _running_least(half_ns - DRIFT_ALLOWANCE * when_ns)
+    after = len(every) - 1 - _running_least((half_ns + DRIFT_ALLOWANCE * when_ns)[::-1])[::-1]
+    bounds_ns = [half_ns[each] + DRIFT_ALLOWANCE * np.abs(when_ns - when_ns[each]) for each in (before, after)]
+    delta_ns = every.delta_ns[np.where(bounds_ns[0] <= bounds_ns[1], before, after)]
+    gaps_ns = np.diff(when_ns)
+    between_ns = DRIFT_ALLOWANCE * np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns)) / 2
+    return Offset(every.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + between_ns, DRIFT_ALLOWANCE)
 
 
 def _running_least(values: FloatArray) -> IntArray:
     """Where the least of all values up to each is."""
     return np.maximum.accumulate(np.where(values == np.minimum.accumulate(values), np.arange(len(values)), 0))
-
-
-def _least_from(half_ns: FloatArray, when: FloatArray) -> IntArray:
-    """Where the exchange is that says most of each moment of those at and after it."""
-    return len(when) - 1 - _running_least((half_ns + DRIFT_ALLOWANCE * when)[::-1])[::-1]

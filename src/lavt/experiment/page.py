@@ -104,5 +104,13 @@ def latency(summary: Mapping[str, Any]) -> str:
         return NOTHING
     median, spread = f"{summary['p50']:.1f}", f"({summary['p5']:.1f} to {summary['p95']:.1f})"
     if "bound" in summary:
-        median += f" ± {summary['bound']:.2f}" if summary["bound"] is not None else " ± unknown"
-    return f"{median.replace(' ', UNBROKEN)} {spread.replace(' ', UNBROKEN)}"
+        median = with_bound(summary["p50"], summary["bound"])
+    return f"{median} {spread.replace(' ', UNBROKEN)}"
+
+
+def with_bound(value: float | None, bound: float | None, *, digits: int = 1) -> str:
+    """Write a number with how wrong it can be (one digit more, at most three), not to be broken."""
+    if value is None:
+        return NOTHING
+    wrong = "unknown" if bound is None else f"{bound:.{min(digits + 1, 3)}f}"
+    return f"{value:.{digits}f} ± {wrong}".replace(" ", UNBROKEN)

@@ -13,6 +13,7 @@ from lavt.domain import Picture
 from lavt.errors import WorkError
 from lavt.experiment import page
 from lavt.experiment.breakdown import Share, breakdown, capture_to_stamp_ms
+from lavt.experiment.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.drives import Drive, one_of_each_condition, read_drive
 from lavt.experiment.figures import (
     Colours,
@@ -25,11 +26,20 @@ from lavt.experiment.figures import (
     time_figure,
 )
 from lavt.experiment.record import read_record
-from lavt.experiment.report_tables import condition_table, hop_table, how_it_was_driven, machine_table, run_table
+from lavt.experiment.report_tables import (
+    clock_table,
+    condition_table,
+    hop_table,
+    how_it_was_driven,
+    machine_table,
+    run_table,
+)
 from lavt.experiment.results import read_json, write_json
 from lavt.experiment.summary import summarize
 
 SHOWN_FRAMES = 4
+ONE_CLOCK = (None, SAME_KERNEL)
+"""Sources of Delta that have no figure: unknown, as the run's own row says, or the same clock."""
 
 
 def write_report(
@@ -66,6 +76,7 @@ def write_report(
         *_groups(summary),
         page.heading("Every run"),
         run_table(summary["runs"]),
+        *_clocks(summary["runs"]),
         *_machines(drives),
     ]
     index = report_dir / "index.html"
@@ -223,6 +234,32 @@ def _groups(summary: Mapping[str, Any]) -> list[str]:
     for group in groups:
         name = ", ".join(f"{key} {value}" for key, value in group.items() if key != "conditions" and value is not None)
         parts += [page.heading(name, 3), condition_table(group["conditions"])]
+    return parts
+
+
+def _clocks(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say how far the clocks of two machines were apart; in virtual time they are modelled."""
+    apart = [run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK]
+    if not apart:
+        return []
+    parts = [
+        page.heading("Clocks of two machines"),
+        clock_table(apart),
+        page.paragraph(
+            "Delta is the server's clock less the client's in the middle of the drive; ± is the largest bound during "
+            "it, that of every one-way latency of the run. The hosts' sources of time and the probe are two opinions: "
+            "a run in which they contradict each other does not count.",
+            note=True,
+        ),
+    ]
+    if any(run["delta"]["source"] == PROBE for run in apart):
+        parts.append(
+            page.paragraph(
+                "By the probe: no other source of time said how the clocks were. Its bound is half the round trip "
+                "and the drift since; if one way is slower than the other, that is hidden inside it.",
+                note=True,
+            )
+        )
     return parts
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lavt.experiment.breakdown import Share
-from lavt.experiment.page import NOTHING, interval, latency, number, percent, table
+from lavt.experiment.page import NOTHING, interval, latency, number, percent, table, with_bound
 
 FIDELITY_SAYS = {
     "video": "network and clocks are modelled, pictures, codec and packets are real",
@@ -80,6 +80,22 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> str:
         for run in runs
     ]
     return table(headers, rows, text_columns=[8])
+
+
+def clock_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """One row for each run whose two sides had clocks of their own: Delta, who says it, and what the probe says."""
+    headers = ["run", "Delta by", "Delta ms", "drift ppm", "by the probe ms"]
+    rows = [
+        [
+            str(run["run"]),
+            str(run["delta"]["source"]),
+            with_bound(run["delta"]["ms"], run["delta"]["bound_ms"], digits=3),
+            number(run["delta"]["drift_ppm"], 2),
+            with_bound(run["delta"]["probe_ms"], run["delta"]["probe_bound_ms"], digits=3),
+        ]
+        for run in runs
+    ]
+    return table(headers, rows, text_columns=[1])
 
 
 def hop_table(shares: Mapping[str, Sequence[Share]], captured_ms: Mapping[str, float | None]) -> str:

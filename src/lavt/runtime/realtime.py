@@ -44,7 +44,7 @@ class RealRuntime:
         clock: Clock,
         nodes: Sequence[Node],
         recorder: Recorder,
-        clock_source: Callable[[], ClockReport],
+        clock_source: Callable[[], ClockReport | None],
     ) -> None:
         self.links: dict[str, Link] = {}
         self.failed: BaseException | None = None
@@ -116,7 +116,9 @@ class RealRuntime:
 
     def _report_clock(self) -> None:
         """Asking chrony takes a process of its own and some milliseconds: no node waits for it."""
-        self.deliver("clock_report", self._clock_source(), self._clock.now())
+        report = self._clock_source()
+        if report is not None:
+            self.deliver("clock_report", report, self._clock.now())
 
 
 class _Worker:

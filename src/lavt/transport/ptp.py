@@ -15,7 +15,7 @@ from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_iden
 
 SOURCE = "ptp"
 PMC = ("pmc", "-u", "-b", "0", "GET PORT_DATA_SET", "GET CURRENT_DATA_SET", "GET TIME_STATUS_NP")
-TIMEOUT_S = 1.0
+TIMEOUT_S = 2.0
 """It takes 0.12 s: pmc waits for what may come late."""
 
 ABSENT = "linuxptp is not installed"
@@ -23,14 +23,19 @@ NOT_RUNNING = "ptp4l is not running, or this user may not ask it"
 NO_MASTER = "ptp4l is neither master nor does it hear one"
 
 
-def read_ptp(clock: Clock) -> ClockReport:
-    """Ask ptp4l on this host; where it cannot tell, the report says so and has no correction."""
+def read_ptp(clock: Clock) -> ClockReport | None:
+    """Ask ptp4l on this host; where it cannot tell, the report says so and has no correction.
+
+    None where no answer came in time: that says nothing of the clock, and is a missed poll.
+    """
     host, before = kernel_identity(), clock.now()
     try:
         answer = subprocess.run(PMC, capture_output=True, timeout=TIMEOUT_S, check=False)  # noqa: S603 (a constant)
     except FileNotFoundError:
         return unknown_clock(before, host, SOURCE, ABSENT)
-    except (OSError, subprocess.SubprocessError):
+    except subprocess.TimeoutExpired:
+        return None
+    except OSError:
         return unknown_clock(before, host, SOURCE, NOT_RUNNING)
     return parse_ptp(host, answer.stdout.decode(errors="replace"), before, clock.now())
 

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import pytest
+
+from lavt.clock import MachineClock
+from lavt.domain import Now
+from lavt.node import Message
+from lavt.nodes.clock_sync import ClockSyncNode
+from lavt.transport.clock_offset import ClockReport
+from lavt.transport.udp_link import UdpLink
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A server that answers probes, and says that its clock needs no correction."""
+    clock = MachineClock()
+    node = ClockSyncNode(0)
+    node.chains["clock_report"][0][1](
+        Message("clock_report", ClockReport(0, 0, "here", "chrony", 0.0, 0.0001), clock.now()), clock.now()
+    )
+
+    def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        for send in node.chains["probe_request"][0][1](Message("probe_request", payload, arrived, peer), clock.now()):
+            link.send(send)
+
+    link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")
+    with closing(link):
+        link.start()
+        yield link.port
+
+
+def lavt_clock(*arguments: str) -> subprocess.CompletedProcess[str]:
+    program = [sys.executable, "-m", "lavt", "clock", *arguments]
+    return subprocess.run(program, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_server_is_probed(port: int) -> None:
+    """Against a server on this machine Delta is 0 within the bound, half of the shortest round trip."""
+    done = lavt_clock("--server", "localhost", "--port", str(port), "--seconds", "0.5", "--json")
+    said = json.loads(done.stdout)
+    assert abs(said["probe"]["ms"]) <= said["probe"]["bound_ms"] == said["round_trip_ms"] / 2
+    assert done.returncode == (0 if said["good"] else 1)
+    assert "Traceback" not in done.stderr
+
+
+def test_nobody_answers() -> None:
+    """Where no server answers the command says so, with what to look for, and ends with 1."""
+    done = lavt_clock("--server", "127.0.0.1", "--port", "1", "--seconds", "0.1")
+    assert done.returncode == 1
+    assert "nobody answered at 127.0.0.1:1 (UDP): is `lavt server` running there" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--server", "a" * 64), "is not known"),
+        (("--server", "localhost", "--port", "0"), "--port"),
+        (("--server", "localhost", "--port", "70000"), "--port"),
+        (("--seconds", "-1"), "--seconds"),
+        (("--source", "sundial"), "--source"),
+    ],
+)
+def test_wrong_input(arguments: tuple[str, ...], said: str) -> None:
+    """A host that nobody knows, and numbers out of range, are refused with exit code 2 and without a traceback."""
+    done = lavt_clock(*arguments)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_machine_without_chrony(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where chronyc is not installed the command says so and what to do, and ends with 1."""
+    monkeypatch.setenv("PATH", "")
+    done = lavt_clock()
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("chrony is not installed: install chrony on both machines")

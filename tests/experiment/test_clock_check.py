@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from lavt.domain import NS_PER_MS
+from lavt.experiment.clock_check import WHAT_TO_DO, Finding, check_host, compare
+from lavt.transport.clock_offset import ClockReport
+from lavt.transport.clock_probe import ClockProbe, ProbeReply
+
+SERVER = "10.9.0.1"
+GOOD = ClockReport(
+    0, 0, "desk", "chrony", 0.25, 0.0005, follows=SERVER, skew_ppm=4.0, age_s=1.0, peer_delay_s=0.0002,
+    peer_dispersion_s=0.00003,
+)  # fmt: skip
+REPLY = ProbeReply(1, 0, 0, 0, 0.0, 0.0001)
+
+
+def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
+    """Make exchanges whose both ways take the same time."""
+    return [
+        ClockProbe(
+            number,
+            0,
+            round((delta_ms + round_trip_ms / 2) * NS_PER_MS),
+            round((delta_ms + round_trip_ms / 2) * NS_PER_MS),
+            round(round_trip_ms * NS_PER_MS),
+        )
+        for number, round_trip_ms in enumerate(round_trips_ms)
+    ]
+
+
+def compared(
+    delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
+) -> Finding:
+    report = dataclasses.replace(GOOD, **changes)
+    return compare(report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
+
+
+def test_a_good_clock() -> None:
+    """A clock that is known to 2 ms or better is good; whom it follows, correction and bound are told."""
+    finding = check_host(GOOD)
+    assert finding.good
+    assert finding.says == (
+        "by chrony this machine's clock follows 10.9.0.1: it must be corrected by +250.000 ms, "
+        "which is known to 0.500 ms",
+    )
+
+
+def test_a_clock_known_too_badly() -> None:
+    """A clock that is known to 3 ms is not good enough, and a sentence says so."""
+    finding = check_host(dataclasses.replace(GOOD, bound_s=0.003))
+    assert not finding.good
+    assert finding.says[1] == "3.00 ms are too wide: one-way latencies need 2.0 ms or better"
+
+
+@pytest.mark.parametrize("status", WHAT_TO_DO)
+def test_a_clock_that_nobody_knows(status: str) -> None:
+    """Where the source cannot tell, why not and what to do about it is told."""
+    finding = check_host(ClockReport(0, 0, "desk", "chrony", status=status))
+    assert (finding.good, finding.says) == (False, (f"{status}: {WHAT_TO_DO[status]}",))
+
+
+def test_two_opinions_that_agree() -> None:
+    """Delta by both, by the shortest round trip of all; with the path's bound as the client follows this server."""
+    finding = compared(250.02)
+    assert finding.good
+    assert finding.sources is not None
+    assert finding.probe is not None
+    assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 0.1 + 0.03 + 0.004])
+    assert [finding.probe.ms, finding.probe.bound_ms] == pytest.approx([250.02, 0.15])
+    assert "these two agree: they are 0.020 ms apart, 0.284 ms are allowed" in finding.says
+
+
+def test_who_follows_another_host_is_known_by_both_bounds() -> None:
+    """Where the client follows a third host the bound is the sum of the client's and the server's own."""
+    finding = compared(follows="10.9.0.9")
+    assert finding.sources is not None
+    assert finding.sources.bound_ms == pytest.approx(0.6)
+
+
+def test_two_opinions_that_disagree() -> None:
+    """Opinions further apart than both bounds are not good, and how far they are is told."""
+    finding = compared(251.0)
+    assert not finding.good
+    assert finding.says[-1] == "these two disagree: 1.000 ms, where 0.284 ms are allowed"
+
+
+def test_ntp_through_delay() -> None:
+    """An NTP round trip over a millisecond longer than the probe's is told as the one complaint."""
+    finding = compared(212.5, peer_delay_s=0.0752)
+    assert not finding.good
+    assert finding.says[-1].startswith(
+        "NTP seems to go through injected delay: its round trip is 75.20 ms, the probe's 0.30"
+    )
+    assert not any("agree" in sentence or "too wide" in sentence for sentence in finding.says)
+
+
+@pytest.mark.parametrize("lacking", ["client", "server"])
+def test_the_probe_alone(lacking: str) -> None:
+    """Where one side's source cannot tell, Delta is the probe's alone, and what that means is told."""
+    unknown: dict[str, Any] = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
+    reply = REPLY if lacking == "client" else dataclasses.replace(REPLY, correction_s=None, bound_s=None)
+    finding = compared(reply=reply, **(unknown if lacking == "client" else {}))
+    assert finding.good
+    assert finding.sources is None
+    assert any("by the probe alone: +250.000 ms ± 0.150 ms" in sentence for sentence in finding.says)
+    assert any("hidden inside it" in sentence for sentence in finding.says)
+
+
+def test_a_probe_over_too_long_a_way() -> None:
+    """By the probe alone a round trip of 5 ms bounds Delta to 2.5 ms: not good enough."""
+    finding = compared(round_trip_ms=5.0, correction_s=None, bound_s=None)
+    assert not finding.good
+    assert finding.says[-1].startswith("2.50 ms are too wide")
