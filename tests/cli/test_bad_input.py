@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -95,6 +96,15 @@ BAD_RUNS = {
     "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "virtual time only"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
+    "more than a delay in virtual time": (["--set", "network.condition=jitter"], "network.injection: netem"),
+    "more than a delay by the relay": (
+        ["--set", "network.condition=loss", "--set", "time=real"],
+        "network.injection: netem and time: real",
+    ),
+    "a profile that netem cannot do": (
+        ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],
+        "network.injection relay",
+    ),
 }
 
 
@@ -104,7 +114,7 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
     """A run or sweep that cannot be driven is refused in one sentence, and no directory is made for it."""
     changes, said = BAD_RUNS[case]
     if command == "sweep":
-        changes = [each.replace("network.condition=L9", "conditions=[L9]") for each in changes]
+        changes = [re.sub(r"network\.condition=(\w+)", r"conditions=[\1]", each) for each in changes]
         changes = [each.replace("vehicle.route=nowhere", "routes=[nowhere]") for each in changes]
     ended = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
     assert said in ended.refused()
@@ -117,6 +127,38 @@ def test_codec_that_cannot_be(run: Run, tmp_path: Path) -> None:
     assert (ended.code, ended.out) == (2, "")
     assert ended.err.splitlines()[-1].startswith("lavt: a decoder buffer of 0.0005 s")
     assert files(tmp_path) == {}
+
+
+ON_LO = ("--interface", "lo", "--role", "server")
+BAD_NETEM = {
+    "unknown condition": (["apply", "L9", *ON_LO], "L0, L1, L2, L3, L4, L5"),
+    "the clock probe's port": (["apply", "L4", *ON_LO, "--video-port", "5602"], "would cover the clock probe"),
+    "the probe moved onto the video": (["apply", "L4", *ON_LO, "--probe-port", "5600"], "would cover the clock probe"),
+    "the port of NTP": (["apply", "L4", *ON_LO, "--video-port", "123"], "would cover NTP"),
+    "no interface's name": (["apply", "L4", "--role", "client", "--interface", "a/b"], "no name of an interface"),
+    "no such interface": (["show", "--interface", "nowhere0"], "nowhere0"),
+    "nothing to verify": (["verify", "--interface", "nowhere0"], "nothing was applied to nowhere0"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_NETEM)
+def test_bad_netem(case: str, run: Run) -> None:
+    """What netem must not or cannot do is refused in one sentence before anything is changed."""
+    arguments, said = BAD_NETEM[case]
+    refused = run("netem", *arguments).refused()
+    assert said in refused or "there is no tc" in refused
+
+
+def test_netem_tells_what_it_would_do(run: Run) -> None:
+    """--dry-run needs no root and no tc, and prints the commands, the root's first."""
+    ended = run("netem", "apply", "L2", *ON_LO, "--dry-run")
+    told = json.loads(run("netem", "apply", "L2", *ON_LO, "--dry-run", "--json").out)
+    assert ended.code == 0
+    assert ended.out.splitlines()[:2] == [
+        "tc qdisc add dev lo root handle 4c56: prio bands 6",
+        "tc qdisc add dev lo parent 4c56:4 handle 4c01: netem limit 10000 delay 150ms rate 10gbit",
+    ]
+    assert [" ".join(command) for command in told["commands"]] == ended.out.splitlines()
 
 
 MISSING = {

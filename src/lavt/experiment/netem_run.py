@@ -11,7 +11,7 @@ from lavt.build.injection import netem_flows
 from lavt.config_file import condition
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.validity import injection_reasons
-from lavt.transport.netem import Flow
+from lavt.transport.netem import Flow, Law
 from lavt.transport.netem_control import Netem
 from lavt.transport.netem_probe import Measured, judge
 from lavt.transport.netem_state import flows_from
@@ -19,11 +19,21 @@ from lavt.transport.netem_state import flows_from
 NETEM = "netem.json"
 """In a run directory: what was asked of netem, and what was measured before and after the drive."""
 LOOPBACK = "lo"
+DISCARD = 9
+"""A port that nobody uses (RFC 863)."""
 
 
 def check_netem(planned: PlannedRun) -> list[str]:
-    """Raise `UserError` where a run wants netem and cannot have it; tell what was put back after a crash."""
-    return Netem(LOOPBACK).check() if by_netem(planned) else []
+    """Raise `UserError` where a run wants netem and cannot have it; tell what was put back after a crash.
+
+    It is tried, with nothing to hold: whether there are root, tc and a netem in the kernel is not known before.
+    """
+    if not by_netem(planned):
+        return []
+    with Netem(LOOPBACK) as netem:
+        restored = netem.check()
+        netem.apply([Flow("video", "udp", DISCARD, "source", Law())])
+        return restored
 
 
 def by_netem(planned: PlannedRun) -> bool:

@@ -42,6 +42,7 @@ _SOURCE, _DESTINATION = socket.inet_aton("192.0.2.2"), socket.inet_aton("192.0.2
 _NOBODY: Final = b"\x02LAVT\0"
 """A hardware address of ours where the interface has none (the loopback): what is not addressed to it, it drops."""
 _SO_ATTACH_FILTER: Final = 26
+_SO_RCVBUFFORCE: Final = 33
 _ALL_PROTOCOLS, _IPV4 = 0x0003, 0x0800
 _MARK: Final = struct.Struct(">QIq")
 """Who measures, number of the frame, when it was sent."""
@@ -226,27 +227,24 @@ def _open(interface: str) -> socket.socket:
     """Open the socket that sees what leaves: only frames for our address, without their link's header."""
     try:
         receiver = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, 0)
-        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
-        # BPF: load the word at 16 (the destination); equal: take all of it, else nothing.
-        code = [
-            (0x20, 0, 0, 16),
-            (0x15, 0, 1, int.from_bytes(_DESTINATION, "big")),
-            (0x06, 0, 0, 0xFFFF),
-            (0x06, 0, 0, 0),
-        ]
-        program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in code))
-        receiver.setsockopt(
-            socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("HL", len(code), ctypes.addressof(program))
-        )
-        receiver.bind((interface, _ALL_PROTOCOLS))
     except PermissionError as error:
         raise UserError("only root may measure what a queue does: run it with sudo") from error
+    try:
+        receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
+        # BPF: load the word at 16 (the destination); equal: take all of it, else nothing.
+        ours = int.from_bytes(_DESTINATION, "big")
+        code = [(0x20, 0, 0, 16), (0x15, 0, 1, ours), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0)]
+        program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *each) for each in code))
+        filtered = struct.pack("HL", len(code), ctypes.addressof(program))
+        receiver.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filtered)
+        receiver.bind((interface, _ALL_PROTOCOLS))
+        receiver.setblocking(False)
     except OSError as error:
+        receiver.close()
         raise UserError(
             f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
         ) from error
-    receiver.setblocking(False)
     return receiver
 
 
