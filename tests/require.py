@@ -9,7 +9,7 @@ import pytest
 
 
 def need(part: str, because: str) -> NoReturn:
-    """Skip the test that asks; fail it where LAVT_REQUIRE, a list with commas, names the part as one that must be there."""
+    """Skip the test that asks; fail it where LAVT_REQUIRE, a list with commas, names the part."""
     required = os.environ.get("LAVT_REQUIRE", "").replace(" ", "").split(",")
     if part in required:
         pytest.fail(f"LAVT_REQUIRE names {part}: {because}", pytrace=False)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
 from tests.kernel.lane import clocks, netem
 from tests.kernel.lane.driving import Drive, collect, start_loop, wait_for_the_end
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine

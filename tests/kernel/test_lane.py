@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+from tests.kernel.lane import clocks, ntp_server
+from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
+from tests.kernel.lane.driving import Drive
+from tests.kernel.lane.machine import Machine, MachineError
+from tests.kernel.lane.netem import netem_on_all
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_MS, NS_PER_S
-from tests.kernel.lane import clocks, ntp_server
-from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
-from tests.kernel.lane.machine import Machine, MachineError
-from tests.kernel.lane.netem import netem_on_all
 
 TrueOffset = Callable[[], int]
 NTP_PORT = 11123
@@ -38,7 +39,7 @@ def test_a_delay_on_one_machine_is_in_the_round_trip_and_gone_afterwards(
 
 def test_what_fails_on_the_other_machine_is_told_here(client_machine: Machine) -> None:
     """A program that fails on the client's machine raises with what it said, and so does a function."""
-    with pytest.raises(MachineError, match="ended with 2: .*no-such-file"):
+    with pytest.raises(MachineError, match=r"ended with 2: .*no-such-file"):
         client_machine.run(["ls", "/no-such-file"])
     with pytest.raises(MachineError, match="No such file"):
         client_machine.read("/no-such-file")
@@ -69,9 +70,7 @@ def test_the_true_offset_is_what_an_exchange_of_time_stamps_finds(
 ) -> None:
     """Four time stamps over the network find the true offset within half their round trip."""
     server_machine.call(clocks.step, -70 * NS_PER_MS)
-    client_machine.start_python(
-        "tests.kernel.lane.ntp_server", client_machine.address, str(NTP_PORT)
-    ).first_line()
+    client_machine.start_python("tests.kernel.lane.ntp_server", client_machine.address, str(NTP_PORT)).first_line()
 
     client_ahead_ns, round_trip_ns = ntp_server.ask(client_machine.address, NTP_PORT)
 
@@ -94,7 +93,7 @@ def test_a_drift_of_one_clock_is_the_rate_of_the_true_offset(
 def test_chrony_of_the_client_finds_the_offset(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
-    """chronyd that follows the server, and touches no clock, finds a server 250 ms ahead to 1 ms."""
+    """Chronyd that follows the server, and touches no clock, finds a server 250 ms ahead to 1 ms."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     start_chronyd(server_machine, *SERVING)
     start_chronyd(client_machine, following(server_machine.address))
@@ -121,3 +120,21 @@ def test_chrony_finds_the_offset_while_the_server_is_slewed(
         assert correction_s(server_machine) > 0.005, "it slews still"
         assert delta_ns(server_machine, client_machine) == pytest.approx(true_offset_ns(), abs=NS_PER_MS)
         pause(NS_PER_S)
+
+
+def test_a_road_is_driven_over_both_machines(
+    server_machine: Machine, client_machine: Machine, drive: Callable[..., Drive]
+) -> None:
+    """With the server's clock 250 ms ahead, a short road is driven to its end, and the loop's parts close to 1 ms."""
+    server_machine.call(clocks.step, 250 * NS_PER_MS)
+    start_chronyd(server_machine, *SERVING)
+    start_chronyd(client_machine, following(server_machine.address))
+    wait_synchronised(client_machine, updates=8)
+
+    driven = drive()
+
+    assert driven.result["ending"] == "completed"
+    assert driven.measured.closure_p95_ms is not None
+    assert driven.measured.closure_p95_ms <= 1
+    assert driven.measured.clock_bound_ms is not None
+    assert 0 < driven.result["tau_c_ms"]["p50"] < 50, "an offset of 250 ms would show"

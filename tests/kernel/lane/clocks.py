@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import time
+from collections.abc import Callable
 from ctypes import c_int, c_long, c_uint
 from functools import cache
 
@@ -42,8 +43,7 @@ class Timex(ctypes.Structure):
 
 def counter() -> int:
     """Read the time stamp counter."""
-    value: int = _rdtsc()[1]()
-    return value
+    return _rdtsc()[1]()
 
 
 def reading(attempts: int = 60) -> tuple[int, int]:
@@ -111,7 +111,7 @@ def _adjust(change: Timex) -> None:
 
 
 @cache
-def _rdtsc() -> tuple[mmap.mmap, ctypes._CFuncPtr]:
+def _rdtsc() -> tuple[mmap.mmap, Callable[[], int]]:
     """Put the instruction into memory that may be executed; the memory must live as long as the function."""
     memory = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     memory.write(RDTSC)

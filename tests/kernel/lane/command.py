@@ -24,7 +24,7 @@ HERE = REPOSITORY / "tests" / "kernel"
 SERVER = {"vec0": "10.9.0.1", "vec1": "10.9.1.1"}
 """Addresses of the first machine, whose pytest it is: vec0 is the network under test, vec1 only manages."""
 CLIENT = {"vec0": "10.9.0.2", "vec1": "10.9.1.2"}
-EPILOG = """What is not listed here goes to pytest, which runs in the top directory of the repository: a test file of this
+EPILOG = """What is not listed here goes to pytest, which runs in the repository's top directory; a test file of this
 directory may be named by its name alone. Environment variables pass through. LAVT_KERNEL is the directory for what is
 fetched, .kernel/ of the repository where it is not set. Example: tests/kernel/run test_lane.py -x"""
 

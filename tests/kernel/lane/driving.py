@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
+
 from lavt.experiment.metrics import Measured, measure
 from lavt.experiment.record import Record, read_record
 from lavt.experiment.results import run_result
-from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
-REMOTE_FOLDER = "/run/tmp/drives"
+LIGHT = ("vehicle.scenery=none",)
+"""What a user-mode kernel, with its one processor and dear system calls, can draw in time."""
 ROUTER_PORT = 7448
-BEGIN_S, LONGEST_S = 60, 240
+LONGEST_S = 240
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,10 @@ def start_loop(
     """Start the four programs; `out` is a new directory's name on both machines."""
     server_router = _start(server, "router", "zenoh-configs/router-server.json5")
     server_router.first_line()
-    changes = [f"vehicle.route={SHORT_ROAD}", *server_changes]
-    server_program = _start(server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes)
+    changes = [f"vehicle.route={SHORT_ROAD}", *LIGHT, *server_changes]
+    server_program = _start(
+        server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes
+    )
     dialled = json.dumps([f"udp/{server.address}:{ROUTER_PORT}?rel=1;mixed_rel=1"])
     client_router = _start(
         client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={dialled}"]

@@ -1,4 +1,4 @@
-"""Machines that are processes: user-mode kernels that see this machine's files and have clocks and queues of their own."""
+"""Machines that are processes: user-mode kernels with clocks and queues of their own, which see this machine's files."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def start_guest(
             stderr=subprocess.STDOUT,
             pass_fds=[output, *(descriptor for descriptor, _ in links.values())],
             start_new_session=True,  # a process group of its own: Ctrl-C goes to who started it, who ends it
-            preexec_fn=_settle,
+            preexec_fn=_settle,  # noqa: PLW1509 (there are no threads here)
             env={"PATH": os.environ.get("PATH", os.defpath), "TMPDIR": _memory_directory(scratch)},
         )
     return Guest(name, process, scratch)

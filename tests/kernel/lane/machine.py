@@ -13,10 +13,11 @@ from multiprocessing.connection import Client, Connection
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from lavt.clock import pause
-from lavt.domain import NS_PER_MS, NS_PER_S
 from tests.kernel.lane import processes
 from tests.kernel.lane.agent import PORT
+
+from lavt.clock import pause
+from lavt.domain import NS_PER_MS, NS_PER_S
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -120,7 +121,9 @@ class Started:
 
     def first_line(self, timeout_s: float = 60) -> dict[str, Any]:
         """Wait for the first line of JSON; raise `MachineError` where the program ends without one."""
-        wait_until(f"{' '.join(self.command)} says something", lambda: "\n" in self.output or not self.running, timeout_s)
+        wait_until(
+            f"{' '.join(self.command)} says something", lambda: "\n" in self.output or not self.running, timeout_s
+        )
         lines = self.lines()
         if not lines:
             raise MachineError(f"{self.machine.name}: {' '.join(self.command)} did not start: {self.errors}")

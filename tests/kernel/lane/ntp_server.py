@@ -2,8 +2,8 @@
 
     python -m tests.kernel.lane.ntp_server ADDRESS PORT [OFFSET_NS DRIFT_PPM]
 
-With an offset its clock is that far ahead of the machine's wall clock when it starts, runs fast by the drift, and goes its
-own way then, whatever is done to the wall clock. Without, it tells the machine's wall clock.
+With an offset its clock is that far ahead of the machine's wall clock when it starts, runs fast by the drift, and goes
+its own way then, whatever is done to the wall clock. Without, it tells the machine's wall clock.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 
 from tests.kernel.lane.clocks import NS_PER_S, raw_ns, wall_less_raw_ns
+
 from lavt.clock import MachineClock
 
 HEADER = struct.Struct("!BBbbII4sQQQQ")

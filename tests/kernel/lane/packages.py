@@ -73,7 +73,9 @@ def _fetch(folder: Path) -> None:
         _apt(folder, "apt-get", *fresh, "update")
         said = _download(folder, fresh)
     if said:
-        raise Refusal(f"the packages cannot be fetched ({said}): connect this machine to Debian's archive and try again")
+        raise Refusal(
+            f"the packages cannot be fetched ({said}): connect this machine to Debian's archive and try again"
+        )
     (folder / "root").mkdir()
     for package in sorted(folder.glob("*.deb")):
         subprocess.run(["dpkg", "-x", str(package), str(folder / "root")], check=True)
