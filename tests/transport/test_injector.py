@@ -56,11 +56,13 @@ def ordered(queues: NamedQueues | None, *orders: Inject) -> list[Injected]:
 
 
 def test_orders_are_done_in_order_measured_and_put_back_at_the_end() -> None:
-    """Each order is applied and measured, one without flows clears, and closing puts everything back."""
+    """An order is applied once and measured whenever it comes; one without flows clears, and closing puts all back."""
     queues = NamedQueues()
-    said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
-    assert said == [Injected(1, "", "read back otherwise", (("video", 150.1),)), Injected(2, "", "", ())]
-    assert queues.did == [("L2", (VIDEO,), (PROBE,)), ("verify", (VIDEO,), (PROBE,)), "clear", "clear"]
+    said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
+    measured = Injected(1, "", "read back otherwise", (("video", 150.1),))
+    assert said == [measured, measured, Injected(2, "", "", ())]
+    verified = ("verify", (VIDEO,), (PROBE,))
+    assert queues.did == [("L2", (VIDEO,), (PROBE,)), verified, verified, "clear", "clear"]
 
 
 def test_a_failure_is_told() -> None:

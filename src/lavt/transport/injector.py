@@ -74,6 +74,8 @@ class Injector:
         self._deliver = deliver
         self._queues = queues
         self._never = tuple(never)
+        self._applied = 0
+        """Number of the order in force: one that comes again is only measured."""
         self._orders: queue.Queue[Inject | None] = queue.Queue()
         self._thread = threading.Thread(target=self._work, name="injector", daemon=True)
         self._thread.start()
@@ -104,7 +106,9 @@ class Injector:
             if not flows:
                 self._queues.clear()
                 return Injected(order.number, "", "", ())
-            self._queues.apply(flows, never=self._never, condition=order.condition)
+            if order.number != self._applied:
+                self._queues.apply(flows, never=self._never, condition=order.condition)
+            self._applied = order.number
             found = self._queues.verify(flows, never=self._never, count=FRAMES)
         except LavtError as error:
             return Injected(order.number, str(error), "", ())
