@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from tests.kernel.lane import clocks, netem
-from tests.kernel.lane.driving import Drive, collect, start_loop, wait_for_the_end
+from tests.kernel.lane.driving import Drive, Loop, collect, start_loop, wait_for_the_end
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine
 from tests.require import need
 
@@ -57,6 +57,14 @@ def as_it_was(machine: Machine) -> Iterator[Machine]:
 
 
 @pytest.fixture
+def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Print a figure that was measured, whatever becomes of the test: the lane's output has them all."""
+    reporter = request.config.pluginmanager.getplugin("terminalreporter")
+    assert reporter is not None
+    return lambda figure: reporter.write_line(f"\n{request.node.name}: {figure}")
+
+
+@pytest.fixture
 def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable[[], int]:
     """Tell how far the server's wall clock is ahead of the client's, from what both read of one counter."""
     return lambda: offset_ns(server_machine, client_machine)
@@ -73,10 +81,16 @@ def offset_ns(server: Machine, client: Machine) -> int:
 def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path) -> Callable[..., Drive]:
     """Drive once over both machines, from the start of the four programs to the result."""
 
-    def once(name: str = "drive", *, server: tuple[str, ...] = (), client: tuple[str, ...] = ()) -> Drive:
+    def once(
+        name: str = "drive",
+        *,
+        server: tuple[str, ...] = (),
+        client: tuple[str, ...] = (),
+        meanwhile: Callable[[Loop], None] = lambda _: None,
+    ) -> Drive:
         out = tmp_path / name
         loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
-        wait_for_the_end(loop)
+        wait_for_the_end(loop, meanwhile)
         return collect(loop, client_machine, out)
 
     return once

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
 
+from lavt.experiment.join import join
 from lavt.experiment.metrics import Measured, measure
 from lavt.experiment.record import Record, read_record
-from lavt.experiment.results import run_result
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
@@ -74,10 +74,14 @@ def start_loop(
     return Loop(server_router, server_program, client_router, client_program)
 
 
-def wait_for_the_end(loop: Loop) -> None:
-    """Wait until the server has seen the drive's end; raises `MachineError` where one of the others ends before."""
+def wait_for_the_end(loop: Loop, meanwhile: Callable[[Loop], None]) -> None:
+    """Wait until the server has seen the drive's end; raises `MachineError` where one of the others ends before.
+
+    `meanwhile` is called twice a second.
+    """
 
     def ended() -> bool:
+        meanwhile(loop)
         if not loop.server.running:
             return True
         for each in loop.all():
@@ -92,17 +96,13 @@ def collect(loop: Loop, client: Machine, out: Path) -> Drive:
     """End the programs in order, bring the records together, and compute the result."""
     for each in reversed(loop.all()):
         each.stop()
-    (out / "server" / "server.mcap").rename(out / "server.mcap")
-    (out / "client.mcap").write_bytes(client.read(out / "client" / "client.mcap"))
-    server_record, client_record = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-    identity: Mapping[str, Any] = {"run": out.name, "time": "real", "route": SHORT_ROAD.stem}
-    return Drive(
-        out,
-        server_record,
-        client_record,
-        measure(server_record, client_record),
-        run_result(identity, server_record, client_record),
-    )
+    (out / "client").mkdir()
+    for name in ("client.mcap", "config.yaml"):
+        (out / "client" / name).write_bytes(client.read(out / "client" / name))
+    run = out / "run"
+    result = join(out / "server", out / "client", run)
+    server_record, client_record = read_record(run / "server.mcap"), read_record(run / "client.mcap")
+    return Drive(run, server_record, client_record, measure(server_record, client_record), result)
 
 
 def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> Started:

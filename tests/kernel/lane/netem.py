@@ -20,6 +20,20 @@ def netem_on_all(machine: Machine, *arguments: str) -> Iterator[None]:
         machine.run(["tc", "qdisc", "del", *where])
 
 
+@contextmanager
+def netem_on_ntp(machine: Machine, delay: str = "75ms") -> Iterator[None]:
+    """Delay what the machine sends to NTP servers, and nothing else, and undo it."""
+    where = ["dev", machine.interface]
+    machine.run(["tc", "qdisc", "add", *where, "root", "handle", "1:", "prio", "bands", "4"])
+    machine.run(["tc", "qdisc", "add", *where, "parent", "1:4", "handle", "40:", "netem", "delay", delay])
+    match = ["match", "ip", "protocol", "17", "0xff", "match", "ip", "dport", "123", "0xffff"]
+    machine.run(["tc", "filter", "add", *where, "parent", "1:", "protocol", "ip", "u32", *match, "classid", "1:4"])
+    try:
+        yield
+    finally:
+        machine.run(["tc", "qdisc", "del", *where, "root"])
+
+
 def clear(machine: Machine) -> None:
     """Take every queue and filter from the machine's end of the network under test, if there are any."""
     for queue in ("root", "clsact"):

@@ -1,0 +1,212 @@
+"""`lavt server` and `lavt client` on two machines with clocks of their own: what they say, against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from tests.kernel.lane import clocks
+from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
+from tests.kernel.lane.driving import REPOSITORY, Drive, Loop
+from tests.kernel.lane.machine import Machine
+from tests.kernel.lane.netem import netem_on_ntp
+
+from lavt.config_file import conditions
+from lavt.domain import NS_PER_MS, NS_PER_S
+
+pytestmark = pytest.mark.timeout(900)
+
+DriveOnce = Callable[..., Drive]
+TrueOffset = Callable[[], int]
+Tell = Callable[[str], None]
+NTP_PORT = 11123
+PAPER = ("L0", "L1", "L2", "L3", "L4", "L5")
+SHORT = (f"vehicle.route={REPOSITORY / 'tests/kernel/roads/straight.yaml'}",)
+SERVER = ("injection.interface=vec0", "injection.remote=true", "safety.picture_age_limit_ms=2000")
+
+
+def under(condition: str) -> tuple[str, ...]:
+    return "injection.interface=vec0", f"injection.condition={condition}"
+
+
+@dataclass
+class Truth:
+    """The true offset between the machines, noted again and again while something goes on."""
+
+    true_offset_ns: TrueOffset
+    client: Machine
+    tell: Tell
+    client_wall_ns: list[int] = field(default_factory=list)
+    offsets_ns: list[int] = field(default_factory=list)
+
+    def note(self, _loop: Loop | None = None) -> None:
+        """Note it now."""
+        self.offsets_ns.append(self.true_offset_ns())
+        self.client_wall_ns.append(self.client.call(clocks.reading)[1])
+
+    def hold_against(self, drive: Drive) -> None:
+        """Delta is within 1 ms of the truth at every moment noted in the drive, the truth inside its bound of 2 ms."""
+        found = drive.measured.clocks
+        assert found.offset is not None
+        at_ns, truth_ns = np.array(self.client_wall_ns), np.array(self.offsets_ns)
+        began_ns, ended_ns = found.client_wall_ns
+        within = (at_ns >= began_ns) & (at_ns <= ended_ns)
+        assert within.sum() >= 5, "the truth was noted too seldom"
+        error_ns = np.abs(found.offset.at(at_ns[within]) - truth_ns[within])
+        bound_ns = found.offset.bound_at(at_ns[within])
+        self.tell(
+            f"Delta by {found.source}: largest error {error_ns.max() / 1e3:.0f} us, bound {found.bound_ms:.3f} ms"
+        )
+        assert np.all(error_ns < NS_PER_MS)
+        assert np.all(error_ns <= bound_ns)
+        assert found.bound_ms is not None
+        assert found.bound_ms <= 2
+
+
+@pytest.fixture
+def truth(true_offset_ns: TrueOffset, client_machine: Machine, tell: Tell) -> Truth:
+    return Truth(true_offset_ns, client_machine, tell)
+
+
+@pytest.fixture
+def chrony(server_machine: Machine, client_machine: Machine) -> None:
+    """The server's clock is 250 ms ahead and runs 30 ppm fast; the client's chrony follows it, and touches no clock."""
+    server_machine.call(clocks.step, 250 * NS_PER_MS)
+    server_machine.call(clocks.drift, 30)
+    start_chronyd(server_machine, *SERVING)
+    start_chronyd(client_machine, following(server_machine.address))
+    wait_synchronised(client_machine, updates=10)
+
+
+def in_short(drive: Drive) -> str:
+    """Say what was measured in a drive."""
+    result = drive.result
+    tau_v, tau_c, loop, delta = (result[key] for key in ("tau_v_ms", "tau_c_ms", "loop_ms", "delta"))
+    return (
+        f"{result['route']} under {result['condition']}: {result['ending']}, tau_v {tau_v['p50']:.2f}, tau_c "
+        f"{tau_c['p50']:.2f}, loop {loop['p50']:.2f} ms, Delta {delta['ms']:.3f} ms +- {delta['bound_ms']:.3f}, drift "
+        f"{delta['drift_ppm']:.1f} ppm, closure p95 {drive.measured.closure_p95_ms}, {result['invalid_because']}"
+    )
+
+
+def clock_reasons(drive: Drive) -> list[str]:
+    """Reasons against a drive, but those of a machine too slow for it: a user-mode kernel has one processor."""
+    slow = ("the physics was", "the camera missed")
+    return [reason for reason in drive.result["invalid_because"] if not reason.startswith(slow)]
+
+
+@pytest.mark.usefixtures("chrony")
+def test_a_route_is_driven_and_its_latencies_are_true(drive: DriveOnce, truth: Truth, tell: Tell) -> None:
+    """Over two machines the key part of route A is driven to its end; Delta is true to its bound, and the loop closes."""
+    driven = drive("route", server=("vehicle.route=a_key",), meanwhile=truth.note)
+    tell(in_short(driven))
+    assert driven.result["ending"] == "completed"
+    assert clock_reasons(driven) == []
+    assert driven.result["delta"]["source"] == "chrony"
+    assert driven.result["delta"]["drift_ppm"] == pytest.approx(30, abs=5)
+    assert driven.measured.closure_p95_ms is not None
+    assert driven.measured.closure_p95_ms < 1
+    truth.hold_against(driven)
+
+
+@pytest.mark.usefixtures("chrony")
+def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
+    drive: DriveOnce, truth: Truth, server_machine: Machine, client_machine: Machine, tell: Tell
+) -> None:
+    """Under each of L0 to L5 median tau_v and tau_c are those of L0 plus what is injected, to 2 ms, and nothing stays."""
+    queues = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
+    asked = conditions()
+    measured: dict[str, tuple[float, float]] = {}
+    for name in PAPER:
+        driven = drive(name, server=(*SHORT, *SERVER), client=under(name), meanwhile=truth.note)
+        tell(in_short(driven))
+        assert clock_reasons(driven) == [], name
+        assert driven.measured.closure_p95_ms is not None
+        assert driven.measured.closure_p95_ms < 1, name
+        truth.hold_against(driven)
+        measured[name] = driven.result["tau_v_ms"]["p50"], driven.result["tau_c_ms"]["p50"]
+    for name in PAPER:
+        shift = [here - without for here, without in zip(measured[name], measured["L0"], strict=True)]
+        assert shift == pytest.approx([asked[name].video_ms, asked[name].control_ms], abs=2), measured
+    after = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
+    assert after == queues
+
+
+def test_delta_is_true_while_the_server_is_slewed_towards_a_third_clock(
+    drive: DriveOnce, truth: Truth, server_machine: Machine, client_machine: Machine
+) -> None:
+    """While chrony steers the server's clock towards a third one, Delta stays within 1 ms of the truth and its bound."""
+    server_machine.start_python(
+        "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(120 * NS_PER_MS), "20"
+    ).first_line()
+    start_chronyd(server_machine, following("127.0.0.1", NTP_PORT), "maxslewrate 500", "allow", adjusts_clock=True)
+    wait_synchronised(server_machine, updates=4)
+    start_chronyd(client_machine, following(server_machine.address))
+    wait_synchronised(client_machine, updates=10)
+    driven = drive("slewed", server=SHORT, meanwhile=truth.note)
+    assert abs(correction_s(server_machine)) > 0.005, "it slews still"
+    assert clock_reasons(driven) == []
+    truth.hold_against(driven)
+
+
+def test_delay_on_the_path_of_ntp_before_it_synchronised_is_told(
+    drive: DriveOnce, server_machine: Machine, client_machine: Machine
+) -> None:
+    """Where NTP went through 75 ms in one direction from the start, the run is invalid, and the reason is the path."""
+    start_chronyd(server_machine, *SERVING)
+    with netem_on_ntp(client_machine):
+        start_chronyd(client_machine, following(server_machine.address))
+        wait_synchronised(client_machine, updates=10)
+        driven = drive("before", server=SHORT)
+    [reason] = clock_reasons(driven)
+    assert "the NTP of the client goes through injected delay" in reason
+
+
+@pytest.mark.usefixtures("chrony")
+def test_delay_on_the_path_of_ntp_after_it_synchronised_is_told(drive: DriveOnce, client_machine: Machine) -> None:
+    """Where NTP is put through delay after it synchronised, the run is invalid because its samples stand still."""
+    with netem_on_ntp(client_machine):
+        driven = drive("after", server=SHORT)
+    [reason] = clock_reasons(driven)
+    assert "the NTP of the client accepted no sample" in reason
+
+
+@pytest.mark.usefixtures("chrony")
+@pytest.mark.parametrize("step_s", [1, -1])
+def test_a_step_of_the_wall_clock_changes_no_safety_state(
+    drive: DriveOnce, server_machine: Machine, step_s: int
+) -> None:
+    """With the server's wall clock set by a second in the middle of a drive, no safety state changes; it is invalid."""
+    stepped: list[bool] = []
+
+    def step(loop: Loop) -> None:
+        if not stepped and loop.server.latest().get("status", {}).get("progress_m", 0) > 30:
+            stepped.append(True)
+            server_machine.call(clocks.step, step_s * NS_PER_S)
+
+    driven = drive("stepped", server=SHORT, meanwhile=step)
+    events = driven.server.table("event")
+    said = [
+        detail for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True) if kind == "safety"
+    ]
+    assert stepped
+    assert driven.result["ending"] == "completed"
+    changes = ["disarmed -> arming", "arming -> driving", "driving -> safe_stop"]
+    assert [each.partition(":")[0] for each in said] == changes
+    assert said[-1].endswith("the drive is over")
+    reasons = clock_reasons(driven)
+    assert len(reasons) == 1
+    assert reasons[0].startswith(f"the wall clock of the server stepped by {step_s * 1000:+d}"[:-2])
+
+
+def test_the_probe_alone_is_right_under_delay_of_the_control(
+    drive: DriveOnce, truth: Truth, server_machine: Machine
+) -> None:
+    """Without chrony, 100 ms on the control leave Delta inside the probe's bound: nothing delays the probe's port."""
+    server_machine.call(clocks.step, 250 * NS_PER_MS)
+    driven = drive("probe", server=(*SHORT, *SERVER), client=under("L5"), meanwhile=truth.note)
+    assert driven.result["delta"]["source"] == "probe"
+    assert clock_reasons(driven) == []
+    truth.hold_against(driven)
