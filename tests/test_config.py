@@ -131,7 +131,7 @@ def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("kind", [ServerConfig, ClientConfig])
 def test_sources_of_time(text: str, said: str, kind: type[Section], tmp_path: Path) -> None:
-    """A source of time that does not exist, is not fully described, or is described where it is not named is refused."""
+    """A source of time that does not exist, lacks a figure, or has one that is not its own is refused."""
     assert said in refused(text, tmp_path, kind)
 
 

@@ -85,7 +85,7 @@ def test_being_asked_for_long_matters_only_while_steered() -> None:
 
 
 def test_what_is_known_of_the_path_replaces_both_bounds() -> None:
-    """Where the client follows the server its bound is the path's, whatever the hosts' own bounds are."""
+    """Where the client follows the server and the path is better than the root distance, the path's bound counts."""
     client, server = drifting(0, 0), drifting(250, 0)
     path: dict[str, Any] = {
         "follows": "10.9.0.1",
@@ -94,7 +94,9 @@ def test_what_is_known_of_the_path_replaces_both_bounds() -> None:
         "skew_ppm": 5.0,
         "age_s": 2.0,
     }
-    offset = by_sources(samples(server, bound_s=0.1, addresses=["10.9.0.1", "fe80::1"]), samples(client, **path))
+    offset = by_sources(
+        samples(server, bound_s=0.1, addresses=["10.9.0.1", "fe80::1"]), samples(client, bound_s=0.05, **path)
+    )
     assert offset is not None
     assert offset.bound_ns.max() == pytest.approx(200_000 + 10_000 + 10_000)
 

@@ -189,6 +189,28 @@ def test_bytes_that_are_no_text(monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.status == NOT_RUNNING
 
 
+class Jumping:
+    """A clock on which 3 s go by from one reading to the next."""
+
+    def __init__(self) -> None:
+        self._mono_ns = 0
+
+    def now(self) -> Now:
+        """Read both clocks."""
+        self._mono_ns += 3 * NS_PER_S
+        return Now(self._mono_ns, self._mono_ns)
+
+
+@pytest.mark.parametrize("read", [read_chrony, read_ptp])
+def test_an_answer_that_is_read_late(
+    read: Callable[[Clock], ClockReport | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a busy machine takes 3 s from the question to the answer nobody knows to when it belongs: a missed poll."""
+    answer = subprocess.CompletedProcess((), 0, TRACKING.encode())
+    monkeypatch.setattr(subprocess, "run", lambda *_arguments, **_options: answer)
+    assert read(Jumping()) is None
+
+
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])
 def test_no_answer_in_time(read: Callable[[Clock], ClockReport | None], monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine too busy to answer is a missed poll, and does not mean that the source lost the clock."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -95,9 +96,9 @@ def _by_sources(report: ClockReport, latest: ProbeReply, server: str) -> Opinion
     if known[0] is None or known[1] is None or known[2] is None or known[3] is None:
         return None
     path = (report.peer_delay_s, report.peer_dispersion_s, report.skew_ppm, report.age_s)
-    bound_s = known[1] + known[3]
-    if report.follows == server and path[0] is not None and path[1] is not None:
-        bound_s = path[0] / 2 + path[1] + (path[2] or 0.0) / 1e6 * (path[3] or 0.0)
+    delay_s, dispersion_s, skew_ppm, age_s = (math.inf if each is None else each for each in path)
+    path_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
+    bound_s = min(known[1], path_s) if report.follows == server else known[1] + known[3]
     return Opinion((known[0] - known[2]) * 1e3, bound_s * 1e3)
 
 

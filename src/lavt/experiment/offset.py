@@ -65,7 +65,11 @@ class _Correction:
     correction_ns: FloatArray
     own_bound_ns: FloatArray
     peer_bound_ns: FloatArray
-    """That of the path to the other host, where the source follows that one and tells; else NaN."""
+    """That of the correction against the other host's reference, where the source follows that host; else NaN.
+
+    The root distance reaches over the path to that host and beyond, and goes by the best samples; what is told of the
+    path goes by the last one: both hold, and the smaller counts.
+    """
     asked_ns: FloatArray
     """What the correction can have changed by while the source was asked for it."""
 
@@ -78,8 +82,8 @@ def by_sources(server: Table, client: Table) -> Offset | None:
     """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
 
     Its moments are those of the samples of both, as long as both know theirs; beyond them it is taken to go on changing
-    at most twice as fast as it did there. The bound is that of the path between the
-    hosts where one follows the other, else the sum of both hosts' own, and what the line between two samples can
+    at most twice as fast as it did there. The bound is that of the host
+    which follows the other where one does, else the sum of both hosts' own, and what the line between two samples can
     miss (`docs/metrics.md`).
     """
     hosts = [_correction(server, client), _correction(client, server)]
@@ -129,9 +133,9 @@ def _correction(samples: Table, other: Table) -> _Correction | None:
     asked_ns = half_asking_ns * np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
     drift_s = samples.floats("skew_ppm") / 1e6 * samples.floats("age_s")
     path_s = samples.floats("peer_delay_s") / 2 + samples.floats("peer_dispersion_s") + drift_s
-    path_s[~follows(samples, other)] = np.nan
-    own_bound_ns = samples.floats("bound_s") * NS_PER_S
-    return _Correction(reference_ns, correction_ns, own_bound_ns, path_s * NS_PER_S, asked_ns)
+    own_bound_s = samples.floats("bound_s")
+    following_s = np.where(follows(samples, other), np.fmin(path_s, own_bound_s), np.nan)
+    return _Correction(reference_ns, correction_ns, own_bound_s * NS_PER_S, following_s * NS_PER_S, asked_ns)
 
 
 def _ordered(samples: Table, order: IntArray) -> Table:

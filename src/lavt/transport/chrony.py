@@ -41,7 +41,10 @@ def read_chrony(clock: Clock) -> ClockReport | None:
         return None
     except OSError:
         return unknown_clock(before, host, SOURCE, NOT_RUNNING)
-    return parse_chrony(host, answer.stdout.decode(errors="replace"), before, clock.now())
+    after = clock.now()
+    if after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # it was there in time, but this thread was not
+        return None
+    return parse_chrony(host, answer.stdout.decode(errors="replace"), before, after)
 
 
 def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport:
