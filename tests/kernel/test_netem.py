@@ -140,9 +140,9 @@ def test_no_packet_is_lost_or_overtaken_by_a_change(sides: dict[str, Netem]) -> 
             pause(400 * NS_PER_MS)
         inside("server", sides["server"].clear)
 
-    flown = fly([HELD[0]], 800, 5, at={50: change})["video"]
+    flown = fly([HELD[0]], 100, 5, at={50: change})["video"]
 
-    assert flown.numbers == list(range(800))
+    assert flown.numbers == list(range(flown.sent))
     assert max(flown.delays_ms) > 224
     assert queues("server")[0]["kind"] == "noqueue"
 
@@ -414,7 +414,7 @@ def test_a_drive_with_netem_is_measured_as_asked(lavt: Callable[..., Ended], tmp
     sets = [
         "time=real", "network.injection=netem", "network.condition=L4", "vehicle.time_limit_s=4",
         "vehicle.scenery=none",
-        "camera.width_px=320", "camera.height_px=240", "camera.rate_hz=10", "record.video=false",
+        "camera.width_px=320", "camera.height_px=240", "camera.rate_hz=5", "record.video=false",
     ]  # fmt: skip
     changes = [word for each in sets for word in ("--set", each)]
     out = tmp_path / "run"
