@@ -128,7 +128,10 @@ class Flown:
 def fly(
     flights: Sequence[Flight], count: int, period_ms: float, *, at: dict[int, Callable[[], None]] | None = None
 ) -> dict[str, Flown]:
-    """Send `count` of each flight and tell what arrived when; `at` names what a thread does meanwhile, by number."""
+    """Send `count` of each flight and tell what arrived when.
+
+    `at` names what a thread does meanwhile, by number; until that is done, more than `count` are sent.
+    """
     clock = MachineClock()
     watchers = {name: inside(name, lambda name=name: _watcher(DEVICES[name])) for name in DEVICES}  # type: ignore[misc]
     lines = [_Line(flight) for flight in flights]
@@ -136,13 +139,16 @@ def fly(
     names = {line.mark: line.flight.name for line in lines}
     try:
         begin_ns = clock.now().mono_ns
-        meanwhile = []
-        for number in range(count):
+        meanwhile: list[threading.Thread] = []
+        for number in itertools.takewhile(
+            lambda number: number < count or any(thread.is_alive() for thread in meanwhile), itertools.count()
+        ):
             if at and number in at:
                 meanwhile.append(threading.Thread(target=at[number]))
                 meanwhile[-1].start()
             for line in lines:
                 line.send(number, clock.now().wall_ns)
+                flown[line.flight.name].sent = number + 1
             _take(watchers, names, flown)
             while clock.now().mono_ns < begin_ns + round((number + 1) * period_ms * NS_PER_MS):
                 pause(NS_PER_MS // 2)

@@ -85,8 +85,8 @@ def apply(
         return
     _say_restored(netem.check())
     with console.until_told() as told:
+        commands = netem.apply(flows, never=never, condition=name)
         try:
-            commands = netem.apply(flows, never=never, condition=name)
             if not as_json:
                 _show_commands(commands)
             found = netem.verify(flows, never=never)

@@ -72,6 +72,7 @@ class NetemRun:
         )  # fmt: skip
         commands = self._netem.apply(self._flows, condition=network.condition)
         self._report = {
+            "restored": self._restored,
             "commands": commands,
             "flows": [asdict(flow) for flow in self._flows],
             "before": self._measured(),

@@ -181,27 +181,27 @@ class Netem:
             raise UserError(
                 "correlated jitter needs a program that stays: `lavt netem apply --hold`, or network.injection: netem"
             )
-        self._stand_still()
         self.restore()
         with self._files.alone():
             self._check_owner()
+            self._stand_still()
             qdiscs = self._ours_or_free(self.interface)
             applied = Applied(self.interface, namespace(), boot(), self._owner, condition, tuple(flows))
             self._files.write(applied)
             if any(flow.law.jitter_distribution == "uniform" for flow in flows):
                 (self._files.directory / "uniform.dist").write_text(uniform_table())
             ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
-        if wanders:
-            self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
-        return ran
+            if wanders:
+                self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
+            return ran
 
     def clear(self, *, at_once: bool = False) -> list[Command]:
         """Put the interface back as it was; give the commands that did it, none where nothing of ours was there.
 
         What is under way is waited for, in order, and nothing is lost; `at_once` loses it.
         """
-        self._stand_still()
         with self._files.alone():
+            self._stand_still()
             ran = self._clear(self.interface, at_once=at_once)
             self._files.forget(self.interface)
             return ran

@@ -25,7 +25,7 @@ from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS
 from lavt.transport.netem import NEVER, Flow, Law, Port, bursts, gilbert
 from lavt.value import value
 
-PERIOD_NS: Final = 10 * NS_PER_MS
+PERIOD_NS: Final = 20 * NS_PER_MS
 """Between two frames of one flow."""
 AFTER_LONGEST_NS: Final = 300 * NS_PER_MS
 LIMIT_MS: Final = 1.0

@@ -8,9 +8,9 @@ the kernel's own rule; a flow that is to be held is sent by a filter to a band o
                     ├─ 4c56:5 netem 4c02: control
                     └─ 4c56:6 netem 4c03: state
 
-Handles are our own, so that ours is known from somebody else's. netem keeps order only where it has a rate (tc-netem(8)
-does not say so): a flow without one gets 10 Gbit/s, which costs a packet a microsecond. So nothing overtakes where
-that is not asked for, neither by jitter nor when a delay becomes shorter, as in `transport/delay.py`.
+Handles are our own, so that ours is known from somebody else's. netem keeps order only where it has a rate (measured;
+tc-netem(8) does not say so): a flow without one gets 10 Gbit/s, which costs a packet a microsecond. So nothing
+overtakes where that is not asked for, neither by jitter nor when a delay becomes shorter, as in `transport/delay.py`.
 """
 
 from __future__ import annotations
