@@ -1,4 +1,4 @@
-"""Machines that are processes: user-mode kernels with clocks and queues of their own, which see this machine's files."""
+"""Machines that are processes: user-mode kernels that see this machine's files, with their own clocks and queues."""
 
 from __future__ import annotations
 
