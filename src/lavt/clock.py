@@ -16,12 +16,23 @@ class Clock(Protocol):
         ...
 
 
+TOGETHER_NS = 100_000
+"""Two readings so close to each other are of one moment."""
+ATTEMPTS = 4
+
+
 class MachineClock:
     """This machine's own clocks."""
 
     def now(self) -> Now:
-        """Read both clocks, one right after the other."""
-        return Now(time.monotonic_ns(), time.time_ns())
+        """Read both clocks at one moment: again, where other work came between the readings."""
+        mono_ns = time.monotonic_ns()
+        for _ in range(ATTEMPTS):
+            wall_ns = time.time_ns()
+            before_ns, mono_ns = mono_ns, time.monotonic_ns()
+            if mono_ns - before_ns <= TOGETHER_NS:
+                break
+        return Now(mono_ns, wall_ns)
 
 
 def pause(duration_ns: int) -> None:

@@ -22,7 +22,7 @@ def _answer(connection: Connection) -> None:
     while True:
         try:
             function, arguments, keywords = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
             connection.send((None, function(*arguments, **keywords)))

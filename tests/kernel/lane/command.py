@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -71,11 +72,9 @@ def _completed(argument: str) -> str:
 def interpreter() -> str:
     """Find a Python that has LAVT and pytest: the one that runs this, or the repository's environment."""
     for python in (sys.executable, str(REPOSITORY / ".venv/bin/python")):
-        if os.access(python, os.X_OK):
-            tried = subprocess.run(
-                [python, "-c", "import lavt, pytest"], capture_output=True, env=_environment(), check=False
-            )
-            if tried.returncode == 0:
+        has_both = [python, "-c", "import lavt, pytest"]
+        with suppress(OSError):
+            if subprocess.run(has_both, capture_output=True, env=_environment(), check=False).returncode == 0:
                 return python
     raise Refusal("no Python here has LAVT and pytest: python3 -m venv .venv && .venv/bin/pip install -e '.[all]'")
 
