@@ -136,5 +136,5 @@ def test_a_road_is_driven_over_both_machines(
     assert driven.result["ending"] == "completed"
     assert driven.measured.closure_p95_ms is not None
     assert driven.measured.closure_p95_ms <= 1
-    assert driven.measured.clock_bound_ms is not None
+    assert driven.measured.clocks.bound_ms is not None
     assert 0 < driven.result["tau_c_ms"]["p50"] < 50, "an offset of 250 ms would show"

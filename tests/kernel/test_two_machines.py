@@ -99,7 +99,7 @@ def clock_reasons(drive: Drive) -> list[str]:
 
 @pytest.mark.usefixtures("chrony")
 def test_a_route_is_driven_and_its_latencies_are_true(drive: DriveOnce, truth: Truth, tell: Tell) -> None:
-    """Over two machines the key part of route A is driven to its end; Delta is true to its bound, and the loop closes."""
+    """Over two machines the key part of route A is driven to its end; Delta is true to its bound; the loop closes."""
     driven = drive("route", server=("vehicle.route=a_key",), meanwhile=truth.note)
     tell(in_short(driven))
     assert driven.result["ending"] == "completed"
@@ -115,7 +115,7 @@ def test_a_route_is_driven_and_its_latencies_are_true(drive: DriveOnce, truth: T
 def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
     drive: DriveOnce, truth: Truth, server_machine: Machine, client_machine: Machine, tell: Tell
 ) -> None:
-    """Under each of L0 to L5 median tau_v and tau_c are those of L0 plus what is injected, to 2 ms, and nothing stays."""
+    """Under each of L0 to L5 median tau_v and tau_c are those of L0 plus what is injected, to 2 ms; nothing stays."""
     queues = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
     asked = conditions()
     measured: dict[str, tuple[float, float]] = {}
@@ -137,7 +137,7 @@ def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
 def test_delta_is_true_while_the_server_is_slewed_towards_a_third_clock(
     drive: DriveOnce, truth: Truth, server_machine: Machine, client_machine: Machine
 ) -> None:
-    """While chrony steers the server's clock towards a third one, Delta stays within 1 ms of the truth and its bound."""
+    """While chrony steers the server's clock towards a third one, Delta stays within 1 ms of the truth, in its bound."""
     server_machine.start_python(
         "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(120 * NS_PER_MS), "20"
     ).first_line()
