@@ -59,9 +59,16 @@ def as_it_was(machine: Machine) -> Iterator[Machine]:
 @pytest.fixture
 def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
     """Print a figure that was measured, whatever becomes of the test: the lane's output has them all."""
-    reporter = request.config.pluginmanager.getplugin("terminalreporter")
+    plugins = request.config.pluginmanager
+    reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
     assert reporter is not None
-    return lambda figure: reporter.write_line(f"\n{request.node.name}: {figure}")
+    assert capture is not None
+
+    def line(figure: str) -> None:
+        with capture.global_and_fixture_disabled():
+            reporter.write_line(f"\n{request.node.name}: {figure}")
+
+    return line
 
 
 @pytest.fixture

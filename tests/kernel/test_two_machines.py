@@ -137,7 +137,7 @@ def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
 def test_delta_is_true_while_the_server_is_slewed_towards_a_third_clock(
     drive: DriveOnce, truth: Truth, server_machine: Machine, client_machine: Machine
 ) -> None:
-    """While chrony steers the server's clock towards a third one, Delta stays within 1 ms of the truth, in its bound."""
+    """While chrony steers the server's clock towards a third one, Delta is within 1 ms of the truth, in its bound."""
     server_machine.start_python(
         "tests.kernel.lane.ntp_server", "127.0.0.1", str(NTP_PORT), str(120 * NS_PER_MS), "20"
     ).first_line()
