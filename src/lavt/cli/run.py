@@ -35,8 +35,9 @@ def run(
     planned = plan_run(load_config(RunConfig, config, changes or []))
     out = out or Path("out") / "run"
     check_directory(out)
-    for restored in check_netem(planned):
-        console.say(f"lavt: {restored}")
+    with console.interruptible():
+        for restored in check_netem(planned):
+            console.say(f"lavt: {restored}")
     title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)
