@@ -155,6 +155,7 @@ def test_a_full_record_queue_loses_and_counts() -> None:
     recorder = QueuedRecorder(Slow(), capacity=3)
     for number in range(20):
         recorder.write("event", number, NOW)
+    assert recorder.overflow >= 16
     go.set()
     recorder.close(NOW)
     written = [payload for topic, payload, _ in kept.entries if topic == "event"]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import queue
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
@@ -16,6 +15,8 @@ from lavt.transport.messages import decode
 from lavt.value import value
 
 log = logging.getLogger(__name__)
+
+LOOK_PERIOD_S = 0.02
 
 
 class Recorder(Protocol):
@@ -97,7 +98,8 @@ def as_written(channel: str, payload: Any) -> Any:
 class QueuedRecorder:
     """A recorder behind a bounded queue and a thread of its own, so that no node ever waits for a disk.
 
-    Bytes of the network are taken apart in that thread too: the threads that receive them have better to do.
+    Bytes of the network are taken apart in that thread too: the threads that receive them have better to do. It looks
+    into the queue from time to time and is never woken: a thousand times a second would cost more than the writing.
 
     What does not fit, or cannot be written, is counted in `overflow`; a run with an overflow is invalid.
     """
@@ -107,7 +109,9 @@ class QueuedRecorder:
         self.failed = False
         """Whether the record has ended because it could not be written."""
         self._recorder = recorder
-        self._queue: queue.Queue[tuple[str, Any, Now] | None] = queue.Queue(capacity)
+        self._capacity = capacity
+        self._queue: deque[tuple[str, Any, Now]] = deque()
+        self._closed = threading.Event()
         self._thread = threading.Thread(target=self._drain, name="recorder", daemon=True)
         self._thread.start()
 
@@ -115,27 +119,32 @@ class QueuedRecorder:
         """Queue one entry, or count it as lost."""
         if topic in UNRECORDED:
             return
-        try:
-            self._queue.put_nowait((topic, payload, now))
-        except queue.Full:
+        if len(self._queue) < self._capacity:
+            self._queue.append((topic, payload, now))
+        else:
             self.overflow += 1
 
     def close(self, now: Now) -> None:
         """Write what is queued, and how much was lost."""
-        self._queue.put(None)
+        self._closed.set()
         self._thread.join()
         if not self.failed:
             self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
 
     def _drain(self) -> None:
-        while (entry := self._queue.get()) is not None:
-            if self.failed:
-                self.overflow += 1
-                continue
-            try:
-                topic, payload, now = entry
-                self._recorder.write(topic, as_written(topic, payload), now)
-            except Exception as error:  # a full disk, or whatever it is, ends the record and not the drive
-                log.error("the record ends here, it cannot be written: %s", error)
-                self.failed = True
-                self.overflow += 1
+        last = False
+        while not last:
+            last = self._closed.wait(LOOK_PERIOD_S)
+            while self._queue:
+                self._write(*self._queue.popleft())
+
+    def _write(self, topic: str, payload: Any, now: Now) -> None:
+        if self.failed:
+            self.overflow += 1
+            return
+        try:
+            self._recorder.write(topic, as_written(topic, payload), now)
+        except Exception as error:  # a full disk, or whatever it is, ends the record and not the drive
+            log.error("the record ends here, it cannot be written: %s", error)
+            self.failed = True
+            self.overflow += 1
