@@ -133,8 +133,14 @@ def test_not_running(case: str) -> None:
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NOT_RUNNING)
 
 
-@pytest.mark.parametrize("field", [19, 20, 10, 33])
-@pytest.mark.parametrize("value", ["", "?", "nan", "-1", "inf"])
+def test_a_poll_of_less_than_a_second() -> None:
+    """The poll is two to the power that chrony gives: its seconds are whole, 0 for half a second."""
+    report = parsed(TRACKING + "\n" + changed(NTPDATA, field9="-1", field10="0"))
+    assert report.poll_s == 0.5
+
+
+@pytest.mark.parametrize("field", [19, 20, 9, 33])
+@pytest.mark.parametrize("value", ["", "?", "nan", "-8", "inf"])
 def test_a_path_that_cannot_be(field: int, value: str) -> None:
     """A figure of the path that is no number, or a negative one, is unknown; the rest stands."""
     report = parsed(TRACKING + "\n" + changed(NTPDATA, **{f"field{field}": value}))

@@ -21,6 +21,8 @@ PATH_LIMIT_MS = 1.0
 """How much longer than the probe's NTP's round trip may be before its path is not the probe's."""
 STILL_LIMIT_POLLS = 5
 """So many polls without a good sample, and chrony only extrapolates."""
+STILL_LEAST_S = 5.0
+"""Shorter than this it may, however often it polls: a busy machine loses some samples of many."""
 
 Sides = tuple[tuple[str, Table, Table, IntArray], ...]
 """Name of a side, its samples, the other side's, and beginning and end of the drive on its wall clock."""
@@ -161,7 +163,7 @@ def _longest_still_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] 
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
     touches = (wall_ns[ends] >= drive_ns[0]) & (wall_ns[begins] <= drive_ns[1])
     still_s = np.where(touches, (mono_ns[ends] - mono_ns[begins]) / NS_PER_S, 0.0)
-    limits_s = STILL_LIMIT_POLLS * samples.floats("poll_s")[begins]
+    limits_s = np.maximum(STILL_LIMIT_POLLS * samples.floats("poll_s")[begins], STILL_LEAST_S)
     worst = int(np.argmax(still_s - limits_s))
     return (float(still_s[worst]), float(limits_s[worst])) if still_s[worst] > limits_s[worst] else None
 

@@ -71,7 +71,8 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     age_s = None if reference_s is None else max(0.0, middle.wall_ns / NS_PER_S + correction_s - reference_s)
     follows = plain_address(tracking[1])
     peer = next((row for row in rows if len(row) == NTPDATA_FIELDS and plain_address(row[0]) == follows != ""), None)
-    poll_s, peer_delay_s, peer_dispersion_s = _numbers_of(peer, (10, 19, 20))
+    peer_delay_s, peer_dispersion_s = _numbers_of(peer, (19, 20))
+    poll_log2 = None if peer is None else _number(peer[9])
     return ClockReport(
         middle.mono_ns,
         middle.wall_ns,
@@ -87,7 +88,8 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
         peer_delay_s=peer_delay_s,
         peer_dispersion_s=peer_dispersion_s,
         good_samples=int(peer[33]) if peer and peer[33].isascii() and peer[33].isdigit() else None,
-        poll_s=poll_s,
+        # Not the field after it: that one is a whole number, and 0 where chrony polls twice a second.
+        poll_s=2.0**poll_log2 if poll_log2 is not None and -7 <= poll_log2 <= 24 else None,
         status="its own clock is the reference" if tracking[0] == LOCAL_REFERENCE else "",
     )
 
