@@ -295,7 +295,7 @@ def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "stop", "router", "relay"]
+COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "stop", "router", "relay", "clock"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
