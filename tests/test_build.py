@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from dataclasses import replace
 from itertools import repeat
 from typing import Literal
@@ -23,6 +24,7 @@ from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
 from lavt.runtime.chain import walk
+from lavt.transport.shell import Shell
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
 
 
@@ -158,16 +160,20 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
     assert woken[1] <= 82
 
 
+def nobody(command: Sequence[str], _timeout_s: float) -> None:
+    raise AssertionError(f"nobody should have asked {command}")
+
+
 def test_an_external_source_of_time_says_what_the_config_says() -> None:
     """Correction and bound of an external source are those of the config, in seconds."""
-    report = clock_source(ClockConfig(source="external", correction_ms=-2.5, bound_ms=0.5), MachineClock())()
+    report = clock_source(ClockConfig(source="external", correction_ms=-2.5, bound_ms=0.5), MachineClock(), nobody)()
     assert report is not None
     assert (report.source, report.correction_s, report.bound_s) == ("external", -0.0025, 0.0005)
 
 
 def test_a_clock_may_be_left_to_the_probe() -> None:
     """With source probe nobody is asked, and the report knows no correction."""
-    report = clock_source(ClockConfig(source="probe"), MachineClock())()
+    report = clock_source(ClockConfig(source="probe"), MachineClock(), nobody)()
     assert report is not None
     assert (report.source, report.correction_s, report.bound_s) == ("probe", None, None)
 
@@ -176,7 +182,8 @@ def test_a_clock_may_be_left_to_the_probe() -> None:
 def test_a_source_that_is_not_installed(source: Literal["chrony", "ptp"], monkeypatch: pytest.MonkeyPatch) -> None:
     """A source by name is asked by its own program; without it the report says that it is not installed."""
     monkeypatch.setenv("PATH", "")
-    report = clock_source(ClockConfig(source=source), MachineClock())()
+    with closing(Shell()) as shell:
+        report = clock_source(ClockConfig(source=source), MachineClock(), shell.run)()
     assert report is not None
     assert (report.source, report.correction_s) == (source, None)
     assert report.status.endswith("is not installed")

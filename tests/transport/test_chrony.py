@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import math
-import subprocess
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -14,6 +12,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.transport.chrony import ABSENT, NOT_RUNNING, NOT_SYNCHRONISED, parse_chrony, read_chrony
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.ptp import read_ptp
+from lavt.transport.shell import NOT_FOUND, Ended, Run
 
 TRACKING = (
     "0A090001,10.9.0.1,9,1795292431.937353491,0.249678716,-0.000000352,0.000014692,-0.310,0.014,3.735,"
@@ -35,6 +34,10 @@ BEFORE_SYNC = (
 LOCAL = "7F7F0101,,8,1795292419.031279233,0.000000000,0.000000000,0.000000000,0.000,0.000,0.000,0.0,0.0,0.0,Normal\n"
 """The server of such a pair: it follows nobody."""
 BEFORE, AFTER = Now(0, 1795292432 * NS_PER_S), Now(20_000_000, 1795292432 * NS_PER_S + 20_000_000)
+
+
+def answering(ended: Ended | None) -> Run:
+    return lambda _command, _timeout_s: ended
 
 
 def parsed(answer: str) -> ClockReport:
@@ -167,32 +170,11 @@ def test_any_answer(answer: str) -> None:
         assert each is None or 0 <= each < math.inf
 
 
-@pytest.mark.parametrize(
-    ("failure", "said"),
-    [
-        (FileNotFoundError(), ABSENT),
-        (PermissionError(), NOT_RUNNING),
-    ],
-)
-def test_no_chrony(failure: Exception, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where chrony is not there or fails, the report says so and has no correction."""
-
-    def run(*_arguments: Any, **_options: Any) -> None:
-        raise failure
-
-    monkeypatch.setattr(subprocess, "run", run)
-    report = read_chrony(MachineClock())
+def test_no_chrony() -> None:
+    """Where chrony is not installed, the report says so and has no correction."""
+    report = read_chrony(MachineClock(), answering(Ended(NOT_FOUND, "")))
     assert report is not None
-    assert (report.source, report.status, report.correction_s, report.bound_s) == ("chrony", said, None, None)
-
-
-def test_bytes_that_are_no_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An answer that is no text is that of a chrony that does not run."""
-    answer = subprocess.CompletedProcess((), 0, b"\xff\xfe\x00,\n")
-    monkeypatch.setattr(subprocess, "run", lambda *_arguments, **_options: answer)
-    report = read_chrony(MachineClock())
-    assert report is not None
-    assert report.status == NOT_RUNNING
+    assert (report.source, report.status, report.correction_s, report.bound_s) == ("chrony", ABSENT, None, None)
 
 
 class Jumping:
@@ -208,21 +190,12 @@ class Jumping:
 
 
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])
-def test_an_answer_that_is_read_late(
-    read: Callable[[Clock], ClockReport | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_answer_that_is_read_late(read: Callable[[Clock, Run], ClockReport | None]) -> None:
     """Where a busy machine takes 3 s from the question to the answer nobody knows to when it belongs: a missed poll."""
-    answer = subprocess.CompletedProcess((), 0, TRACKING.encode())
-    monkeypatch.setattr(subprocess, "run", lambda *_arguments, **_options: answer)
-    assert read(Jumping()) is None
+    assert read(Jumping(), answering(Ended(0, TRACKING))) is None
 
 
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])
-def test_no_answer_in_time(read: Callable[[Clock], ClockReport | None], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_answer_in_time(read: Callable[[Clock, Run], ClockReport | None]) -> None:
     """A machine too busy to answer is a missed poll, and does not mean that the source lost the clock."""
-
-    def run(*_arguments: Any, **_options: Any) -> None:
-        raise subprocess.TimeoutExpired("chronyc", 2)
-
-    monkeypatch.setattr(subprocess, "run", run)
-    assert read(MachineClock()) is None
+    assert read(MachineClock(), answering(None)) is None

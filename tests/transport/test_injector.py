@@ -36,6 +36,11 @@ class NamedQueues:
         self.did.append(("verify", tuple(flows), tuple(never)))
         return Verified(["read back otherwise"], {"video": Measured(count, 0, 0, 0, 150.0, 150.1, 150.2)})
 
+    def measure(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> dict[str, Measured]:
+        """Give the same."""
+        self.did.append(("measure", tuple(flows), tuple(never)))
+        return {"video": Measured(count, 0, 0, 0, 150.0, 150.1, 150.2)}
+
     def clear(self) -> None:
         """Note it."""
         self.did.append("clear")
@@ -59,10 +64,12 @@ def test_orders_are_done_in_order_measured_and_put_back_at_the_end() -> None:
     """An order is applied once and measured whenever it comes; one without flows clears, and closing puts all back."""
     queues = NamedQueues()
     said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
-    measured = Injected(1, "", "read back otherwise", (("video", 150.1),))
-    assert said == [measured, measured, Injected(2, "", "", ())]
-    verified = ("verify", (VIDEO,), (PROBE,))
-    assert queues.did == [("L2", (VIDEO,), (PROBE,)), verified, verified, "clear", "clear"]
+    assert said[0] == Injected(1, "", "read back otherwise", (("video", 150.1),))
+    assert (said[1].number, said[1].because, said[1].measured_ms) == (1, "", (("video", 150.1),))
+    assert "NTP: no packet came through" in said[1].doubts
+    assert said[2] == Injected(2, "", "", ())
+    both = ((VIDEO,), (PROBE,))
+    assert queues.did == [("L2", *both), ("verify", *both), ("measure", *both), "clear", "clear"]
 
 
 def test_a_failure_is_told() -> None:

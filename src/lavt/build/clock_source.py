@@ -9,12 +9,16 @@ from lavt.config import ClockConfig
 from lavt.transport.chrony import read_chrony
 from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, unknown_clock
 from lavt.transport.ptp import read_ptp
+from lavt.transport.shell import Run
 
 MS_PER_S = 1000.0
 
 
-def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport | None]:
-    """Give the function that asks the source which the config names; it gives None where no answer came in time."""
+def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
+    """Give the function that asks the source which the config names; it gives None where no answer came in time.
+
+    `run` runs the source's program.
+    """
 
     def external() -> ClockReport:
         now = clock.now()
@@ -27,8 +31,8 @@ def clock_source(config: ClockConfig, clock: Clock) -> Callable[[], ClockReport 
         return unknown_clock(clock.now(), kernel_identity(), "probe", "left to the probe by clock.source")
 
     sources: dict[str, Callable[[], ClockReport | None]] = {
-        "chrony": lambda: read_chrony(clock),
-        "ptp": lambda: read_ptp(clock),
+        "chrony": lambda: read_chrony(clock, run),
+        "ptp": lambda: read_ptp(clock, run),
         "external": external,
         "probe": left_to_the_probe,
     }

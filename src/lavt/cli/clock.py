@@ -18,6 +18,7 @@ from lavt.errors import BadMessage, WorkError
 from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
 from lavt.transport.clock_probe import ClockProbe, ProbeReply, decode_reply, encode_request
+from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink, look_up
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS
@@ -45,7 +46,8 @@ def clock(
     """
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
-    report = clock_source(ClockConfig(source=source), machine)()
+    with closing(Shell()) as shell:
+        report = clock_source(ClockConfig(source=source), machine, shell.run)()
     if report is None:
         raise WorkError(f"{source} did not answer in time: is this machine very busy?")
     if address is None:

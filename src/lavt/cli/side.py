@@ -27,6 +27,7 @@ from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.injector import Injector
 from lavt.transport.netem import Port
 from lavt.transport.netem_control import Netem
+from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
@@ -57,6 +58,7 @@ class Side:
         self._writer: RecordWriter | None = None
         self._queue: QueuedRecorder | None = None
         self._udp: dict[str, UdpLink] = {}
+        self._shell = Shell()
         if out is not None:
             check_directory(out)
         queues = _queues(config)
@@ -91,7 +93,9 @@ class Side:
             self._writer = self._open_record(self._out)
             self.tap = LiveTap(self._writer)
         self._queue = QueuedRecorder(self.tap)
-        self.runtime = RealRuntime(self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock))
+        self.runtime = RealRuntime(
+            self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock, self._shell.run)
+        )
         self._zenoh.start()
         self.runtime.start({**self._udp, "zenoh": self._zenoh, "netem": self._injector})
         for link in self._udp.values():
@@ -124,6 +128,7 @@ class Side:
         if self.runtime is not None:
             self.runtime.stop()
         self._injector.close()
+        self._shell.close()
         for each in self._udp.values():
             each.close()
         self._zenoh.close()

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-import subprocess
 from collections.abc import Sequence
 
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
-from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, plain_address, unknown_clock
+from lavt.transport.clock_offset import ClockReport, ask, host_addresses, plain_address, unknown_clock
+from lavt.transport.shell import Run
 
 SOURCE = "chrony"
 CHRONYC = ("chronyc", "-n", "-c", "-m", "tracking", "ntpdata")
 """Both reports by one process; who may not see the second (it needs root) still gets the first."""
-TIMEOUT_S = 2.0
 TRACKING_FIELDS = 14
 NTPDATA_FIELDS = 34
 SYNCHRONISED = {"Normal", "Insert second", "Delete second"}
@@ -25,26 +24,12 @@ NOT_RUNNING = "chrony is not running"
 NOT_SYNCHRONISED = "chrony is not synchronised"
 
 
-def read_chrony(clock: Clock) -> ClockReport | None:
+def read_chrony(clock: Clock, run: Run) -> ClockReport | None:
     """Ask chrony on this host; where it cannot tell, the report says so and has no correction.
 
     None where no answer came in time: that says nothing of the clock, and is a missed poll.
     """
-    host, before = kernel_identity(), clock.now()
-    try:
-        answer = subprocess.run(  # noqa: S603 (a constant)
-            CHRONYC, capture_output=True, timeout=TIMEOUT_S, check=False
-        )
-    except FileNotFoundError:
-        return unknown_clock(before, host, SOURCE, ABSENT)
-    except subprocess.TimeoutExpired:
-        return None
-    except OSError:
-        return unknown_clock(before, host, SOURCE, NOT_RUNNING)
-    after = clock.now()
-    if after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # it was there in time, but this thread was not
-        return None
-    return parse_chrony(host, answer.stdout.decode(errors="replace"), before, after)
+    return ask(CHRONYC, clock, run, source=SOURCE, absent=ABSENT, parse=parse_chrony)
 
 
 def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport:

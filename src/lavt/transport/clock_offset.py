@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from lavt.domain import Now
+from lavt.clock import Clock
+from lavt.domain import NS_PER_S, Now
+from lavt.transport.shell import NOT_FOUND, Run
 from lavt.value import value
+
+TIMEOUT_S = 2.0
 
 
 @value
@@ -91,6 +96,23 @@ def plain_address(text: str) -> str:
 def unknown_clock(now: Now, host: str, source: str, status: str) -> ClockReport:
     """Make the report of a source that cannot tell."""
     return ClockReport(now.mono_ns, now.wall_ns, host, source, status=status, addresses=host_addresses())
+
+
+def ask(
+    command: Sequence[str], clock: Clock, run: Run, *, source: str, absent: str, parse: Callable[..., ClockReport]
+) -> ClockReport | None:
+    """Have a program tell of this host's clock: `parse(host, its output, clocks before, clocks after)`.
+
+    None where no answer came in time: that says nothing of the clock, and is a missed poll.
+    """
+    host, before = kernel_identity(), clock.now()
+    ended = run(command, TIMEOUT_S)
+    after = clock.now()
+    if ended is None or after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # it was in time, but this thread not
+        return None
+    if ended.code == NOT_FOUND:
+        return unknown_clock(before, host, source, absent)
+    return parse(host, ended.output, before, after)
 
 
 def _text_of(path: Path) -> str:

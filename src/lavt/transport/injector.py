@@ -14,11 +14,12 @@ from lavt.errors import LavtError
 from lavt.node import Send
 from lavt.transport.netem import Flow, Port
 from lavt.transport.netem_control import Verified
+from lavt.transport.netem_probe import Measured, judge
 from lavt.value import value
 
 Deliver = Callable[[str, Any, Now, Any], None]
 
-FRAMES = 20
+FRAMES = 10
 """So many measure a flow, in a fifth of a second."""
 NO_INTERFACE = "no interface is configured for it: set injection.interface"
 
@@ -55,7 +56,11 @@ class Queues(Protocol):
         ...
 
     def verify(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> Verified:
-        """Measure what happens to packets of flows, and of what must not be held."""
+        """Read back what is in force, and measure what happens to packets of flows, and of what must not be held."""
+        ...
+
+    def measure(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> dict[str, Measured]:
+        """Measure the same, and read nothing back."""
         ...
 
     def clear(self) -> object:
@@ -108,8 +113,11 @@ class Injector:
                 return Injected(order.number, "", "", ())
             if order.number != self._applied:
                 self._queues.apply(flows, never=self._never, condition=order.condition)
+                found = self._queues.verify(flows, never=self._never, count=FRAMES)
+            else:  # while it is driven: without starting programs, which would hold it up
+                measured = self._queues.measure(flows, never=self._never, count=FRAMES)
+                found = Verified(judge(flows, self._never, measured), measured)
             self._applied = order.number
-            found = self._queues.verify(flows, never=self._never, count=FRAMES)
         except LavtError as error:
             return Injected(order.number, str(error), "", ())
         measured_ms = tuple((flow.name, found.measured[flow.name].median_ms) for flow in flows)

@@ -28,6 +28,8 @@ from lavt.value import value
 PERIOD_NS: Final = 20 * NS_PER_MS
 """Between two frames of one flow."""
 AFTER_LONGEST_NS: Final = 300 * NS_PER_MS
+AFTERWARDS_NS: Final = 10 * NS_PER_MS
+"""Between two looks for what is still under way."""
 LIMIT_MS: Final = 1.0
 """How far a median may be from what was asked."""
 SIGMAS: Final = 4.0
@@ -113,14 +115,13 @@ def measure(
         for number in range(count):
             for index, probe in enumerate(asked):
                 _send(sender, _frame(probe, seen.mark(number, index, clock.now().wall_ns)), link)
-            while clock.now().mono_ns < begin_ns + (number + 1) * period_ns:
-                seen.take()
-                pause(NS_PER_MS // 2)
+            pause(begin_ns + (number + 1) * period_ns - clock.now().mono_ns)
+            seen.take()  # when is the kernel's to say: there is no hurry
         longest_ns = round(max(probe.law.longest_ms for probe in asked) * NS_PER_MS)
         limit_ns = clock.now().mono_ns + longest_ns + AFTER_LONGEST_NS
         while seen.count < count * len(asked) and clock.now().mono_ns < limit_ns:
+            pause(AFTERWARDS_NS)
             seen.take()
-            pause(NS_PER_MS // 2)
     return {probe.name: summary(probe.law, count, seen.delays[index]) for index, probe in enumerate(asked)}
 
 

@@ -7,15 +7,14 @@ steers that one itself (software time stamping); where phc2sys copies a network 
 from __future__ import annotations
 
 import math
-import subprocess
 
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
-from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, unknown_clock
+from lavt.transport.clock_offset import ClockReport, ask, host_addresses, unknown_clock
+from lavt.transport.shell import Run
 
 SOURCE = "ptp"
 PMC = ("pmc", "-u", "-b", "0", "GET PORT_DATA_SET", "GET CURRENT_DATA_SET", "GET TIME_STATUS_NP")
-TIMEOUT_S = 2.0
 """It takes 0.12 s: pmc waits for what may come late."""
 
 ABSENT = "linuxptp is not installed"
@@ -23,24 +22,12 @@ NOT_RUNNING = "ptp4l is not running, or this user may not ask it"
 NO_MASTER = "ptp4l is neither master nor does it hear one"
 
 
-def read_ptp(clock: Clock) -> ClockReport | None:
+def read_ptp(clock: Clock, run: Run) -> ClockReport | None:
     """Ask ptp4l on this host; where it cannot tell, the report says so and has no correction.
 
     None where no answer came in time: that says nothing of the clock, and is a missed poll.
     """
-    host, before = kernel_identity(), clock.now()
-    try:
-        answer = subprocess.run(PMC, capture_output=True, timeout=TIMEOUT_S, check=False)  # noqa: S603 (a constant)
-    except FileNotFoundError:
-        return unknown_clock(before, host, SOURCE, ABSENT)
-    except subprocess.TimeoutExpired:
-        return None
-    except OSError:
-        return unknown_clock(before, host, SOURCE, NOT_RUNNING)
-    after = clock.now()
-    if after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # it was there in time, but this thread was not
-        return None
-    return parse_ptp(host, answer.stdout.decode(errors="replace"), before, after)
+    return ask(PMC, clock, run, source=SOURCE, absent=ABSENT, parse=parse_ptp)
 
 
 def parse_ptp(host: str, answer: str, before: Now, after: Now) -> ClockReport:
