@@ -23,12 +23,14 @@ TrueOffset = Callable[[], int]
 Tell = Callable[[str], None]
 NTP_PORT = 11123
 PAPER = ("L0", "L1", "L2", "L3", "L4", "L5")
-SHORT = (f"vehicle.route={REPOSITORY / 'tests/kernel/roads/straight.yaml'}",)
+SMALL = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
+"""A user-mode kernel has one processor and dear system calls: with less to do it is steadier."""
+SHORT = (f"vehicle.route={REPOSITORY / 'tests/kernel/roads/straight.yaml'}", "video.bit_rate_bps=500000", *SMALL)
 SERVER = ("injection.interface=vec0", "injection.remote=true", "safety.picture_age_limit_ms=2000")
 
 
 def under(condition: str) -> tuple[str, ...]:
-    return "injection.interface=vec0", f"injection.condition={condition}"
+    return (*SMALL, "injection.interface=vec0", f"injection.condition={condition}")
 
 
 @dataclass
@@ -100,7 +102,7 @@ def clock_reasons(drive: Drive) -> list[str]:
 @pytest.mark.usefixtures("chrony")
 def test_a_route_is_driven_and_its_latencies_are_true(drive: DriveOnce, truth: Truth, tell: Tell) -> None:
     """Over two machines the key part of route A is driven to its end; Delta is true to its bound; the loop closes."""
-    driven = drive("route", server=("vehicle.route=a_key",), meanwhile=truth.note)
+    driven = drive("route", server=("vehicle.route=a_key", "video.bit_rate_bps=1000000"), meanwhile=truth.note)
     tell(in_short(driven))
     assert driven.result["ending"] == "completed"
     assert clock_reasons(driven) == []
@@ -145,7 +147,7 @@ def test_delta_is_true_while_the_server_is_slewed_towards_a_third_clock(
     wait_synchronised(server_machine, updates=4)
     start_chronyd(client_machine, following(server_machine.address))
     wait_synchronised(client_machine, updates=10)
-    driven = drive("slewed", server=SHORT, meanwhile=truth.note)
+    driven = drive("slewed", server=SHORT, client=SMALL, meanwhile=truth.note)
     assert abs(correction_s(server_machine)) > 0.005, "it slews still"
     assert clock_reasons(driven) == []
     truth.hold_against(driven)
@@ -159,7 +161,7 @@ def test_delay_on_the_path_of_ntp_before_it_synchronised_is_told(
     with netem_on_ntp(client_machine):
         start_chronyd(client_machine, following(server_machine.address))
         wait_synchronised(client_machine, updates=10)
-        driven = drive("before", server=SHORT)
+        driven = drive("before", server=SHORT, client=SMALL)
     [reason] = clock_reasons(driven)
     assert "the NTP of the client goes through injected delay" in reason
 
@@ -168,7 +170,7 @@ def test_delay_on_the_path_of_ntp_before_it_synchronised_is_told(
 def test_delay_on_the_path_of_ntp_after_it_synchronised_is_told(drive: DriveOnce, client_machine: Machine) -> None:
     """Where NTP is put through delay after it synchronised, the run is invalid because its samples stand still."""
     with netem_on_ntp(client_machine):
-        driven = drive("after", server=SHORT)
+        driven = drive("after", server=SHORT, client=SMALL)
     [reason] = clock_reasons(driven)
     assert "the NTP of the client accepted no sample" in reason
 
@@ -186,7 +188,7 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(
             stepped.append(True)
             server_machine.call(clocks.step, step_s * NS_PER_S)
 
-    driven = drive("stepped", server=SHORT, meanwhile=step)
+    driven = drive("stepped", server=SHORT, client=SMALL, meanwhile=step)
     events = driven.server.table("event")
     said = [
         detail for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True) if kind == "safety"

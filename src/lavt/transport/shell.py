@@ -12,6 +12,7 @@ import shlex
 import subprocess
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from lavt.clock import Clock, MachineClock
@@ -19,6 +20,8 @@ from lavt.domain import NS_PER_S
 
 END: Final = "lavt: ended with"
 """Begins the line after a program's output."""
+NICENESS: Final = 10
+"""Less of the processor than others get: a question must not hold up who drives."""
 NOT_FOUND: Final = 127
 """Exit code where there is no such program (POSIX, shell command language, 2.8.2)."""
 
@@ -65,6 +68,8 @@ class Shell:
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C at the terminal is for us
             )  # fmt: skip
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, self._process.pid, NICENESS)
         assert self._process.stdin is not None  # noqa: S101 (a pipe was asked for)
         assert self._process.stdout is not None  # noqa: S101
         os.write(self._process.stdin.fileno(), line.encode())
