@@ -95,7 +95,7 @@ def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path) -> C
         client: tuple[str, ...] = (),
         meanwhile: Callable[[Loop], None] = lambda _: None,
     ) -> Drive:
-        out = tmp_path / name
+        out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
         loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
         wait_for_the_end(loop, meanwhile)
         return collect(loop, client_machine, out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +14,7 @@ from tests.kernel.lane.machine import Machine
 from tests.kernel.lane.netem import netem_on_ntp
 
 from lavt.config_file import conditions
-from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -22,6 +22,8 @@ DriveOnce = Callable[..., Drive]
 TrueOffset = Callable[[], int]
 Tell = Callable[[str], None]
 NTP_PORT = 11123
+DRIVES = 3
+"""At most, where the first was disturbed by other work on the host: then the median over a condition's drives counts."""
 PAPER = ("L0", "L1", "L2", "L3", "L4", "L5")
 SMALL = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
 """A user-mode kernel has one processor and dear system calls: with less to do it is steadier."""
@@ -93,6 +95,12 @@ def in_short(drive: Drive) -> str:
     )
 
 
+def off_ms(measured: Mapping[str, Sequence[tuple[float, float]]], name: str, wanted_ms: FloatArray) -> float:
+    """Tell how far the shift from L0 to a condition, each the median over its drives, is from what was asked."""
+    shift_ms = np.median(measured[name], axis=0) - np.median(measured["L0"], axis=0)
+    return float(np.max(np.abs(shift_ms - wanted_ms)))
+
+
 def clock_reasons(drive: Drive) -> list[str]:
     """Reasons against a drive, but those of a machine too slow for it: a user-mode kernel has one processor."""
     slow = ("the physics was", "the camera missed")
@@ -119,19 +127,24 @@ def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
 ) -> None:
     """Under each of L0 to L5 median tau_v and tau_c are those of L0 plus what is injected, to 2 ms; nothing stays."""
     queues = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
-    asked = conditions()
-    measured: dict[str, tuple[float, float]] = {}
-    for name in PAPER:
+
+    def median_ms(name: str) -> tuple[float, float]:
         driven = drive(name, server=(*SHORT, *SERVER), client=under(name), meanwhile=truth.note)
         tell(in_short(driven))
         assert clock_reasons(driven) == [], name
         assert driven.measured.closure_p95_ms is not None
         assert driven.measured.closure_p95_ms < 1, name
         truth.hold_against(driven)
-        measured[name] = driven.result["tau_v_ms"]["p50"], driven.result["tau_c_ms"]["p50"]
-    for name in PAPER:
-        shift = [here - without for here, without in zip(measured[name], measured["L0"], strict=True)]
-        assert shift == pytest.approx([asked[name].video_ms, asked[name].control_ms], abs=2), measured
+        return driven.result["tau_v_ms"]["p50"], driven.result["tau_c_ms"]["p50"]
+
+    measured = {name: [median_ms(name)] for name in PAPER}
+    for name in PAPER[1:]:
+        asked = conditions()[name]
+        wanted_ms = np.array([asked.video_ms, asked.control_ms])
+        for each in (name, "L0", name, "L0"):
+            if off_ms(measured, name, wanted_ms) > 2 and len(measured[each]) < DRIVES:
+                measured[each].append(median_ms(each))
+        assert off_ms(measured, name, wanted_ms) <= 2, measured
     after = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]
     assert after == queues
 
