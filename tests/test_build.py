@@ -16,10 +16,11 @@ from lavt.build.cameras import camera_model
 from lavt.build.clock_source import clock_source
 from lavt.build.entropy import MachineEntropy, SeededEntropy, run_seed
 from lavt.build.fidelity import FIDELITIES
+from lavt.build.injection import injection_client
 from lavt.build.sides import build_controller, build_server, check_names
 from lavt.build.vehicles import build_plant, build_unpictured, car_of
 from lavt.clock import MachineClock
-from lavt.config import CameraConfig, ClockConfig, ControllerConfig, ServerConfig, VehicleConfig
+from lavt.config import CameraConfig, ClientInjectionConfig, ClockConfig, ControllerConfig, ServerConfig, VehicleConfig
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
@@ -158,6 +159,15 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
         woken.append(wakes)
     assert woken[0] == woken[2] > 240
     assert woken[1] <= 82
+
+
+def test_a_condition_that_cannot_be_asked_for_is_refused_at_the_start() -> None:
+    """A client needs an interface for what it must delay itself, and a condition that fits into a request."""
+    with pytest.raises(UserError, match=r"name the interface towards the vehicle in injection\.interface"):
+        injection_client(ClientInjectionConfig(condition="L4"), "alice", 7, 0)
+    with pytest.raises(UserError, match="there is no condition"):
+        injection_client(ClientInjectionConfig(condition="L9", interface="eth0"), "alice", 7, 0)
+    injection_client(ClientInjectionConfig(condition="L2"), "alice", 7, 0)
 
 
 def nobody(command: Sequence[str], _timeout_s: float) -> None:

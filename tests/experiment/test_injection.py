@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.injection import recorded_reasons
+from lavt.experiment.injection import absent_reasons, recorded_reasons
 from lavt.experiment.record import Record
 from lavt.experiment.table import Table, table_of
 
@@ -63,3 +63,33 @@ def test_each_way_of_not_being_in_force_is_a_reason(video: list[Sample], control
 def test_what_was_not_asked_for_need_not_be_measured() -> None:
     """Under a condition that delays the video only, nobody has to measure the control."""
     assert reasons(VIDEO, [(1, "L4", "", 0.0, None, "")], {"video": 150.0, "control": 0.0}) == []
+
+
+def test_a_long_silence_is_a_reason() -> None:
+    """Where a queue was not measured for more than 20 s of the drive nobody knows what it did."""
+    early = [(-15, "L4", "video", 150.0, 150.2, "")]
+    assert reasons(early, CONTROL) == ["the server did not measure condition L4 for 35 s"]
+    gap = [*CONTROL, (30, "L4", "control", 75.0, 75.1, "")]
+    assert reasons(VIDEO, gap) == ["the client did not measure condition L4 for 29 s"]
+
+
+def test_a_drive_without_a_condition_must_not_have_anothers() -> None:
+    """A run that asked for nothing is invalid where another client's condition was in force."""
+    said = recorded_reasons(record(VIDEO, drove=True), record([]), "", ASKED_MS)
+    assert said == ["condition L4 was in force on the server, which this run did not ask for"]
+    ended = [VIDEO[0], (8, "", "", 0.0, None, "")]
+    assert recorded_reasons(record(ended, drove=True), record([]), "", ASKED_MS) == []
+
+
+@pytest.mark.parametrize(
+    ("tau_v_ms", "tau_c_ms", "flows"),
+    [(151.0, 76.0, []), (140.0, 70.0, []), (30.0, 76.0, ["video"]), (151.0, 5.0, ["control"]), (None, None, [])],
+)
+def test_latencies_that_are_too_short_for_what_was_injected(
+    tau_v_ms: float | None, tau_c_ms: float | None, flows: list[str]
+) -> None:
+    """Where video or control took less than was injected into them, the delay was on another path: invalid."""
+    entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
+    said = absent_reasons(entry, ASKED_MS)
+    assert [each.split()[1] for each in said] == flows
+    assert all("the delay is not on its path" in each for each in said)

@@ -13,16 +13,19 @@ def new_session(*, rearm: bool = False) -> ClientSession:
     return ClientSession("alice", 7, rearm=rearm, start_ns=100)
 
 
-def test_it_waits_for_the_condition_of_the_network() -> None:
-    """A session that waits asks for nothing until the condition is in force, says why, and waits only once."""
+def test_it_holds_the_vehicle_and_waits_for_the_condition_of_the_network() -> None:
+    """A session that waits asks for the vehicle but does not command it until the condition is in force, and says why."""
     session = ClientSession("alice", 7, rearm=False, start_ns=100, waits=True)
-    assert (session.next_wake_ns(), session.request_due(200)) == (None, None)
+    assert session.request_due(100) is not None
+    session.note_reply(GRANTED, 200)
+    assert (session.phase, session.commanding) == ("arming", False)
+    assert session.because == "the network's condition is not in force yet"
     session.note_condition("the server does not delay the video: no")
-    assert (session.because, session.request_due(200)) == ("the server does not delay the video: no", None)
+    assert (session.because, session.commanding) == ("the server does not delay the video: no", False)
     session.note_condition("")
-    assert session.request_due(200) is not None
+    assert (session.because, session.commanding) == ("", True)
     session.note_condition("later")
-    assert (session.because, session.next_wake_ns()) == ("", 200 + NS_PER_S)
+    assert (session.because, session.commanding) == ("", True)
 
 
 def state(safety: SafetyState, speed_mps: float = 0.0) -> State:

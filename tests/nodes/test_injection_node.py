@@ -148,14 +148,43 @@ def test_what_is_measured_otherwise_than_asked_is_written_down_and_changes_nothi
     assert refusals(ask(node, L4, NS_PER_S)) == [""]
 
 
-def test_queues_that_fail_are_told_and_the_lease_is_free() -> None:
-    """Where the queues cannot do it, whoever asked hears why, the record too, and anybody may ask again."""
+def test_queues_that_fail_are_told_and_put_back_and_the_lease_is_free() -> None:
+    """Where the queues cannot do it, whoever asked hears why, what was done is undone, and anybody may ask again."""
     node = server()
     ask(node, L4)
     sends = done(node, 1, because="there is no tc")
     assert refusals(sends) == ["there is no tc"]
     assert {sample.because for sample in of(sends, "injection")} == {"there is no tc"}
-    assert of(ask(node, replace(L4, who="bob")), "netem_reply") == []
+    assert of(sends, "inject") == [Inject(2, "", ())]
+    assert of(ask(node, L4), "inject") == [Inject(3, "L4", (VIDEO, STATE))]
+    assert of(ask(server(), replace(L4, who="bob")), "netem_reply") == []
+
+
+def test_what_cannot_be_put_back_is_tried_again_every_second() -> None:
+    """A queue that could not be cleared at the lease's end is told again until it is."""
+    node = in_force()
+    give(node, WAKE, None, at(5 * NS_PER_S))
+    assert done(node, 2, because="tc hangs", after_ns=6 * NS_PER_S)
+    assert node.next_wake_ns() == at(7 * NS_PER_S).mono_ns
+    assert give(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", Inject(3, "", ()))]
+    give(node, "injected", Injected(3, "", "", ()), at(8 * NS_PER_S))
+    assert node.next_wake_ns() is None
+
+
+def test_who_comes_to_hold_the_vehicle_drives_without_anothers_condition() -> None:
+    """When another client holds the vehicle the lease ends; when its own does, or nobody, it goes on."""
+    node = in_force()
+    assert give(node, "rest", Rest(True, None), at(0)) == []
+    assert give(node, "rest", Rest(True, ("alice", 7)), at(0)) == []
+    assert give(node, "rest", Rest(True, ("bob", 8)), at(0)) == [Send("inject", Inject(2, "", ()))]
+
+
+def test_a_law_that_netem_cannot_do_is_refused_before_anything_is_touched() -> None:
+    """What no queue could do is refused with the reason, and the condition in force stays."""
+    node = in_force()
+    [because] = refusals(ask(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
+    assert because.startswith("video: a jitter of 20 ms on a delay of 10 ms would need delays below zero")
+    assert refusals(ask(node, L4, NS_PER_S)) == [""]
 
 
 def test_what_the_queues_say_of_an_older_order_is_not_taken_for_the_newer() -> None:
@@ -198,6 +227,15 @@ def test_the_client_delays_its_own_control_first_and_then_asks_once_a_second() -
     granted = give(client, "netem_reply", encode(NetemReply(True, "")), at(NS_PER_S))
     assert granted == [Send("condition_in_force", "")]
     assert len(of(give(client, WAKE, None, at(2 * NS_PER_S)), "netem")) == 1
+
+
+def test_a_client_whose_own_queue_fails_says_so_and_tries_again() -> None:
+    """Where this machine cannot delay the control the driver is told why, and a second later it is tried again."""
+    client = asking()
+    give(client, WAKE, None, at(0))
+    sends = give(client, "injected", Injected(1, "no tc", "", ()), at(0))
+    assert of(sends, "condition_in_force") == ["this machine does not delay the control: no tc"]
+    assert of(give(client, WAKE, None, at(NS_PER_S)), "inject") == [Inject(2, "L4", (CONTROL,))]
 
 
 def test_a_refusal_is_told_to_the_driver() -> None:

@@ -6,7 +6,10 @@ from typing import Final, Literal
 
 from lavt.config import ClientInjectionConfig, Condition, Impairment, ServerInjectionConfig
 from lavt.config_file import condition
+from lavt.domain import NetemRequest
+from lavt.errors import BadMessage, UserError
 from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.transport.messages import decode
 from lavt.transport.netem import Flow, Law
 
 NO_CONDITION: Final = Condition(video_ms=0, control_ms=0)
@@ -65,7 +68,12 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
     [control] = netem_flows(
         asked, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )
-    return InjectionClient(
+    if not (config.interface or control.law.is_nothing):
+        raise UserError(
+            f"condition {config.condition} delays the control, which this machine must do: name the interface towards "
+            "the vehicle in injection.interface"
+        )
+    client = InjectionClient(
         who,
         instance,
         condition=config.condition,
@@ -74,3 +82,8 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
         state_delay_ms=asked.video_ms if config.state_delay == "with_video" else 0.0,
         start_ns=start_ns,
     )
+    try:
+        decode(NetemRequest, client.request)
+    except BadMessage as error:
+        raise UserError(f"condition {config.condition} cannot be asked of a server: {error}") from error
+    return client

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lavt.errors import WorkError
+from lavt.experiment.injection import absent_reasons
 from lavt.experiment.metrics import measure
 from lavt.experiment.payload_json import without_nan
 from lavt.experiment.record import Record
@@ -69,7 +70,8 @@ def run_result(
     was asked of the network); these two are kept. `reasons` are those against the run that records do not show.
     """
     measured = measure(server, client)
-    against = [*invalid_because(server, client, measured), *reasons]
+    absent = absent_reasons(measured.entry, identity["injected_ms"]) if "injected_ms" in identity else []
+    against = [*invalid_because(server, client, measured), *reasons, *absent]
     further = {key: identity[key] for key in ("axes", "injected_ms") if key in identity}
     return {
         **{key: identity.get(key) for key in IDENTITY},

@@ -60,8 +60,9 @@ def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -
     if identity["injection"] == "relay":
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
         reasons = relay_reasons(relay)
-    elif identity["injection"] == "netem" and identity["inherent"] == NETWORK:
-        reasons = recorded_reasons(server, client, identity["condition"], identity["injected_ms"])
+    elif identity["inherent"] == NETWORK:
+        asked = identity["condition"] if identity["injection"] == "netem" else ""
+        reasons = recorded_reasons(server, client, asked, identity["injected_ms"])
     elif identity["injection"] == "netem":
         reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)

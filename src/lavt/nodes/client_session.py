@@ -17,7 +17,7 @@ class ClientSession:
     """Asks for the vehicle until it is granted, and again until the vehicle is armed: asking twice changes nothing.
 
     With `rearm` it begins anew after a safe stop; with `clear_stop` it clears an emergency stop that it finds. With
-    `waits` it does not ask before the network's condition is in force.
+    `waits` it does not arm the vehicle before the network's condition is in force.
     """
 
     def __init__(
@@ -34,18 +34,18 @@ class ClientSession:
         self._instance = instance
         self._rearm = rearm
         self._clear_stop = clear_stop
-        self._waits = waits
+        self._waits_because = "the network's condition is not in force yet" if waits else ""
         self._ask_ns = start_ns
         self._highest_emergency_stop = 0
 
     @property
     def commanding(self) -> bool:
-        """Whether commands make sense: there is an epoch to send them under."""
-        return self.phase in ("arming", "driving")
+        """Whether commands make sense: there is an epoch to send them under, and the network is as it shall be."""
+        return self.phase == "driving" or (self.phase == "arming" and not self._waits_because)
 
     def next_wake_ns(self) -> int | None:
         """When the next query is due."""
-        return self._ask_ns if self.phase in ("seeking", "arming") and not self._waits else None
+        return self._ask_ns if self.phase in ("seeking", "arming") else None
 
     def request_due(self, now_ns: int) -> SessionRequest | None:
         """Give the query that is due at `now_ns`."""
@@ -58,13 +58,13 @@ class ClientSession:
         return SessionRequest("hold", self._who, self._instance, 0)
 
     def note_condition(self, because: str) -> None:
-        """The network's condition is in force, or `because` says why it is not; once begun, it is not waited for."""
-        if self._waits:
-            self._waits, self.because = because != "", because
+        """The network's condition is in force, or `because` says why it is not; once it was, it is not waited for."""
+        if self._waits_because:
+            self._waits_because = self.because = because
 
     def note_reply(self, reply: SessionReply, _now_ns: int) -> None:
         """Take over what the server granted, or why it did not."""
-        self.because = reply.because
+        self.because = reply.because or self._waits_because
         self._highest_emergency_stop = max(self._highest_emergency_stop, reply.emergency_stop)
         if self.emergency_stop and reply.emergency_stop > self.emergency_stop:
             # The vehicle takes ours for an old one, as with a wall clock that is behind: raise it with a newer number.

@@ -12,12 +12,12 @@ from dataclasses import asdict
 from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
-from lavt.errors import BadMessage
+from lavt.errors import BadMessage, UserError
 from lavt.node import WAKE, Hop, Message, Peer, Send
 from lavt.nodes.reports import InjectionSample, Rest
 from lavt.transport.injector import Inject, Injected
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem import Flow, Law
+from lavt.transport.netem import Flow, Law, check_flows
 from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
@@ -35,26 +35,30 @@ class _Queues:
         self.flows: tuple[Flow, ...] = ()
         self.condition = ""
         self.in_force = False
-        self.measure_ns: int | None = None
+        self.again_ns: int | None = None
+        """When the order is given again: to measure what is in force, or because it failed."""
         self._number = 0
 
     def tell(self, condition: str, flows: tuple[Flow, ...]) -> list[Send]:
-        self.condition, self.flows, self.in_force, self.measure_ns = condition, flows, False, None
+        self.condition, self.flows, self.in_force, self.again_ns = condition, flows, False, None
         self._number += 1
         return self._inject()
 
-    def measure_when_due(self, now_ns: int) -> list[Send]:
-        if self.measure_ns is None or now_ns < self.measure_ns:
+    def tell_again_when_due(self, now_ns: int) -> list[Send]:
+        if self.again_ns is None or now_ns < self.again_ns:
             return []
-        self.measure_ns = None  # set anew by the answer
-        return self._inject()
+        self.again_ns = None  # set anew by the answer
+        return self._inject() if self.in_force else self.tell(self.condition, self.flows)
 
     def note(self, done: Injected, now: Now) -> list[Send] | None:
         """Take in what became of the newest order; None where it was an older one."""
         if done.number != self._number:
             return None
         self.in_force = done.because == ""
-        self.measure_ns = now.mono_ns + MEASURE_PERIOD_NS if self.condition and self.in_force else None
+        if not self.in_force:
+            self.again_ns = now.mono_ns + ASK_PERIOD_NS
+        elif self.condition:
+            self.again_ns = now.mono_ns + MEASURE_PERIOD_NS
         asked_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
         measured_ms = dict(done.measured_ms)
         return [
@@ -112,9 +116,9 @@ class InjectionNode:
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the lease ends, or the condition is measured again."""
+        """When the lease ends, the condition is measured again, or what failed is tried again."""
         ends_ns = None if self._lease is None else self._lease.until_ns
-        return _first(ends_ns, self._queues.measure_ns)
+        return _first(ends_ns, self._queues.again_ns)
 
     def _answer(self, message: Message, now: Now) -> list[Send]:
         try:
@@ -144,6 +148,10 @@ class InjectionNode:
             return f"{self._rest.holder[0]} holds the vehicle"
         if changes and not (self._simulated or self._rest.at_rest):
             return "a vehicle that is not simulated must stand disarmed for this"
+        try:
+            check_flows(self._flows(request))
+        except UserError as error:
+            return str(error)
         return ""
 
     def _flows(self, request: NetemRequest) -> tuple[Flow, ...]:
@@ -162,8 +170,12 @@ class InjectionNode:
             Flow("state", *self._control, "source", Law(request.state_delay_ms)),
         )
 
-    def _note_rest(self, message: Message, _now: Now) -> None:
+    def _note_rest(self, message: Message, _now: Now) -> list[Send]:
+        """Whoever holds the vehicle drives without what another had asked for."""
         self._rest = message.payload
+        if self._lease is None or self._rest.holder in (None, self._lease.holder):
+            return []
+        return self._end_lease()
 
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
         done: Injected = message.payload
@@ -171,23 +183,29 @@ class InjectionNode:
         if sends is None:
             return []
         waiting, self._waiting = self._waiting, []
-        if done.because:
-            self._lease = None
-            self.counts["netem_failed"] += 1
-        return [*sends, *(_reply(done.because, peer) for peer in waiting)]
+        sends += [_reply(done.because, peer) for peer in waiting]
+        if not done.because:
+            return sends
+        self.counts["netem_failed"] += 1
+        self._lease = None
+        # What failed half-way must not stay; what cannot be put back is tried again every second.
+        return [*sends, *self._queues.tell("", ())] if self._queues.condition else sends
 
     def _look(self, _message: Message, now: Now) -> list[Send]:
         if self._lease is not None and now.mono_ns >= self._lease.until_ns:
-            self._lease = None
-            self.counts["netem_leases_ended"] += 1
-            return self._queues.tell("", ())
-        return self._queues.measure_when_due(now.mono_ns)
+            return self._end_lease()
+        return self._queues.tell_again_when_due(now.mono_ns)
+
+    def _end_lease(self) -> list[Send]:
+        self._lease = None
+        self.counts["netem_leases_ended"] += 1
+        return self._queues.tell("", ())
 
 
 class InjectionClient:
     """The client's: has the control delayed by its own machine, and asks the server for the rest, again and again.
 
-    The driver begins when both are in force; without a condition it need not wait.
+    The driver arms when both are in force; without a condition it need not wait.
     """
 
     name = "injection"
@@ -204,12 +222,11 @@ class InjectionClient:
         start_ns: int,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.because = "the network's condition is not in force yet" if condition else ""
         self._condition = condition
         self._control = control
         self._queues = _Queues()
         law = asdict(video)
-        self._request = encode(NetemRequest(who, instance, condition, LEASE_MS, **law, state_delay_ms=state_delay_ms))
+        self.request = encode(NetemRequest(who, instance, condition, LEASE_MS, **law, state_delay_ms=state_delay_ms))
         self._ask_ns: int | None = start_ns if condition else None
         self._told = False
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -219,27 +236,27 @@ class InjectionClient:
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the lease is renewed, or what this machine does is measured again."""
-        return _first(self._ask_ns, self._queues.measure_ns)
+        """When the lease is renewed, what this machine does is measured again, or what failed is tried again."""
+        return _first(self._ask_ns, self._queues.again_ns)
 
     def _ask(self, _message: Message, now: Now) -> list[Send]:
-        sends = self._queues.measure_when_due(now.mono_ns)
+        sends = self._queues.tell_again_when_due(now.mono_ns)
         if self._ask_ns is None or now.mono_ns < self._ask_ns:
             return sends
         self._ask_ns = now.mono_ns + ASK_PERIOD_NS
         if not self._told:
             self._told = True
             return self._queues.tell(self._condition, (self._control,))
-        return [*sends, Send("netem", self._request)] if self._queues.in_force else sends
+        return [*sends, Send("netem", self.request)] if self._queues.in_force else sends
 
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
         done: Injected = message.payload
-        sends = self._queues.note(done, now)
+        sends = self._queues.note(done, now) or []
         if done.because:
-            self.because = f"this machine does not delay the control: {done.because}"
             self.counts["netem_failed"] += 1
-        self._ask_ns = now.mono_ns
-        return sends or []
+            return [*sends, Send("condition_in_force", f"this machine does not delay the control: {done.because}")]
+        self._ask_ns = now.mono_ns if self._ask_ns is None else min(self._ask_ns, now.mono_ns)
+        return sends
 
     def _note_reply(self, message: Message, _now: Now) -> list[Send]:
         try:
@@ -248,8 +265,8 @@ class InjectionClient:
             self.counts["netem_replies_unreadable"] += 1
             return []
         granted = reply.granted and self._queues.in_force
-        self.because = "" if granted else f"the server does not delay the video: {reply.because}"
-        return [Send("condition_in_force", self.because)]
+        because = "" if granted else f"the server does not delay the video: {reply.because}"
+        return [Send("condition_in_force", because)]
 
 
 def _first(*times_ns: int | None) -> int | None:

@@ -38,7 +38,7 @@ CHANNELS: dict[str, Channel] = {
     "pose": Channel("local", "actuator", ("camera",), "newest"),
     "frame": Channel("local", "camera", ("actuator",)),
     "video_token": Channel("local", "actuator", ("camera",)),
-    "rest": Channel("local", "actuator", ("injection",), "newest"),
+    "rest": Channel("local", "actuator", ("injection",)),  # in order with requests: a flood of these must not hide it
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),

@@ -100,8 +100,20 @@ class Injector:
                 log.error("the delay could not be taken away: %s", error)
 
     def _work(self) -> None:
-        while (order := self._orders.get()) is not None:
-            self._deliver("injected", self._do(order), self._clock.now(), None)
+        while (order := self._newest()) is not None:
+            try:
+                done = self._do(order)
+            except Exception as error:  # whatever it was, the next order, which may be to put all back, must be done
+                log.exception("netem failed")
+                done = Injected(order.number, f"{type(error).__name__}: {error}", "", ())
+            self._deliver("injected", done, self._clock.now(), None)
+
+    def _newest(self) -> Inject | None:
+        """Wait for an order; of several that wait only the last counts, and after None nothing does."""
+        order = self._orders.get()
+        while order is not None and not self._orders.empty():
+            order = self._orders.get()
+        return order
 
     def _do(self, order: Inject) -> Injected:
         flows = order.flows
@@ -114,6 +126,8 @@ class Injector:
             if order.number != self._applied:
                 self._queues.apply(flows, never=self._never, condition=order.condition)
                 found = self._queues.verify(flows, never=self._never, count=FRAMES)
+                if found.reasons:
+                    return Injected(order.number, "; ".join(found.reasons), "", ())
             else:  # while it is driven: without starting programs, which would hold it up
                 measured = self._queues.measure(flows, never=self._never, count=FRAMES)
                 found = Verified(judge(flows, self._never, measured), measured)

@@ -32,7 +32,7 @@ ANSWERS = {"session": "session_reply", "netem": "netem_reply"}
 """The queries, by the last part of their keys, and what answers them."""
 ASKED = {answer: query for query, answer in ANSWERS.items()}
 QUERIES_KEPT = 64
-"""So many queries wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
+"""So many queries of each kind wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
 CONTROL: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
     "priority": zenoh.Priority.REAL_TIME,
@@ -145,7 +145,7 @@ class ZenohLink:
         self._side = side
         self._base = f"lavt/{check_name('the vehicle', vehicle)}"
         self._who = check_name("the client", who)
-        self._queries: dict[int, zenoh.Query] = {}
+        self._queries: dict[str, dict[int, zenoh.Query]] = {channel: {} for channel in ANSWERS}
         self._queries_lock = threading.Lock()
         self._number = itertools.count()
         config = _load(path, {"connect/endpoints": [router]} if router else {})
@@ -208,15 +208,16 @@ class ZenohLink:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         number = next(self._number)
         with self._queries_lock:
-            self._queries[number] = query
-            oldest = self._queries.pop(next(iter(self._queries))) if len(self._queries) > QUERIES_KEPT else None
+            kept = self._queries[channel]
+            kept[number] = query
+            oldest = kept.pop(next(iter(kept))) if len(kept) > QUERIES_KEPT else None
         if oldest is not None:
             oldest.drop()
         self._deliver(channel, payload, self._clock.now(), number)
 
     def _reply(self, channel: str, number: int, payload: bytes) -> None:
         with self._queries_lock:
-            query = self._queries.pop(number, None)
+            query = self._queries[channel].pop(number, None)
         if query is not None:
             query.reply(f"{self._base}/{channel}", payload)
             query.drop()
