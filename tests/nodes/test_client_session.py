@@ -14,7 +14,7 @@ def new_session(*, rearm: bool = False) -> ClientSession:
 
 
 def test_it_holds_the_vehicle_and_waits_for_the_condition_of_the_network() -> None:
-    """A session that waits asks for the vehicle but does not command it until the condition is in force, and says why."""
+    """A session that waits asks for the vehicle, but does not command it until the condition is in force."""
     session = ClientSession("alice", 7, rearm=False, start_ns=100, waits=True)
     assert session.request_due(100) is not None
     session.note_reply(GRANTED, 200)

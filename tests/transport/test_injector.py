@@ -79,7 +79,7 @@ def ordered(queues: NamedQueues | None, *orders: Inject) -> list[Injected]:
 
 
 def test_an_order_is_applied_once_and_measured_whenever_it_comes() -> None:
-    """The first time an order is applied and verified, then only measured; one without flows clears, and so does the end."""
+    """An order is applied and verified, and when it comes again measured; one without flows clears, as the end does."""
     queues = NamedQueues()
     said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
     assert said[0] == Injected(1, "", "", (("video", 150.1),))
@@ -108,7 +108,7 @@ def test_a_condition_that_is_not_as_asked_when_it_is_applied_is_not_in_force() -
 
 
 def test_of_orders_that_wait_only_the_last_is_done() -> None:
-    """While an order is carried out others may come: of these the last counts, and a flood of orders is none of work."""
+    """Of the orders that come while one is carried out only the last counts: a flood of orders is no flood of work."""
     queues = NamedQueues()
     queues.go.clear()
     told = Told(queues)

@@ -34,8 +34,8 @@ def recorded_reasons(server: Record, client: Record, condition: str, asked_ms: M
     """
     began_ns, ended_ns, _ = driving_interval(server)
     if not condition:
-        others = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
-        return [f"condition {each} was in force on the server, which this run did not ask for" for each in others]
+        strange = set(_in_force(server.table("injection"), began_ns, ended_ns).texts("condition")) - {""}
+        return [f"condition {each} was in force on the server, which this run did not ask for" for each in strange]
     samples = {
         "server": _in_force(server.table("injection"), began_ns, ended_ns),
         "client": client.table("injection"),
@@ -81,8 +81,8 @@ def absent_reasons(entry: Mapping[str, Any], asked_ms: Mapping[str, float]) -> l
         median_ms, bound_ms = entry[key]["p50"], entry[key]["bound"] or 0.0
         if median_ms is not None and median_ms + bound_ms < LEAST_SHARE * asked_ms[flow]:
             reasons.append(
-                f"the {flow} took {median_ms:.1f} ms in the median where {asked_ms[flow]:g} ms were injected: the delay "
-                "is not on its path, look at interface and ports"
+                f"the {flow} took {median_ms:.1f} ms in the median where {asked_ms[flow]:g} ms were injected: the "
+                "delay is not on its path, look at interface and ports"
             )
     return reasons
 
