@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,11 +11,13 @@ import pytest
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
+from lavt.errors import UserError
 from lavt.experiment.netem_run import NetemRun, netem_reasons
 from lavt.experiment.plan import plan_run
 from lavt.transport.netem import Flow, Law, Port
 from lavt.transport.netem_control import Netem
 from lavt.transport.netem_probe import Measured, probes
+from lavt.transport.netem_state import Applied, StateFiles, boot, namespace, started
 from lavt.transport.netem_tc import Command
 
 
@@ -80,6 +83,17 @@ def test_a_run_that_fails_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         stopped()
     assert kernel.commands[-1] == "tc qdisc del dev lo root"
+
+
+def test_a_run_that_is_refused_leaves_what_another_holds(tmp_path: Path) -> None:
+    """Where another program holds the loopback a run is refused, and that program's queue stays."""
+    kernel = Kernel(tmp_path)
+    kernel.commands = ["tc qdisc add dev lo root"]
+    owner = os.getppid(), started(os.getppid())
+    StateFiles(tmp_path).write(Applied("lo", namespace(), boot(), owner, "L3", ()))
+    with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
+        pass
+    assert kernel.commands == ["tc qdisc add dev lo root"]
 
 
 def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:

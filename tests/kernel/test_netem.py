@@ -71,7 +71,7 @@ def sides(baseline: dict[str, float], tmp_path: Path) -> Iterator[dict[str, Nete
     made = {name: Netem(device, directory=tmp_path) for name, device in DEVICES.items()}
     yield made
     for name, netem in made.items():
-        inside(name, lambda netem=netem: netem.clear(at_once=True))  # type: ignore[misc]
+        inside(name, lambda netem=netem: netem.clear(at_once=True, of_anybody=True))  # type: ignore[misc]
 
 
 def hold(sides: dict[str, Netem], name: str) -> None:
@@ -209,7 +209,7 @@ def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, Netem])
         with pytest.raises(UserError, match="va has a queue that is not ours"):
             hold_video(sides, Law(75))
         with pytest.raises(UserError, match="va has a queue that is not ours"):
-            inside("server", sides["server"].clear)
+            inside("server", lambda: sides["server"].clear(of_anybody=True))
         assert queues("server") == there
     finally:
         command("tc -n server qdisc del dev va root")

@@ -18,7 +18,17 @@ from lavt.errors import UserError, WorkError
 from lavt.transport.netem import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
 from lavt.transport.netem_control import Netem, run_tc
 from lavt.transport.netem_probe import Measured, judge, measure, probes, summary
-from lavt.transport.netem_state import Applied, StateFiles, boot, flows_from, namespace, started, this_process
+from lavt.transport.netem_state import (
+    NOBODY,
+    Applied,
+    Owner,
+    StateFiles,
+    boot,
+    flows_from,
+    namespace,
+    started,
+    this_process,
+)
 from lavt.transport.netem_tc import (
     Command,
     Qdisc,
@@ -309,7 +319,7 @@ def test_somebody_elses_root_is_refused(tmp_path: Path) -> None:
     """A root with a handle that is not ours is refused, and tc is told nothing."""
     tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = Netem("eth0", directory=tmp_path, run=tc)
-    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), netem.clear, netem.check]
+    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(of_anybody=True), netem.check]
     for use in uses:
         with pytest.raises(UserError, match=r"eth0 has a queue that is not ours \(fq_codel 8001:\)"):
             use()
@@ -327,6 +337,32 @@ def test_what_another_program_owns_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="a delay on eth0, left in place"):
         Netem("eth0", directory=tmp_path, run=tc).check()
     assert tc.told == []
+
+
+@pytest.mark.parametrize("owner", [(os.getppid(), started(os.getppid())), NOBODY, None])
+def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner: Owner | None) -> None:
+    """A program clears neither another's delay nor one left in place, with a file or without; on demand it does."""
+    tc, files = Tc(QDISCS, FILTERS), StateFiles(tmp_path)
+    if owner is not None:
+        files.write(Applied("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+    there = files.read("eth0")
+    with pytest.raises(UserError, match="there is"), Netem("eth0", directory=tmp_path, run=tc) as netem:
+        netem.check()
+
+    assert netem.clear() == []
+    assert tc.told == []
+    assert files.read("eth0") == there
+    assert netem.clear(at_once=True, of_anybody=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
+    assert files.read("eth0") is None
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_what_was_left_in_place_is_cleared_by_who_leaves_in_place(tmp_path: Path, written: bool) -> None:
+    """What `lavt netem apply` or a script left, the command that leaves in place owns, and clears."""
+    tc = Tc(QDISCS, FILTERS)
+    if written:
+        StateFiles(tmp_path).write(Applied("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
+    assert Netem("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
 
 
 @pytest.mark.parametrize("dead", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}])

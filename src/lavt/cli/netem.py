@@ -21,6 +21,7 @@ from lavt.transport.netem_tc import Command, as_typed, first_commands
 Interface = Annotated[str, typer.Option(help="The network interface, such as eth0: the one that faces the other side.")]
 ProbePort = Annotated[int, typer.Option(help="UDP port of the clock probe, which is never delayed.", min=1, max=65535)]
 PROBE_PORT = 5602
+MADE_BY_HAND = "what was made by hand"
 
 
 def register(app: typer.Typer) -> None:
@@ -46,7 +47,7 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
     if not shown["ours"]:
         console.show(f"{interface} holds nothing of ours: {', '.join(shown['queues']) or 'no queue'}")
         return
-    console.show(f"{interface} holds {'what was made by hand' if applied is None else applied.words}")
+    console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.words}")
     for name, law in laws.items():
         told = ", ".join(f"{key} {value:g}" for key, value in law.items() if isinstance(value, int | float) and value)
         console.show(f"  {name}: {told or 'nothing'}")
@@ -124,13 +125,16 @@ def clear(
     at_once: Annotated[bool, typer.Option("--at-once", help="Do not wait for what is under way: it is lost.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Put an interface back as it was; what is under way is waited for.
+    """Put an interface back as it was, whoever delays it, and say who did; what is under way is waited for.
 
     Example: lavt netem clear --interface eth0
     """
     netem = Netem(interface)
     _say_restored(netem.restore())
-    commands = netem.clear(at_once=at_once)
+    applied = netem.applied()
+    commands = netem.clear(at_once=at_once, of_anybody=True)
+    if commands:
+        console.say(f"lavt: taken away: {MADE_BY_HAND if applied is None else applied.words}")
     _tell_commands(commands, as_json, interface, "")
     if not as_json:
         console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")

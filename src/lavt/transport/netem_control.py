@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.netem import Flow, Law, Port, check_flows
 from lavt.transport.netem_probe import Measured, judge, measure, probes
-from lavt.transport.netem_state import DIRECTORY, NOBODY, Applied, StateFiles, boot, namespace, this_process
+from lavt.transport.netem_state import DIRECTORY, NOBODY, Applied, Owner, StateFiles, boot, namespace, this_process
 from lavt.transport.netem_tc import (
     PLACES,
     ROOT,
@@ -195,13 +195,16 @@ class Netem:
                 self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
             return ran
 
-    def clear(self, *, at_once: bool = False) -> list[Command]:
-        """Put the interface back as it was; give the commands that did it, none where nothing of ours was there.
+    def clear(self, *, at_once: bool = False, of_anybody: bool = False) -> list[Command]:
+        """Put the interface back as it was; give the commands that did it, none where nothing of this owner was there.
 
-        What is under way is waited for, in order, and nothing is lost; `at_once` loses it.
+        What is under way is waited for, in order, and nothing is lost; `at_once` loses it. `of_anybody` also clears
+        what another program of ours owns, or was left in place; raises `UserError` for a queue that is not ours.
         """
         with self._files.alone():
             self._stand_still()
+            if not of_anybody and self._owner_of_what_is_there() != self._owner:
+                return []
             ran = self._clear(self.interface, at_once=at_once)
             self._files.forget(self.interface)
             return ran
@@ -248,13 +251,16 @@ class Netem:
         """Raise `UserError` where the delay that is there belongs to another program of ours."""
         if not self._ours_or_free(self.interface):
             return
-        there = self._files.read(self.interface)
-        owner = NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
-        if owner != self._owner:
+        if self._owner_of_what_is_there() != self._owner:
+            there = self._files.read(self.interface)
             words = f"a delay on {self.interface}, left in place" if there is None else there.words
             raise UserError(
                 f"there is {words}: clear it with `lavt netem clear --interface {self.interface}`, or let it end"
             )
+
+    def _owner_of_what_is_there(self) -> Owner:
+        there = self._files.read(self.interface)
+        return NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
 
     def _ours_or_free(self, interface: str) -> list[Qdisc]:
         """Give the queues where the root is ours, and none where it is the kernel's own.
