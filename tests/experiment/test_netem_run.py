@@ -28,6 +28,7 @@ class Kernel(Netem):
         super().__init__("lo", directory=directory, run=self.told)
         self.commands: list[str] = []
         self.more_ms = 0.0
+        self.stopped: list[str] = []
 
     def told(self, command: Command) -> str:
         """Take a command: the interface has nothing of ours until the root is added."""
@@ -44,6 +45,10 @@ class Kernel(Netem):
             each.name: Measured(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
             for each in probes(flows, never)
         }
+
+    def doubts(self) -> list[str]:
+        """Doubt what is said to have stopped."""
+        return self.stopped
 
     def read_back(self, flows: Sequence[Flow]) -> list[str]:
         """Read nothing back."""
@@ -106,6 +111,8 @@ def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:
 
     assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
+    kernel.stopped = ["video: its correlated jitter has stopped"]
+    assert netem_reasons(netem.report())[0] == "video: its correlated jitter has stopped"
     assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
 
 

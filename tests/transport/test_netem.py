@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from itertools import pairwise
@@ -13,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.build.injection import netem_flows
+from lavt.clock import MachineClock, pause
 from lavt.config_file import condition
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError, WorkError
 from lavt.transport.netem import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
 from lavt.transport.netem_control import Netem, run_tc
@@ -43,7 +46,7 @@ from lavt.transport.netem_tc import (
     read_law,
     set_law,
 )
-from lavt.transport.netem_wander import wandering
+from lavt.transport.netem_wander import Wander, wandering
 
 VIDEO = Flow("video", "udp", 5600, "source", Law(150))
 CONTROL = Flow("control", "udp", 7448, "destination", Law(75))
@@ -429,6 +432,78 @@ def test_a_wandering_delay_is_correlated_as_asked_and_repeats() -> None:
     assert 0.8 < sum(a * a for a in values) / 4000 < 1.2
     assert walk(3) == values
     assert walk(4) != values
+
+
+WANDERING = Flow("video", "udp", 5600, "source", Law(75, 10, 0.9))
+
+
+def tc_that(does: str, folder: Path) -> dict[str, str]:
+    """Make a tc that does something else, and give the environment in which it is found."""
+    program = folder / "tc"
+    program.write_text(f"#!/bin/sh\n{does}\n")
+    program.chmod(0o755)
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
+def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) -> None:
+    """Ctrl-C at the terminal, which goes to a whole group of processes, does not reach it: it leads its own session."""
+    said = tmp_path / "said"
+    does = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
+    does += f"; echo $pid $session > {said}"
+    Wander("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
+    pid, session = said.read_text().split()
+
+    assert session == pid
+
+
+def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the tc that steps a delay has ended by itself, that is a doubt of its flow, and clearing goes on."""
+    monkeypatch.setenv("PATH", tc_that("exit 1", tmp_path)["PATH"])
+    tc = Tc()
+    netem = Netem("eth0", directory=tmp_path, run=tc)
+    netem.apply([WANDERING, CONTROL])
+    limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
+    while not netem.doubts() and MachineClock().now().mono_ns < limit_ns:
+        pause(NS_PER_MS)
+    doubts, tc.qdiscs = netem.doubts(), QDISCS.replace('"qlen": 7', '"qlen": 0')
+
+    assert doubts == ["video (udp source port 5600): its correlated jitter has stopped"]
+    assert netem.clear()[-1] == ["tc", "qdisc", "del", "dev", "eth0", "root"]
+    assert netem.doubts() == []
+
+
+class Ahead(MachineClock):
+    """A clock that can be set ahead."""
+
+    ahead_ns = 0
+
+    def now(self) -> Now:
+        """Tell the time."""
+        now = super().now()
+        return now._replace(mono_ns=now.mono_ns + self.ahead_ns)
+
+
+def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wander that steps is in no doubt; one whose thread has died is, a second after its last step, not before."""
+    monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
+    monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
+    clock = Ahead()
+    wander = Wander("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    now = wander.doubts()
+    clock.ahead_ns = NS_PER_S
+    later = wander.doubts()
+    wander.end()
+
+    assert now == []
+    assert later == ["video (udp source port 5600): its correlated jitter has stopped"]
+
+
+def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A verification tells what has stopped, beside what was read back and measured."""
+    netem = Netem("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
+    monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: JUDGED)
+    monkeypatch.setattr(netem, "doubts", lambda: ["stopped"])
+    assert netem.verify([VIDEO]).reasons == ["stopped"]
 
 
 def test_what_is_probed_beside_the_flows() -> None:

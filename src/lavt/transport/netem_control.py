@@ -242,10 +242,14 @@ class Netem:
         return measure(self.interface, probes(flows, never), count=count, clock=self._clock)
 
     def verify(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), count: int = 50) -> Verified:
-        """Verify by reading back and by measuring."""
+        """Verify by reading back and by measuring, and tell what has stopped."""
         reasons = self.read_back(flows)
         measured = self.measure(flows, never=never, count=count)
-        return Verified(reasons + judge(flows, never, measured), measured)
+        return Verified(reasons + self.doubts() + judge(flows, never, measured), measured)
+
+    def doubts(self) -> list[str]:
+        """Say in sentences what of ours has stopped by itself since it was applied; no program is started for it."""
+        return [] if self._wander is None else self._wander.doubts()
 
     def _check_owner(self) -> None:
         """Raise `UserError` where the delay that is there belongs to another program of ours."""
