@@ -70,7 +70,8 @@ def apply(
 ) -> None:
     """Delay what this machine sends as a condition asks, verify it by reading back and by measuring, and leave it so.
 
-    What is there already is changed without losing a packet. Where the verification fails, the interface is put back.
+    What is there already is changed without losing a packet. Where the verification fails, the interface is put back;
+    where the change itself fails, and a delay was there before, it is said that something is left.
 
     Example: lavt netem apply L4 --role server --interface eth0
     """
@@ -86,17 +87,18 @@ def apply(
         return
     _say_restored(netem.check())
     with console.until_told() as told:
-        commands = netem.apply(flows, never=never, condition=name)
+        was_held = netem.shown()["ours"]
         try:
+            commands = netem.apply(flows, never=never, condition=name)
             if not as_json:
                 _show_commands(commands)
             found = netem.verify(flows, never=never)
+            _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
+            if hold and not found.reasons:
+                told.wait()
         except BaseException:
-            netem.clear()
+            _put_back(netem, was_held)
             raise
-        _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
-        if hold and not found.reasons:
-            told.wait()
         if hold or found.reasons or told.is_set():
             for command in netem.clear():
                 console.say(as_typed(command))
@@ -138,6 +140,17 @@ def clear(
     _tell_commands(commands, as_json, interface, "")
     if not as_json:
         console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")
+
+
+def _put_back(netem: Netem, was_held: bool) -> None:
+    """Leave an interface as it was before a change that failed; where it was held, say how to find out what is left."""
+    if not was_held:
+        netem.clear()
+        return
+    console.say(
+        f"lavt: {netem.interface} was held before, and is left as it is now: `lavt netem show --interface "
+        f"{netem.interface}` tells what is left, `lavt netem clear --interface {netem.interface}` takes it away"
+    )
 
 
 def _tell_commands(commands: Sequence[Command], as_json: bool, interface: str, name: str) -> None:
