@@ -550,6 +550,9 @@ JUDGED = {
         (Law(150, reorder=0.5), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.0), "0 of 50 packets overtook"),
         (Law(150, 10), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.5), "jitter of 0.50 ms"),
         (Law(150, 10), "video", Measured(50, 0, 0, 0, 90.0, 150.0, 170.0), "delayed by 90.00 ms (p5)"),
+        (Law(150, 10), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
+        (Law(150, 10, 0.9), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
+        (Law(150, loss=0.1), "video", Measured(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
     ],
 )  # fmt: skip
 def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, found: Measured, said: str) -> None:
@@ -561,6 +564,22 @@ def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, foun
     assert len(reasons) == 1
     assert said in reasons[0]
     assert judge([flow], [], {**JUDGED, "video": good}) == []
+
+
+@pytest.mark.parametrize(
+    ("law", "found"),
+    [
+        (Law(150, loss=0.1, loss_burst_packets=5), Measured(10, 10, 0, 0, None, None, None)),
+        (Law(150, loss=0.5), Measured(10, 9, 0, 0, None, None, None)),
+        (Law(150, reorder=0.5), Measured(10, 0, 8, 9, None, None, None)),
+        (Law(150, 10), Measured(50, 0, 0, 0, 140.0, 191.0, 195.0)),
+        (Law(150, 10, rate_bps=20_000), Measured(50, 0, 0, 0, 150.0, 400.0, 600.0)),
+    ],
+)
+def test_what_a_law_may_do_is_no_reason(law: Law, found: Measured) -> None:
+    """Losses and overtaking that are a possible share, a late median that jitter allows, and any where there is a rate."""
+    flow = Flow("video", "udp", 5600, "source", law)
+    assert judge([flow], [], {**JUDGED, "video": found}) == []
 
 
 def test_a_refusal_of_tc_is_a_sentence() -> None:

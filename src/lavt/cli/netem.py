@@ -183,9 +183,9 @@ def _tell(found: Verified, as_json: bool, what: Mapping[str, Any]) -> None:
 
 
 def _words(measured: Measured) -> str:
-    if measured.median_ms is None:
-        return f"none of {measured.sent} came through"
-    parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
+    parts = ["no delay measured"]
+    if measured.median_ms is not None:
+        parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
     counts = {"lost": measured.lost, "overtaken": measured.reordered, "early": measured.early}
     return ", ".join(parts + [f"{count} of {measured.sent} {name}" for name, count in counts.items() if count])
 

@@ -147,17 +147,28 @@ def judge(flows: Sequence[Flow], never: Sequence[Port], measured: Mapping[str, M
 
 def _judge(probe: Probe, found: Measured | None) -> list[str]:
     name, law = probe.name, probe.law
-    if found is None or found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+    if found is None:
         return [f"{name}: no packet came through"]
+    if found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+        return _judge_counts(probe, found) if law.loss or law.reorder else [f"{name}: no packet came through"]
     reasons = []
     if not (law.jitter_ms or law.rate_bps) and abs(found.median_ms - law.delay_ms) > LIMIT_MS:
         reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms where {law.delay_ms:g} ms was asked")
     least_ms = law.delay_ms - 4 * law.jitter_ms - LIMIT_MS
     if (law.jitter_ms or law.rate_bps) and found.p5_ms < least_ms:
         reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5) where {least_ms:.2f} ms is the least")
+    most_ms = law.longest_ms + LIMIT_MS
+    if law.jitter_ms and not law.rate_bps and found.median_ms > most_ms:
+        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median) where {most_ms:.2f} ms is the most")
     if law.jitter_ms and not law.jitter_correlation and found.p95_ms - found.p5_ms < law.jitter_ms / 2:
         spread_ms = found.p95_ms - found.p5_ms
         reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) where {law.jitter_ms:g} ms was asked")
+    return reasons + _judge_counts(probe, found)
+
+
+def _judge_counts(probe: Probe, found: Measured) -> list[str]:
+    name, law = probe.name, probe.law
+    reasons = []
     if not _is_share(found.lost, found.sent, law.loss, _clumping(law)):
         reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost where {law.loss:.1%} was asked")
     arrived = found.sent - found.lost
