@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
@@ -8,6 +9,7 @@ from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from hypothesis import given
@@ -18,6 +20,7 @@ from lavt.clock import MachineClock, pause
 from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError, WorkError
+from lavt.transport import netem_probe
 from lavt.transport.netem import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
 from lavt.transport.netem_control import Netem, run_tc
 from lavt.transport.netem_probe import Measured, judge, measure, probes, summary
@@ -383,6 +386,43 @@ def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) 
 
 
 @pytest.mark.parametrize(
+    ("interface", "qdiscs", "became", "kept"),
+    [
+        ("lo", '[{"kind":"fq_codel","handle":"8001:","root":true}]', "it is not put back: lo has a queue that", True),
+        ("lo", "garbage", "it is not put back: tc told its queues", True),
+        ("nowhere0", "garbage", "the interface is gone", False),
+    ],
+)
+def test_what_cannot_be_put_back_is_said_and_kept(
+    tmp_path: Path, interface: str, qdiscs: str, became: str, kept: bool
+) -> None:
+    """What cannot be put back is said with its reason and tried again; an interface that is gone is forgotten."""
+    dead = Applied(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
+    StateFiles(tmp_path).write(dead)
+    said = Netem("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
+
+    assert len(said) == 1
+    assert (
+        f"{interface} was still held (L3 on {interface}, of process {os.getpid()}, which has died): {became}" in said[0]
+    )
+    assert (StateFiles(tmp_path).read(interface) is not None) == kept
+
+
+@pytest.mark.parametrize("name", ["state", "table"])
+def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: str) -> None:
+    """Where a file of ours cannot be written, that is said before tc is told anything, and what is held goes on."""
+    tc = Tc(QDISCS, FILTERS)
+    file = {"state": f"netem-{namespace()}-eth0.json", "table": "uniform.dist"}[name]
+    (tmp_path / f"{file}.part").mkdir()
+    flow = Flow("video", "udp", 5600, "source", Law(75, 10, jitter_distribution="uniform"))
+    with pytest.raises(UserError, match=r"cannot be written \(Is a directory\): make room there"):
+        Netem("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
+
+    assert tc.told == []
+    assert not (tmp_path / f"netem-{namespace()}-eth0.json").exists()
+
+
+@pytest.mark.parametrize(
     "text", ["", "{}", "[]", "null", '{"interface": 3, "owner": 7}', '{"owner": [1, 2], "flows": [{}]}']
 )
 def test_a_broken_file_is_no_application(tmp_path: Path, text: str) -> None:
@@ -577,7 +617,7 @@ def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, foun
     ],
 )
 def test_what_a_law_may_do_is_no_reason(law: Law, found: Measured) -> None:
-    """Losses and overtaking that are a possible share, a late median that jitter allows, and any where there is a rate."""
+    """Possible shares of losses and overtaking, a late median that jitter allows, and any where there is a rate."""
     flow = Flow("video", "udp", 5600, "source", law)
     assert judge([flow], [], {**JUDGED, "video": found}) == []
 
@@ -586,6 +626,23 @@ def test_a_refusal_of_tc_is_a_sentence() -> None:
     """An interface that is not there is said so, whatever tc calls it."""
     with pytest.raises(UserError, match=r"there is no interface nowhere0|no tc"):
         run_tc(["tc", "qdisc", "show", "dev", "nowhere0"])
+
+
+@pytest.mark.parametrize("call", ["setsockopt", "bind", "getsockname", "sendto", "recvmsg"])
+def test_an_interface_that_goes_down_cannot_be_measured(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    """Whatever a packet socket refuses while it measures, as the interface went down, is one sentence."""
+
+    def down(*_: object) -> None:
+        raise OSError(errno.ENETDOWN, "Network is down")
+
+    opened = MagicMock()
+    opened.return_value.__enter__.return_value = opened.return_value
+    opened.return_value.getsockname.return_value = ("eth0", 0, 0, 1, bytes(6))
+    opened.return_value.recvmsg.side_effect = BlockingIOError
+    getattr(opened.return_value, call).side_effect = down
+    monkeypatch.setattr(netem_probe.socket, "socket", opened)
+    with pytest.raises(UserError, match=r"eth0 cannot be measured \(Network is down\)"):
+        measure("eth0", probes([VIDEO]), count=1)
 
 
 def test_an_interface_that_is_not_there_cannot_be_measured() -> None:

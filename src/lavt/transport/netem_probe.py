@@ -107,7 +107,15 @@ def measure(
 
     Raises `UserError` without root, and for an interface that is not there or not up.
     """
-    clock = clock or MachineClock()
+    try:
+        return _measure(interface, asked, count, period_ns, clock or MachineClock())
+    except OSError as error:
+        raise UserError(
+            f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
+        ) from error
+
+
+def _measure(interface: str, asked: Sequence[Probe], count: int, period_ns: int, clock: Clock) -> dict[str, Measured]:
     with _open(interface) as receiver, _open_sender() as sender:
         seen = _Seen(receiver, asked, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
@@ -252,11 +260,9 @@ def _open(interface: str) -> socket.socket:
         receiver.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filtered)
         receiver.bind((interface, _ALL_PROTOCOLS))
         receiver.setblocking(False)
-    except OSError as error:
+    except OSError:
         receiver.close()
-        raise UserError(
-            f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
-        ) from error
+        raise
     return receiver
 
 
@@ -271,9 +277,7 @@ def _send(sender: socket.socket, frame: bytes, link: tuple[str, int, int, int, b
         return
     except OSError as error:  # netem says so of what it loses, too
         if error.errno != errno.ENOBUFS:
-            raise UserError(
-                f"{link[0]} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
-            ) from error
+            raise
 
 
 def _hardware_address(interface: str) -> bytes:
