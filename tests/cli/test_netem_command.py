@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from lavt.cli import console
 from lavt.cli import netem as command
 from lavt.errors import LavtError, WorkError
 from lavt.transport.netem_control import Netem, Verified
@@ -33,7 +34,7 @@ class Kernel(Netem):
         self.commands.append(line)
         return ""
 
-    def verify(self, *_arguments: object, **_more: object) -> Verified:  # type: ignore[override]
+    def verify(self, *_arguments: object, **_more: object) -> Verified:
         """Find everything as asked."""
         return Verified([], {})
 
@@ -58,7 +59,7 @@ def test_an_apply_that_fails_half_way_leaves_nothing(
 ) -> None:
     """Whatever fails after a free interface was changed, printing also, the interface is free again."""
     kernel = Kernel(tmp_path, held=False)
-    monkeypatch.setattr(command.console if says == "show" else command, says, fails)
+    monkeypatch.setattr(console if says == "show" else command, says, fails)
     with pytest.raises((BrokenPipeError, KeyboardInterrupt)):
         apply_to(kernel, monkeypatch)
 

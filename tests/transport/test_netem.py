@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import socket
 import threading
 from collections.abc import Callable
 from dataclasses import asdict
@@ -20,7 +21,6 @@ from lavt.clock import MachineClock, pause
 from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError, WorkError
-from lavt.transport import netem_probe
 from lavt.transport.netem import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
 from lavt.transport.netem_control import Netem, run_tc
 from lavt.transport.netem_probe import Measured, judge, measure, probes, summary
@@ -640,7 +640,7 @@ def test_an_interface_that_goes_down_cannot_be_measured(monkeypatch: pytest.Monk
     opened.return_value.getsockname.return_value = ("eth0", 0, 0, 1, bytes(6))
     opened.return_value.recvmsg.side_effect = BlockingIOError
     getattr(opened.return_value, call).side_effect = down
-    monkeypatch.setattr(netem_probe.socket, "socket", opened)
+    monkeypatch.setattr(socket, "socket", opened)
     with pytest.raises(UserError, match=r"eth0 cannot be measured \(Network is down\)"):
         measure("eth0", probes([VIDEO]), count=1)
 
