@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,11 +11,13 @@ import pytest
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
+from lavt.errors import UserError
 from lavt.experiment.netem_run import NetemRun, netem_reasons
 from lavt.experiment.plan import plan_run
 from lavt.transport.netem import Flow, Law, Port
 from lavt.transport.netem_control import Netem
 from lavt.transport.netem_probe import Measured, probes
+from lavt.transport.netem_state import Applied, StateFiles, boot, namespace, started
 from lavt.transport.netem_tc import Command
 
 
@@ -25,6 +28,7 @@ class Kernel(Netem):
         super().__init__("lo", directory=directory, run=self.told)
         self.commands: list[str] = []
         self.more_ms = 0.0
+        self.stopped: list[str] = []
 
     def told(self, command: Command) -> str:
         """Take a command: the interface has nothing of ours until the root is added."""
@@ -41,6 +45,10 @@ class Kernel(Netem):
             each.name: Measured(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
             for each in probes(flows, never)
         }
+
+    def doubts(self) -> list[str]:
+        """Doubt what is said to have stopped."""
+        return self.stopped
 
     def read_back(self, flows: Sequence[Flow]) -> list[str]:
         """Read nothing back."""
@@ -82,6 +90,17 @@ def test_a_run_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert kernel.commands[-1] == "tc qdisc del dev lo root"
 
 
+def test_a_run_that_is_refused_leaves_what_another_holds(tmp_path: Path) -> None:
+    """Where another program holds the loopback a run is refused, and that program's queue stays."""
+    kernel = Kernel(tmp_path)
+    kernel.commands = ["tc qdisc add dev lo root"]
+    owner = os.getppid(), started(os.getppid())
+    StateFiles(tmp_path).write(Applied("lo", namespace(), boot(), owner, "L3", ()))
+    with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
+        pass
+    assert kernel.commands == ["tc qdisc add dev lo root"]
+
+
 def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:
     """A delay that is 3 ms longer after the drive is said for each flow, held or not, with when it was measured."""
     kernel = Kernel(tmp_path)
@@ -92,6 +111,8 @@ def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:
 
     assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
+    kernel.stopped = ["video: its correlated jitter has stopped"]
+    assert netem_reasons(netem.report())[0] == "video: its correlated jitter has stopped"
     assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
 
 

@@ -71,7 +71,7 @@ def sides(baseline: dict[str, float], tmp_path: Path) -> Iterator[dict[str, Nete
     made = {name: Netem(device, directory=tmp_path) for name, device in DEVICES.items()}
     yield made
     for name, netem in made.items():
-        inside(name, lambda netem=netem: netem.clear(at_once=True))  # type: ignore[misc]
+        inside(name, lambda netem=netem: netem.clear(at_once=True, of_anybody=True))  # type: ignore[misc]
 
 
 def hold(sides: dict[str, Netem], name: str) -> None:
@@ -209,7 +209,7 @@ def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, Netem])
         with pytest.raises(UserError, match="va has a queue that is not ours"):
             hold_video(sides, Law(75))
         with pytest.raises(UserError, match="va has a queue that is not ours"):
-            inside("server", sides["server"].clear)
+            inside("server", lambda: sides["server"].clear(of_anybody=True))
         assert queues("server") == there
     finally:
         command("tc -n server qdisc del dev va root")
@@ -377,6 +377,7 @@ def test_the_command_applies_verifies_and_clears(lavt: Callable[..., Ended]) -> 
     assert changed.code == 1
     assert "delay_ms is 100 where 150 was asked" in changed.err
     assert cleared.code == 0
+    assert cleared.err == "lavt: taken away: L4 on lo, left in place\n"
     assert command("tc -j qdisc show dev lo") == before
 
 
@@ -392,22 +393,27 @@ def test_apply_puts_the_interface_back_where_it_cannot_be_verified(lavt: Callabl
     command("ip link del idle")
 
 
-def test_a_held_delay_ends_with_its_command(lavt: Callable[..., Ended]) -> None:
-    """`lavt netem apply --hold` holds until SIGINT, refuses others meanwhile, and then puts the interface back."""
+@pytest.mark.parametrize(
+    ("name", "number"), [("L1", signal.SIGINT), ("L1", signal.SIGHUP), ("jitter_correlated", signal.SIGINT)]
+)
+def test_a_held_delay_ends_with_its_command(lavt: Callable[..., Ended], name: str, number: signal.Signals) -> None:
+    """`lavt netem apply --hold` holds, refuses others, and puts the interface back when the terminal ends its group."""
     before = command("tc -j qdisc show dev lo")
-    words = ["netem", "apply", "L1", "--role", "server", "--interface", "lo", "--hold", "--json"]
-    with subprocess.Popen([sys.executable, "-B", "-m", "lavt", *words], stdout=subprocess.PIPE, text=True) as holder:
+    words = ["netem", "apply", name, "--role", "server", "--interface", "lo", "--hold", "--json"]
+    with subprocess.Popen(
+        [sys.executable, "-B", "-m", "lavt", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as holder:
         assert holder.stdout is not None
         answer = json.loads(holder.stdout.readline())
         refused = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
         held = command("tc -j qdisc show dev lo")
-        holder.send_signal(signal.SIGINT)
+        os.killpg(holder.pid, number)
         holder.wait(30)
 
     assert answer["reasons"] == []
     assert held != before
     assert refused.code == 2
-    assert f"L1 on lo, of process {holder.pid}" in refused.err
+    assert f"{name} on lo, of process {holder.pid}" in refused.err
     assert holder.returncode == 0
     assert command("tc -j qdisc show dev lo") == before
 

@@ -1,24 +1,40 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
+import socket
+import threading
 from collections.abc import Callable
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.build.injection import netem_flows
+from lavt.clock import MachineClock, pause
 from lavt.config_file import condition
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError, WorkError
 from lavt.transport.netem import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
 from lavt.transport.netem_control import Netem, run_tc
 from lavt.transport.netem_probe import Measured, judge, measure, probes, summary
-from lavt.transport.netem_state import Applied, StateFiles, boot, flows_from, namespace, started, this_process
+from lavt.transport.netem_state import (
+    NOBODY,
+    Applied,
+    Owner,
+    StateFiles,
+    boot,
+    flows_from,
+    namespace,
+    started,
+    this_process,
+)
 from lavt.transport.netem_tc import (
     Command,
     Qdisc,
@@ -33,7 +49,7 @@ from lavt.transport.netem_tc import (
     read_law,
     set_law,
 )
-from lavt.transport.netem_wander import wandering
+from lavt.transport.netem_wander import Wander, wandering
 
 VIDEO = Flow("video", "udp", 5600, "source", Law(150))
 CONTROL = Flow("control", "udp", 7448, "destination", Law(75))
@@ -309,7 +325,7 @@ def test_somebody_elses_root_is_refused(tmp_path: Path) -> None:
     """A root with a handle that is not ours is refused, and tc is told nothing."""
     tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = Netem("eth0", directory=tmp_path, run=tc)
-    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), netem.clear, netem.check]
+    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(of_anybody=True), netem.check]
     for use in uses:
         with pytest.raises(UserError, match=r"eth0 has a queue that is not ours \(fq_codel 8001:\)"):
             use()
@@ -329,6 +345,32 @@ def test_what_another_program_owns_is_refused(tmp_path: Path) -> None:
     assert tc.told == []
 
 
+@pytest.mark.parametrize("owner", [(os.getppid(), started(os.getppid())), NOBODY, None])
+def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner: Owner | None) -> None:
+    """A program clears neither another's delay nor one left in place, with a file or without; on demand it does."""
+    tc, files = Tc(QDISCS, FILTERS), StateFiles(tmp_path)
+    if owner is not None:
+        files.write(Applied("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+    there = files.read("eth0")
+    with pytest.raises(UserError, match="there is"), Netem("eth0", directory=tmp_path, run=tc) as netem:
+        netem.check()
+
+    assert netem.clear() == []
+    assert tc.told == []
+    assert files.read("eth0") == there
+    assert netem.clear(at_once=True, of_anybody=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
+    assert files.read("eth0") is None
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_what_was_left_in_place_is_cleared_by_who_leaves_in_place(tmp_path: Path, written: bool) -> None:
+    """What `lavt netem apply` or a script left, the command that leaves in place owns, and clears."""
+    tc = Tc(QDISCS, FILTERS)
+    if written:
+        StateFiles(tmp_path).write(Applied("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
+    assert Netem("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
+
+
 @pytest.mark.parametrize("dead", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}])
 def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) -> None:
     """What belongs to an earlier boot, or a process that is no more, is cleared, also where its number came again."""
@@ -341,6 +383,43 @@ def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) 
     assert "eth0 was still held (L3 on eth0" in said[0]
     assert tc.told == ["tc qdisc del dev eth0 root"]
     assert StateFiles(tmp_path).read("eth0") is None
+
+
+@pytest.mark.parametrize(
+    ("interface", "qdiscs", "became", "kept"),
+    [
+        ("lo", '[{"kind":"fq_codel","handle":"8001:","root":true}]', "it is not put back: lo has a queue that", True),
+        ("lo", "garbage", "it is not put back: tc told its queues", True),
+        ("nowhere0", "garbage", "the interface is gone", False),
+    ],
+)
+def test_what_cannot_be_put_back_is_said_and_kept(
+    tmp_path: Path, interface: str, qdiscs: str, became: str, kept: bool
+) -> None:
+    """What cannot be put back is said with its reason and tried again; an interface that is gone is forgotten."""
+    dead = Applied(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
+    StateFiles(tmp_path).write(dead)
+    said = Netem("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
+
+    assert len(said) == 1
+    assert (
+        f"{interface} was still held (L3 on {interface}, of process {os.getpid()}, which has died): {became}" in said[0]
+    )
+    assert (StateFiles(tmp_path).read(interface) is not None) == kept
+
+
+@pytest.mark.parametrize("name", ["state", "table"])
+def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: str) -> None:
+    """Where a file of ours cannot be written, that is said before tc is told anything, and what is held goes on."""
+    tc = Tc(QDISCS, FILTERS)
+    file = {"state": f"netem-{namespace()}-eth0.json", "table": "uniform.dist"}[name]
+    (tmp_path / f"{file}.part").mkdir()
+    flow = Flow("video", "udp", 5600, "source", Law(75, 10, jitter_distribution="uniform"))
+    with pytest.raises(UserError, match=r"cannot be written \(Is a directory\): make room there"):
+        Netem("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
+
+    assert tc.told == []
+    assert not (tmp_path / f"netem-{namespace()}-eth0.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -395,6 +474,78 @@ def test_a_wandering_delay_is_correlated_as_asked_and_repeats() -> None:
     assert walk(4) != values
 
 
+WANDERING = Flow("video", "udp", 5600, "source", Law(75, 10, 0.9))
+
+
+def tc_that(does: str, folder: Path) -> dict[str, str]:
+    """Make a tc that does something else, and give the environment in which it is found."""
+    program = folder / "tc"
+    program.write_text(f"#!/bin/sh\n{does}\n")
+    program.chmod(0o755)
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
+def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) -> None:
+    """Ctrl-C at the terminal, which goes to a whole group of processes, does not reach it: it leads its own session."""
+    said = tmp_path / "said"
+    does = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
+    does += f"; echo $pid $session > {said}"
+    Wander("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
+    pid, session = said.read_text().split()
+
+    assert session == pid
+
+
+def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the tc that steps a delay has ended by itself, that is a doubt of its flow, and clearing goes on."""
+    monkeypatch.setenv("PATH", tc_that("exit 1", tmp_path)["PATH"])
+    tc = Tc()
+    netem = Netem("eth0", directory=tmp_path, run=tc)
+    netem.apply([WANDERING, CONTROL])
+    limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
+    while not netem.doubts() and MachineClock().now().mono_ns < limit_ns:
+        pause(NS_PER_MS)
+    doubts, tc.qdiscs = netem.doubts(), QDISCS.replace('"qlen": 7', '"qlen": 0')
+
+    assert doubts == ["video (udp source port 5600): its correlated jitter has stopped"]
+    assert netem.clear()[-1] == ["tc", "qdisc", "del", "dev", "eth0", "root"]
+    assert netem.doubts() == []
+
+
+class Ahead(MachineClock):
+    """A clock that can be set ahead."""
+
+    ahead_ns = 0
+
+    def now(self) -> Now:
+        """Tell the time."""
+        now = super().now()
+        return now._replace(mono_ns=now.mono_ns + self.ahead_ns)
+
+
+def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wander that steps is in no doubt; one whose thread has died is, a second after its last step, not before."""
+    monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
+    monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
+    clock = Ahead()
+    wander = Wander("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    now = wander.doubts()
+    clock.ahead_ns = NS_PER_S
+    later = wander.doubts()
+    wander.end()
+
+    assert now == []
+    assert later == ["video (udp source port 5600): its correlated jitter has stopped"]
+
+
+def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A verification tells what has stopped, beside what was read back and measured."""
+    netem = Netem("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
+    monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: JUDGED)
+    monkeypatch.setattr(netem, "doubts", lambda: ["stopped"])
+    assert netem.verify([VIDEO]).reasons == ["stopped"]
+
+
 def test_what_is_probed_beside_the_flows() -> None:
     """Beside L4's flows are probed: challenges, the other directions, NTP, ssh and the clock probe."""
     asked = probes([VIDEO, CONTROL], [Port("udp", 5602, "the clock probe")])
@@ -439,6 +590,9 @@ JUDGED = {
         (Law(150, reorder=0.5), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.0), "0 of 50 packets overtook"),
         (Law(150, 10), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.5), "jitter of 0.50 ms"),
         (Law(150, 10), "video", Measured(50, 0, 0, 0, 90.0, 150.0, 170.0), "delayed by 90.00 ms (p5)"),
+        (Law(150, 10), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
+        (Law(150, 10, 0.9), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
+        (Law(150, loss=0.1), "video", Measured(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
     ],
 )  # fmt: skip
 def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, found: Measured, said: str) -> None:
@@ -452,10 +606,43 @@ def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, foun
     assert judge([flow], [], {**JUDGED, "video": good}) == []
 
 
+@pytest.mark.parametrize(
+    ("law", "found"),
+    [
+        (Law(150, loss=0.1, loss_burst_packets=5), Measured(10, 10, 0, 0, None, None, None)),
+        (Law(150, loss=0.5), Measured(10, 9, 0, 0, None, None, None)),
+        (Law(150, reorder=0.5), Measured(10, 0, 8, 9, None, None, None)),
+        (Law(150, 10), Measured(50, 0, 0, 0, 140.0, 191.0, 195.0)),
+        (Law(150, 10, rate_bps=20_000), Measured(50, 0, 0, 0, 150.0, 400.0, 600.0)),
+    ],
+)
+def test_what_a_law_may_do_is_no_reason(law: Law, found: Measured) -> None:
+    """Possible shares of losses and overtaking, a late median that jitter allows, and any where there is a rate."""
+    flow = Flow("video", "udp", 5600, "source", law)
+    assert judge([flow], [], {**JUDGED, "video": found}) == []
+
+
 def test_a_refusal_of_tc_is_a_sentence() -> None:
     """An interface that is not there is said so, whatever tc calls it."""
     with pytest.raises(UserError, match=r"there is no interface nowhere0|no tc"):
         run_tc(["tc", "qdisc", "show", "dev", "nowhere0"])
+
+
+@pytest.mark.parametrize("call", ["setsockopt", "bind", "getsockname", "sendto", "recvmsg"])
+def test_an_interface_that_goes_down_cannot_be_measured(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    """Whatever a packet socket refuses while it measures, as the interface went down, is one sentence."""
+
+    def down(*_: object) -> None:
+        raise OSError(errno.ENETDOWN, "Network is down")
+
+    opened = MagicMock()
+    opened.return_value.__enter__.return_value = opened.return_value
+    opened.return_value.getsockname.return_value = ("eth0", 0, 0, 1, bytes(6))
+    opened.return_value.recvmsg.side_effect = BlockingIOError
+    getattr(opened.return_value, call).side_effect = down
+    monkeypatch.setattr(socket, "socket", opened)
+    with pytest.raises(UserError, match=r"eth0 cannot be measured \(Network is down\)"):
+        measure("eth0", probes([VIDEO]), count=1)
 
 
 def test_an_interface_that_is_not_there_cannot_be_measured() -> None:

@@ -90,9 +90,15 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def until_told() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C (SIGINT) or SIGTERM sets, for programs that run until they are told to stop."""
+    """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are told to stop.
+
+    Under `nohup`, which ignores the closed terminal's SIGHUP, that stays ignored.
+    """
     told = threading.Event()
-    before = {number: signal.signal(number, lambda *_: told.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, lambda *_: told.set()) for number in numbers}
     try:
         yield told
     finally:

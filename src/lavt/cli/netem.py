@@ -21,6 +21,7 @@ from lavt.transport.netem_tc import Command, as_typed, first_commands
 Interface = Annotated[str, typer.Option(help="The network interface, such as eth0: the one that faces the other side.")]
 ProbePort = Annotated[int, typer.Option(help="UDP port of the clock probe, which is never delayed.", min=1, max=65535)]
 PROBE_PORT = 5602
+MADE_BY_HAND = "what was made by hand"
 
 
 def register(app: typer.Typer) -> None:
@@ -46,7 +47,7 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
     if not shown["ours"]:
         console.show(f"{interface} holds nothing of ours: {', '.join(shown['queues']) or 'no queue'}")
         return
-    console.show(f"{interface} holds {'what was made by hand' if applied is None else applied.words}")
+    console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.words}")
     for name, law in laws.items():
         told = ", ".join(f"{key} {value:g}" for key, value in law.items() if isinstance(value, int | float) and value)
         console.show(f"  {name}: {told or 'nothing'}")
@@ -69,7 +70,8 @@ def apply(
 ) -> None:
     """Delay what this machine sends as a condition asks, verify it by reading back and by measuring, and leave it so.
 
-    What is there already is changed without losing a packet. Where the verification fails, the interface is put back.
+    What is there already is changed without losing a packet. Where the verification fails, the interface is put back;
+    where the change itself fails, and a delay was there before, it is said that something is left.
 
     Example: lavt netem apply L4 --role server --interface eth0
     """
@@ -85,17 +87,18 @@ def apply(
         return
     _say_restored(netem.check())
     with console.until_told() as told:
-        commands = netem.apply(flows, never=never, condition=name)
+        was_held = netem.shown()["ours"]
         try:
+            commands = netem.apply(flows, never=never, condition=name)
             if not as_json:
                 _show_commands(commands)
             found = netem.verify(flows, never=never)
+            _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
+            if hold and not found.reasons:
+                told.wait()
         except BaseException:
-            netem.clear()
+            _put_back(netem, was_held)
             raise
-        _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
-        if hold and not found.reasons:
-            told.wait()
         if hold or found.reasons or told.is_set():
             for command in netem.clear():
                 console.say(as_typed(command))
@@ -124,16 +127,30 @@ def clear(
     at_once: Annotated[bool, typer.Option("--at-once", help="Do not wait for what is under way: it is lost.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Put an interface back as it was; what is under way is waited for.
+    """Put an interface back as it was, whoever delays it, and say who did; what is under way is waited for.
 
     Example: lavt netem clear --interface eth0
     """
     netem = Netem(interface)
     _say_restored(netem.restore())
-    commands = netem.clear(at_once=at_once)
+    applied = netem.applied()
+    commands = netem.clear(at_once=at_once, of_anybody=True)
+    if commands:
+        console.say(f"lavt: taken away: {MADE_BY_HAND if applied is None else applied.words}")
     _tell_commands(commands, as_json, interface, "")
     if not as_json:
         console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")
+
+
+def _put_back(netem: Netem, was_held: bool) -> None:
+    """Leave an interface as it was before a change that failed; where it was held, say how to find out what is left."""
+    if not was_held:
+        netem.clear()
+        return
+    console.say(
+        f"lavt: {netem.interface} was held before, and is left as it is now: `lavt netem show --interface "
+        f"{netem.interface}` tells what is left, `lavt netem clear --interface {netem.interface}` takes it away"
+    )
 
 
 def _tell_commands(commands: Sequence[Command], as_json: bool, interface: str, name: str) -> None:
@@ -166,9 +183,9 @@ def _tell(found: Verified, as_json: bool, what: Mapping[str, Any]) -> None:
 
 
 def _words(measured: Measured) -> str:
-    if measured.median_ms is None:
-        return f"none of {measured.sent} came through"
-    parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
+    parts = ["no delay measured"]
+    if measured.median_ms is not None:
+        parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
     counts = {"lost": measured.lost, "overtaken": measured.reordered, "early": measured.early}
     return ", ".join(parts + [f"{count} of {measured.sent} {name}" for name, count in counts.items() if count])
 

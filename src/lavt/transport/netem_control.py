@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import socket
 import subprocess
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.netem import Flow, Law, Port, check_flows
 from lavt.transport.netem_probe import Measured, judge, measure, probes
-from lavt.transport.netem_state import DIRECTORY, NOBODY, Applied, StateFiles, boot, namespace, this_process
+from lavt.transport.netem_state import DIRECTORY, NOBODY, Applied, Owner, StateFiles, boot, namespace, this_process
 from lavt.transport.netem_tc import (
     PLACES,
     ROOT,
@@ -157,16 +158,16 @@ class Netem:
         return said
 
     def restore(self) -> list[str]:
-        """Put back every interface that a process left held when it died, and say which."""
+        """Put back every interface that a process left held when it died, and say of each what was done.
+
+        What cannot be put back is tried again the next time, but for an interface that is gone.
+        """
         with self._files.alone():
-            said = []
-            for applied in self._files.all():
-                if applied.is_abandoned:
-                    with suppress(UserError):  # the interface is gone, or somebody else's by now
-                        self._clear(applied.interface, at_once=True)
-                    self._files.forget(applied.interface)
-                    said.append(f"{applied.interface} was still held ({applied.words}, which has died): it is put back")
-            return said
+            return [
+                f"{each.interface} was still held ({each.words}, which has died): {self._restored(each.interface)}"
+                for each in self._files.all()
+                if each.is_abandoned
+            ]
 
     def apply(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), condition: str = "") -> list[Command]:
         """Hold `flows` as their laws say, from now on; give the commands that did it.
@@ -184,24 +185,27 @@ class Netem:
         self.restore()
         with self._files.alone():
             self._check_owner()
-            self._stand_still()
             qdiscs = self._ours_or_free(self.interface)
-            applied = Applied(self.interface, namespace(), boot(), self._owner, condition, tuple(flows))
-            self._files.write(applied)
             if any(flow.law.jitter_distribution == "uniform" for flow in flows):
-                (self._files.directory / "uniform.dist").write_text(uniform_table())
+                self._files.write_text("uniform.dist", uniform_table())
+            self._files.write(Applied(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
+            self._stand_still()
             ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
             if wanders:
                 self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
             return ran
 
-    def clear(self, *, at_once: bool = False) -> list[Command]:
-        """Put the interface back as it was; give the commands that did it, none where nothing of ours was there.
+    def clear(self, *, at_once: bool = False, of_anybody: bool = False) -> list[Command]:
+        """Put the interface back as it was; give the commands that did it, none where nothing of this owner was there.
 
-        What is under way is waited for, in order, and nothing is lost; `at_once` loses it.
+        What is under way is waited for, in order; lost is only what a rate has piled up beyond the longest delay and
+        two seconds, and with `at_once` all of it. `of_anybody` also clears
+        what another program of ours owns, or was left in place; raises `UserError` for a queue that is not ours.
         """
         with self._files.alone():
             self._stand_still()
+            if not of_anybody and self._owner_of_what_is_there() != self._owner:
+                return []
             ran = self._clear(self.interface, at_once=at_once)
             self._files.forget(self.interface)
             return ran
@@ -239,22 +243,41 @@ class Netem:
         return measure(self.interface, probes(flows, never), count=count, clock=self._clock)
 
     def verify(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), count: int = 50) -> Verified:
-        """Verify by reading back and by measuring."""
+        """Verify by reading back and by measuring, and tell what has stopped."""
         reasons = self.read_back(flows)
         measured = self.measure(flows, never=never, count=count)
-        return Verified(reasons + judge(flows, never, measured), measured)
+        return Verified(reasons + self.doubts() + judge(flows, never, measured), measured)
+
+    def doubts(self) -> list[str]:
+        """Say in sentences what of ours has stopped by itself since it was applied; no program is started for it."""
+        return [] if self._wander is None else self._wander.doubts()
+
+    def _restored(self, interface: str) -> str:
+        """Put back what the dead left, and say what came of it."""
+        became = "it is put back"
+        try:
+            self._clear(interface, at_once=True)
+        except LavtError as error:
+            if _exists(interface):
+                return f"it is not put back: {error}"
+            became = "the interface is gone"
+        self._files.forget(interface)
+        return became
 
     def _check_owner(self) -> None:
         """Raise `UserError` where the delay that is there belongs to another program of ours."""
         if not self._ours_or_free(self.interface):
             return
-        there = self._files.read(self.interface)
-        owner = NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
-        if owner != self._owner:
+        if self._owner_of_what_is_there() != self._owner:
+            there = self._files.read(self.interface)
             words = f"a delay on {self.interface}, left in place" if there is None else there.words
             raise UserError(
                 f"there is {words}: clear it with `lavt netem clear --interface {self.interface}`, or let it end"
             )
+
+    def _owner_of_what_is_there(self) -> Owner:
+        there = self._files.read(self.interface)
+        return NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
 
     def _ours_or_free(self, interface: str) -> list[Qdisc]:
         """Give the queues where the root is ours, and none where it is the kernel's own.
@@ -334,6 +357,13 @@ class Netem:
         for command in commands:
             self._run(command)
         return list(commands)
+
+
+def _exists(interface: str) -> bool:
+    try:
+        return socket.if_nametoindex(interface) > 0
+    except OSError:
+        return False
 
 
 def _is_ours(qdiscs: Sequence[Qdisc]) -> bool:

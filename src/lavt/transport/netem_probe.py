@@ -107,7 +107,15 @@ def measure(
 
     Raises `UserError` without root, and for an interface that is not there or not up.
     """
-    clock = clock or MachineClock()
+    try:
+        return _measure(interface, asked, count, period_ns, clock or MachineClock())
+    except OSError as error:
+        raise UserError(
+            f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
+        ) from error
+
+
+def _measure(interface: str, asked: Sequence[Probe], count: int, period_ns: int, clock: Clock) -> dict[str, Measured]:
     with _open(interface) as receiver, _open_sender() as sender:
         seen = _Seen(receiver, asked, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
@@ -147,17 +155,28 @@ def judge(flows: Sequence[Flow], never: Sequence[Port], measured: Mapping[str, M
 
 def _judge(probe: Probe, found: Measured | None) -> list[str]:
     name, law = probe.name, probe.law
-    if found is None or found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+    if found is None:
         return [f"{name}: no packet came through"]
+    if found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
+        return _judge_counts(probe, found) if law.loss or law.reorder else [f"{name}: no packet came through"]
     reasons = []
     if not (law.jitter_ms or law.rate_bps) and abs(found.median_ms - law.delay_ms) > LIMIT_MS:
         reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms where {law.delay_ms:g} ms was asked")
     least_ms = law.delay_ms - 4 * law.jitter_ms - LIMIT_MS
     if (law.jitter_ms or law.rate_bps) and found.p5_ms < least_ms:
         reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5) where {least_ms:.2f} ms is the least")
+    most_ms = law.longest_ms + LIMIT_MS
+    if law.jitter_ms and not law.rate_bps and found.median_ms > most_ms:
+        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median) where {most_ms:.2f} ms is the most")
     if law.jitter_ms and not law.jitter_correlation and found.p95_ms - found.p5_ms < law.jitter_ms / 2:
         spread_ms = found.p95_ms - found.p5_ms
         reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) where {law.jitter_ms:g} ms was asked")
+    return reasons + _judge_counts(probe, found)
+
+
+def _judge_counts(probe: Probe, found: Measured) -> list[str]:
+    name, law = probe.name, probe.law
+    reasons = []
     if not _is_share(found.lost, found.sent, law.loss, _clumping(law)):
         reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost where {law.loss:.1%} was asked")
     arrived = found.sent - found.lost
@@ -241,11 +260,9 @@ def _open(interface: str) -> socket.socket:
         receiver.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filtered)
         receiver.bind((interface, _ALL_PROTOCOLS))
         receiver.setblocking(False)
-    except OSError as error:
+    except OSError:
         receiver.close()
-        raise UserError(
-            f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
-        ) from error
+        raise
     return receiver
 
 
@@ -260,9 +277,7 @@ def _send(sender: socket.socket, frame: bytes, link: tuple[str, int, int, int, b
         return
     except OSError as error:  # netem says so of what it loses, too
         if error.errno != errno.ENOBUFS:
-            raise UserError(
-                f"{link[0]} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
-            ) from error
+            raise
 
 
 def _hardware_address(interface: str) -> bytes:

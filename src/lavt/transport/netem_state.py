@@ -10,7 +10,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -102,11 +102,15 @@ class StateFiles:
             os.close(lock)
 
     def write(self, applied: Applied) -> None:
-        """Write down what is going to be applied; there is never half a file."""
-        path = self._path(applied.interface)
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(asdict(applied)))
-        part.replace(path)
+        """Write down what is going to be applied."""
+        self.write_text(self._path(applied.interface).name, json.dumps(asdict(applied)))
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file; there is never half of one."""
+        part = self.directory / f"{name}.part"
+        with self._writing():
+            part.write_text(text)
+            part.replace(self.directory / name)
 
     def read(self, interface: str) -> Applied | None:
         """Give what was applied to an interface of this namespace; None for nothing, or what cannot be read."""
@@ -119,8 +123,17 @@ class StateFiles:
 
     def forget(self, interface: str) -> None:
         """Take away what was written down of an interface."""
-        with suppress(FileNotFoundError):
-            self._path(interface).unlink()
+        with self._writing():
+            self._path(interface).unlink(missing_ok=True)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise UserError(
+                f"{self.directory} cannot be written ({error.strerror}): make room there, and let root write to it"
+            ) from error
 
     def _path(self, interface: str) -> Path:
         return self.directory / f"netem-{namespace()}-{interface}.json"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import subprocess
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final
 
@@ -20,6 +21,8 @@ from lavt.transport.netem import Flow, Law
 from lavt.transport.netem_tc import set_law
 
 STEP_NS: Final = 20 * NS_PER_MS
+LATE_NS: Final = NS_PER_S
+"""A wander that has made no step for so long has stopped."""
 END_S: Final = 5.0
 
 
@@ -35,7 +38,7 @@ def wandering(law: Law, seed: int, name: str, index: int, before: tuple[int, flo
 class Wander:
     """A thread that steps the delays of the flows whose jitter is correlated, from now until it is told to end.
 
-    `environment` is that of tc. A tc that ends by itself is noted in `failed`.
+    `environment` is that of tc.
     """
 
     def __init__(
@@ -52,11 +55,12 @@ class Wander:
         self._seed = seed
         self._clock = clock or MachineClock()
         self._told = threading.Event()
-        self.failed = False
-        self.steps = 0
+        self._failed = False
+        self._stepped_ns = self._clock.now().mono_ns
         self._tc = subprocess.Popen(
             ["tc", "-force", "-batch", "-"],  # noqa: S607 (found as root's PATH says, like every tc here)
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True, env=environment,
+            start_new_session=True,  # Ctrl-C is for us: we end it
         )  # fmt: skip
         self._thread = threading.Thread(target=self._run, name=f"wander {interface}", daemon=True)
         self._thread.start()
@@ -66,12 +70,19 @@ class Wander:
         self._told.set()
         self._thread.join()
         if self._tc.stdin is not None:
-            self._tc.stdin.close()
+            with suppress(OSError):  # it has ended by itself
+                self._tc.stdin.close()
         try:
             self._tc.wait(END_S)
         except subprocess.TimeoutExpired:
             self._tc.kill()
             self._tc.wait()
+
+    def doubts(self) -> list[str]:
+        """Say in sentences which flows wander no more: tc has ended by itself, or there was no step for a second."""
+        if not self._failed and self._clock.now().mono_ns - self._stepped_ns <= LATE_NS:
+            return []
+        return [f"{flow.words}: its correlated jitter has stopped" for flow in self._flows]
 
     def _run(self) -> None:
         at: dict[str, tuple[int, float]] = {}
@@ -82,7 +93,7 @@ class Wander:
                 deviations = wandering(flow.law, self._seed, flow.name, index, at.get(flow.name))
                 at[flow.name] = index, deviations
                 self._say(flow, deviations)
-            self.steps += 1
+            self._stepped_ns = self._clock.now().mono_ns
             next_ns = begin_ns + (index + 1) * STEP_NS
             self._told.wait(max(0, next_ns - self._clock.now().mono_ns) / NS_PER_S)
 
@@ -95,4 +106,4 @@ class Wander:
             self._tc.stdin.write(" ".join(words) + "\n")
             self._tc.stdin.flush()
         except OSError:
-            self.failed = True
+            self._failed = True

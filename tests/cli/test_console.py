@@ -1,0 +1,34 @@
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from lavt.cli import console
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_runs_until_told_is_told_by_each_signal_that_ends(number: signal.Signals) -> None:
+    """Ctrl-C, SIGTERM and a closed terminal each set the event, and afterwards mean what they meant before."""
+    heard = list[int]()
+    before = signal.signal(number, lambda *_: heard.append(number))
+    try:
+        with console.until_told() as told:
+            assert not told.is_set()
+            signal.raise_signal(number)
+            assert (told.is_set(), heard) == (True, [])
+        signal.raise_signal(number)
+        assert heard == [number]
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_closed_terminal_that_is_ignored_stays_ignored() -> None:
+    """Under nohup, a program that runs until told goes on when its terminal is closed."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with console.until_told() as told:
+            signal.raise_signal(signal.SIGHUP)
+            assert not told.is_set()
+    finally:
+        signal.signal(signal.SIGHUP, before)
