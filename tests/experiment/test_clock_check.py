@@ -115,3 +115,14 @@ def test_a_probe_over_too_long_a_way() -> None:
     finding = compared(round_trip_ms=5.0, correction_s=None, bound_s=None)
     assert not finding.good
     assert finding.says[-1].startswith("2.50 ms are too wide")
+
+
+def test_an_exchange_during_which_a_clock_was_set_is_not_used() -> None:
+    """An answer that came before it was asked for says nothing: it is left out, and alone it is not good."""
+    spoilt = ClockProbe(9, 0, 250 * NS_PER_MS, 250 * NS_PER_MS, -999 * NS_PER_MS)
+    finding = compare(GOOD, [*probes(250.0, 0.3), spoilt], REPLY, SERVER)
+    assert finding.good
+    assert finding == compare(GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    alone = compare(GOOD, [spoilt], REPLY, SERVER)
+    assert (alone.good, alone.probe) == (False, None)
+    assert alone.says == ("no answer can be used: a clock was set during each, so ask again when none is set",)

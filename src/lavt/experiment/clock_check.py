@@ -60,7 +60,10 @@ def check_host(report: ClockReport) -> Finding:
 
 def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str) -> Finding:
     """Tell how this host's clock is against that of a server at the address `server` that answered these probes."""
-    best = min(probes, key=lambda probe: probe.round_trip_ns)
+    possible = [probe for probe in probes if probe.round_trip_ns >= 0]
+    if not possible:
+        return Finding(False, ("no answer can be used: a clock was set during each, so ask again when none is set",))
+    best = min(possible, key=lambda probe: probe.round_trip_ns)
     probe = Opinion(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
     sources = _by_sources(report, latest, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
@@ -84,7 +87,7 @@ def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeRepl
             complaints.append(f"these two disagree: {apart_ms:.3f} ms, where {allowed_ms:.3f} ms are allowed")
         else:
             says.append(f"these two agree: they are {apart_ms:.3f} ms apart, {allowed_ms:.3f} ms are allowed")
-    says.append(f"the shortest of {len(probes)} round trips took {round_trip_ms:.3f} ms")
+    says.append(f"the shortest of {len(possible)} round trips took {round_trip_ms:.3f} ms")
     used = sources or probe
     if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
         complaints.append(_too_wide(used.bound_ms))
