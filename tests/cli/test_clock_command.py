@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -48,6 +50,22 @@ def test_a_server_is_probed(port: int) -> None:
     assert abs(said["probe"]["ms"]) <= said["probe"]["bound_ms"] == said["round_trip_ms"] / 2
     assert done.returncode == (0 if said["good"] else 1)
     assert "Traceback" not in done.stderr
+
+
+def test_the_source_is_asked_before_and_after_the_probing(
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What chrony says last counts, and by how much it differs from what it said first is in the bound."""
+    (tmp_path / "chronyc").write_text(
+        "#!/bin/sh\n"
+        'if [ -e "$0.was_asked" ]; then correction=0.001; else correction=0.0; touch "$0.was_asked"; fi\n'
+        "echo 0A090001,10.9.0.1,9,1795292431.9,$correction,0.0,0.0,0.0,0.0,4.0,0.0002,0.00005,1.1,Normal\n"
+    )
+    (tmp_path / "chronyc").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    said = json.loads(lavt_clock("--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json").stdout)
+    assert said["clock"]["correction_s"] == 0.001
+    assert said["sources"] == pytest.approx({"ms": 1.0, "bound_ms": 0.1 + 0.05 + 0.1 + 1.0})
 
 
 def test_nobody_answers() -> None:

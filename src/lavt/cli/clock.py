@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
@@ -17,6 +18,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, WorkError
 from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
+from lavt.transport.clock_offset import ClockReport
 from lavt.transport.clock_probe import ClockProbe, ProbeReply, decode_reply, encode_request
 from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink, look_up
@@ -47,19 +49,19 @@ def clock(
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
     with closing(Shell()) as shell:
-        report = clock_source(ClockConfig(source=source), machine, shell.run)()
-    if report is None:
-        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
-    if address is None:
-        finding = check_host(report)
-    else:
-        probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
-        if latest is None:
-            raise WorkError(
-                f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its clock.probe_port "
-                f"{port}, and does the firewall let it through?"
-            )
-        finding = compare(report, probes, latest, address)
+        ask = clock_source(ClockConfig(source=source), machine, shell.run)
+        report = _answer(ask, source)
+        if address is None:
+            finding = check_host(report)
+        else:
+            probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
+            if latest is None:
+                raise WorkError(
+                    f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its "
+                    f"clock.probe_port {port}, and does the firewall let it through?"
+                )
+            before, report = report, _answer(ask, source)
+            finding = compare(before, report, probes, latest, address)
     if as_json:
         console.show_json({**asdict(finding), "clock": asdict(report)})
     else:
@@ -67,6 +69,13 @@ def clock(
             console.show(f"{sentence}.")
     if not finding.good:
         raise typer.Exit(1)
+
+
+def _answer(ask: Callable[[], ClockReport | None], source: str) -> ClockReport:
+    report = ask()
+    if report is None:
+        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
+    return report
 
 
 def probe(
