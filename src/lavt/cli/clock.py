@@ -14,6 +14,7 @@ from lavt.build.clock_source import clock_source
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
+from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, WorkError
 from lavt.experiment.clock_check import check_host, compare
@@ -38,18 +39,26 @@ def clock(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = 5602,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="For how long to probe.")] = 3.0,
     source: Annotated[
-        Literal["chrony", "ptp"], typer.Option(help="Who is asked about this machine's clock.")
+        Literal["chrony", "ptp", "external"], typer.Option(help="Who is asked about this machine's clock.")
     ] = "chrony",
+    correction_ms: Annotated[
+        float | None, typer.Option(help="With external: reference time less this machine's wall clock.")
+    ] = None,
+    bound_ms: Annotated[
+        float | None, typer.Option(help="With external: how far the correction can be from the truth.")
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Say how this machine's clock is and, with --server, how far from the vehicle's; ends with 1 if not good enough.
 
     Example: lavt clock --server 192.0.2.7
     """
+    asked = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
+    config = parse_config(ClockConfig, asked, "lavt clock")
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
     with closing(Shell()) as shell:
-        ask = clock_source(ClockConfig(source=source), machine, shell.run)
+        ask = clock_source(config, machine, shell.run)
         report = _answer(ask, source)
         if address is None:
             finding = check_host(report)
