@@ -20,7 +20,7 @@ from lavt.errors import BadMessage, WorkError
 from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
 from lavt.transport.clock_offset import ClockReport
-from lavt.transport.clock_probe import ClockProbe, ProbeReply, decode_reply, encode_request
+from lavt.transport.clock_probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
 from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink, look_up
 
@@ -36,7 +36,7 @@ def register(app: typer.Typer) -> None:
 
 def clock(
     server: Annotated[str | None, typer.Option(help="Also probe the `lavt server` on this host.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = 5602,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = DEFAULT_PORT,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="For how long to probe.")] = 3.0,
     source: Annotated[
         Literal["chrony", "ptp", "external"], typer.Option(help="Who is asked about this machine's clock.")
