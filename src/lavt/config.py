@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from lavt.transport import clock_probe
+
 
 class Section(BaseModel):
     """A part of a config: no unknown keys, no silent conversion, not changed once read."""
@@ -282,7 +284,7 @@ class ClockConfig(Section):
     """With `external`: reference time less this machine's wall clock."""
     bound_ms: float | None = Field(None, ge=0, le=86_400_000)
     """With `external`: how far the correction can be from the truth."""
-    probe_port: int = Field(5602, ge=0, le=65535)
+    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=0, le=65535)
     """The server's UDP port for the probe; nothing may delay it."""
 
     @model_validator(mode="after")
@@ -298,7 +300,7 @@ class ClockConfig(Section):
 class ClientClockConfig(ClockConfig):
     """The same on the client, which must know the server's port."""
 
-    probe_port: int = Field(5602, ge=1, le=65535)
+    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=1, le=65535)
 
 
 class ServerVideoConfig(VideoConfig):

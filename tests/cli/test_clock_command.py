@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -50,6 +52,32 @@ def test_a_server_is_probed(port: int) -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_the_source_is_asked_before_and_after_the_probing(
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What chrony says last counts, and by how much it differs from what it said first is in the bound."""
+    (tmp_path / "chronyc").write_text(
+        "#!/bin/sh\n"
+        'if [ -e "$0.was_asked" ]; then correction=0.001; else correction=0.0; touch "$0.was_asked"; fi\n'
+        "echo 0A090001,10.9.0.1,9,1795292431.9,$correction,0.0,0.0,0.0,0.0,4.0,0.0002,0.00005,1.1,Normal\n"
+    )
+    (tmp_path / "chronyc").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    said = json.loads(lavt_clock("--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json").stdout)
+    assert said["clock"]["correction_s"] == 0.001
+    assert said["sources"] == pytest.approx({"ms": 1.0, "bound_ms": 0.1 + 0.05 + 0.1 + 1.0})
+
+
+def test_an_external_source_is_given_by_options(port: int) -> None:
+    """With --source external correction and bound are the given ones, and count with the server's."""
+    external = ("--source", "external", "--correction-ms", "0.05", "--bound-ms", "0.1")
+    done = lavt_clock("--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json", *external)
+    said = json.loads(done.stdout)
+    assert said["clock"]["source"] == "external"
+    assert said["sources"] == pytest.approx({"ms": 0.05, "bound_ms": 0.1 + 0.1})
+    assert (done.returncode, said["good"]) == (0, True)
+
+
 def test_nobody_answers() -> None:
     """Where no server answers the command says so, with what to look for, and ends with 1."""
     done = lavt_clock("--server", "127.0.0.1", "--port", "1", "--seconds", "0.1")
@@ -66,6 +94,10 @@ def test_nobody_answers() -> None:
         (("--server", "localhost", "--port", "70000"), "--port"),
         (("--seconds", "-1"), "--seconds"),
         (("--source", "sundial"), "--source"),
+        (("--source", "external"), "lavt clock: source external needs correction_ms and bound_ms"),
+        (("--source", "external", "--correction-ms", "nan", "--bound-ms", "1"), "lavt clock: 'correction_ms'"),
+        (("--source", "external", "--correction-ms", "1", "--bound-ms", "-1"), "lavt clock: 'bound_ms'"),
+        (("--bound-ms", "1"), "lavt clock: correction_ms and bound_ms belong to source external"),
     ],
 )
 def test_wrong_input(arguments: tuple[str, ...], said: str) -> None:

@@ -41,7 +41,11 @@ class Drive:
     ending: str | None = "completed"
     wobble_m: float = 0.5
     step_s: float = 0.0
-    """Step of the client's wall clock halfway."""
+    """Step of the client's wall clock."""
+    stepped_s: float = 6.0
+    """When it was: halfway, where the drive has its usual length."""
+    waited_s: int = 1
+    """For how long both sides sampled their clocks before the drive."""
     server_counts: tuple[tuple[str, int], ...] = ()
     skipped: int = 0
     """Frames that the camera missed in the middle of the drive."""
@@ -72,13 +76,14 @@ class Drive:
     def client(self, at_ns: int) -> Now:
         """Read the client's clocks: behind by the offset, and losing `drift` a second."""
         ticked = at_ns - round(at_ns * self.drift)
-        step_ns = round(self.step_s * NS_PER_S) if at_ns > self.seconds * NS_PER_S / 2 else 0
+        step_ns = round(self.step_s * NS_PER_S) if at_ns > self.stepped_s * NS_PER_S else 0
         wall_ns = WALL_NS + round((self.began_s - self.offset_s) * NS_PER_S)
         return Now(CLIENT_MONO_NS + ticked, wall_ns + ticked + step_ns)
 
     def client_correction_s(self, at_ns: int) -> float:
-        """Tell what a perfect time service on the client would."""
-        return self.offset_s + self.drift * at_ns / NS_PER_S if self.corrected else 0.0
+        """Tell what a perfect time service on the client would; of a step during the drive it does not know."""
+        step_s = self.step_s if at_ns > self.stepped_s * NS_PER_S and self.stepped_s < 0 else 0.0
+        return self.offset_s - step_s + self.drift * at_ns / NS_PER_S if self.corrected else 0.0
 
     def tau_v_of_frame_ns(self, number: int) -> int:
         """Give the video latency of a frame: five values in turn, even about the median."""
@@ -100,7 +105,7 @@ def write_server(drive: Drive, path: Path) -> None:
     points = [on_route(index / 2, 0.0) for index in range(201)]
     writer.write("route", {"name": "A key", "length_m": 100.0, "points": points}, drive.server(0))
     end_ns = round(drive.seconds * NS_PER_S)
-    for second in range(-1, math.ceil(drive.seconds) + 2):
+    for second in range(-drive.waited_s, math.ceil(drive.seconds) + 2):
         if second in range(*drive.server_unpolled_s):
             continue
         now = drive.server(second * NS_PER_S)
@@ -192,7 +197,7 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
 
 def write_client(drive: Drive, path: Path) -> None:
     writer = RecordWriter(path, "client")
-    for second in range(-1, math.ceil(drive.seconds) + 2):
+    for second in range(-drive.waited_s, math.ceil(drive.seconds) + 2):
         if second in range(*drive.client_unpolled_s):
             continue
         at_ns = second * NS_PER_S
@@ -201,7 +206,7 @@ def write_client(drive: Drive, path: Path) -> None:
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
         given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
         writer.write("clock", given, now)
-    for index in range(-2, round(drive.seconds * 2) + 3 if drive.probes else -2):
+    for index in range(-2 * drive.waited_s, round(drive.seconds * 2) + 3 if drive.probes else -2 * drive.waited_s):
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
         stamp_ns = drive.server(number * FRAME_NS).wall_ns

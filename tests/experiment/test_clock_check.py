@@ -36,7 +36,7 @@ def compared(
     delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
 ) -> Finding:
     report = dataclasses.replace(GOOD, **changes)
-    return compare(report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
+    return compare(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
 
 
 def test_a_good_clock() -> None:
@@ -81,6 +81,24 @@ def test_who_follows_another_host_is_known_by_both_bounds() -> None:
     assert finding.sources.bound_ms == pytest.approx(0.6)
 
 
+def test_a_clock_that_is_steered_meanwhile() -> None:
+    """What the host said last counts, and by how much that differs from what it said first is added to the bound."""
+    before = dataclasses.replace(GOOD, correction_s=0.251)
+    finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    assert finding.sources is not None
+    assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 1.0 + 0.1 + 0.03 + 0.004])
+
+
+def test_a_source_that_could_not_tell_before() -> None:
+    """Where the host's source could tell only after the probing, Delta is the probe's, and what to do is told."""
+    before = ClockReport(0, 0, "desk", "chrony", status="chrony is not synchronised")
+    finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    assert (finding.good, finding.sources) == (True, None)
+    assert finding.says[1] == (
+        "this machine's source of time could not tell before the probing: run `lavt clock` again"
+    )
+
+
 def test_two_opinions_that_disagree() -> None:
     """Opinions further apart than both bounds are not good, and how far they are is told."""
     finding = compared(251.0)
@@ -115,3 +133,14 @@ def test_a_probe_over_too_long_a_way() -> None:
     finding = compared(round_trip_ms=5.0, correction_s=None, bound_s=None)
     assert not finding.good
     assert finding.says[-1].startswith("2.50 ms are too wide")
+
+
+def test_an_exchange_during_which_a_clock_was_set_is_not_used() -> None:
+    """An answer that came before it was asked for says nothing: it is left out, and alone it is not good."""
+    spoilt = ClockProbe(9, 0, 250 * NS_PER_MS, 250 * NS_PER_MS, -999 * NS_PER_MS)
+    finding = compare(GOOD, GOOD, [*probes(250.0, 0.3), spoilt], REPLY, SERVER)
+    assert finding.good
+    assert finding == compare(GOOD, GOOD, probes(250.0, 0.3), REPLY, SERVER)
+    alone = compare(GOOD, GOOD, [spoilt], REPLY, SERVER)
+    assert (alone.good, alone.probe) == (False, None)
+    assert alone.says == ("no answer can be used: a clock was set during each, so ask again when none is set",)

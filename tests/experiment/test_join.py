@@ -10,8 +10,10 @@ import yaml
 
 from lavt.config import ClientConfig, RunConfig, ServerConfig
 from lavt.config_file import load_config, parse_config
+from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.experiment.join import join
+from lavt.experiment.record import RecordWriter, read_record
 from lavt.experiment.run import compute_result
 
 MakeRun = Callable[..., Path]
@@ -20,8 +22,10 @@ MakeRun = Callable[..., Path]
 def sides(make_run: MakeRun, where: Path, **settings: Any) -> tuple[Path, Path]:
     """Leave what `lavt server --out` and `lavt client --out` leave of a drive."""
     records = make_run(where / "records", **settings)
-    client = parse_config(ClientConfig, {"controller": {"preset": "paper_calibrated"}}, "the client")
-    server = parse_config(ServerConfig, {"vehicle": {"route": "b_key"}, "video": {"bit_rate_bps": 2_000_000}}, "x")
+    controller, client_video = {"preset": "paper_calibrated"}, {"reorder_hold_ms": 25.0}
+    server_video = {"bit_rate_bps": 2_000_000, "reorder_hold_ms": 40.0}
+    client = parse_config(ClientConfig, {"controller": controller, "video": client_video}, "the client")
+    server = parse_config(ServerConfig, {"vehicle": {"route": "b_key"}, "video": server_video}, "the server")
     for side, config in (("server", server), ("client", client)):
         (where / side).mkdir()
         (where / side / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
@@ -49,6 +53,28 @@ def test_records_of_two_drives_are_refused(make_run: MakeRun, tmp_path: Path) ->
     server, _ = sides(make_run, tmp_path / "one")
     _, client = sides(make_run, tmp_path / "two", began_s=100.0)
     with pytest.raises(UserError, match="name two directories of the same drive"):
+        join(server, client, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
+    """For how long packets waited for earlier ones is what the client's config says, not what the server's does."""
+    server, client = sides(make_run, tmp_path)
+    join(server, client, tmp_path / "run")
+    assert load_config(RunConfig, tmp_path / "run" / "config.yaml").video.reorder_hold_ms == 25.0
+
+
+def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+    """A client that has only seen what the server sent after its first drive is refused: that drive was not its own."""
+    server, client = sides(make_run, tmp_path)
+    seen = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
+    writer = RecordWriter(server / "server.mcap", "server")
+    for mono_ns, kind in ((100, "drive_began"), (200, "ending"), (300, "drive_began")):
+        writer.write("event", {"mono_ns": mono_ns, "kind": kind, "detail": ""}, Now(mono_ns, mono_ns))
+    for mono_ns, stamp_ns in ((50, seen[0]), (150, seen[0] - 1), (350, seen[1])):
+        writer.write("frame", {"number": 0, "stamp_ns": stamp_ns, "stamped_mono_ns": mono_ns}, Now(mono_ns, mono_ns))
+    writer.close()
+    with pytest.raises(UserError, match="of a server that was driven several times only the first drive is joined"):
         join(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

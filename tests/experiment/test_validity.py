@@ -200,8 +200,41 @@ def test_a_shared_clock_that_is_set_is_told_once(make_run: MakeRun, tmp_path: Pa
     """Two sides on one kernel have one clock: its step is one reason."""
     make_run(tmp_path / "a", step_s=1.0, server_host="one", client_host="one", offset_s=0.0, drift=0.0)
     client = read_record(tmp_path / "a" / "client.mcap")
-    assert step_reasons(client, client, measure(client, client).clocks) == [
+    sampled_ns = client.table("clock").ints("mono_ns").tolist()
+    assert step_reasons(client, client, measure(client, client).clocks, sampled_ns[0], sampled_ns[-1]) == [
         "the wall clock of the server stepped by +1000.0 ms"
+    ]
+
+
+@pytest.mark.parametrize("source", ["chrony", "probe"])
+@pytest.mark.parametrize("step_s", [0.25, -1.0, -3600.0])
+def test_a_clock_that_is_set_while_nobody_drives_yet(
+    make_run: MakeRun, tmp_path: Path, step_s: float, source: str
+) -> None:
+    """A client's clock that is set 20 s before the drive is no reason, and Delta is what it is since then."""
+    alone = {"client_clock": lambda _second: {"source": "probe", "correction_s": None}} if source == "probe" else {}
+    make_run(tmp_path, step_s=step_s, stepped_s=-20.0, waited_s=40, drift=0.0, **alone)
+    server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
+    measured = measure(server, client)
+    assert invalid_because(server, client, measured) == []
+    assert measured.entry["delta"]["source"] == source
+    assert measured.entry["delta"]["ms"] == pytest.approx(250.0 - 1000 * step_s, abs=1e-3)
+
+
+@pytest.mark.parametrize("stepped_s", [-3.0, 0.5, 11.5, 12.5])
+def test_a_clock_that_is_set_near_the_drive(make_run: MakeRun, tmp_path: Path, stepped_s: float) -> None:
+    """However long the sides waited, a step in the drive or within 5 s of it is told."""
+    found = reasons(make_run, tmp_path, step_s=-1.0, stepped_s=stepped_s, waited_s=40)
+    assert found == ["the wall clock of the client stepped by -1000.0 ms"]
+
+
+def test_polls_that_are_missing_while_nobody_drives_yet(make_run: MakeRun, tmp_path: Path) -> None:
+    """A client that did not sample its clocks for 10 s before the drive is no reason; samples do not stand in for those
+    of the drive's end.
+    """
+    assert reasons(make_run, tmp_path / "before", client_unpolled_s=(-30, -20), waited_s=40) == []
+    assert reasons(make_run, tmp_path / "end", client_unpolled_s=(8, 15), waited_s=40) == [
+        "the clock samples of the client reach over 9.0 s of a drive of 12.0 s"
     ]
 
 

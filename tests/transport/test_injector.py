@@ -49,6 +49,10 @@ class NamedQueues:
         self.did.append(("measure", tuple(flows), tuple(never), count))
         return FOUND
 
+    def doubts(self) -> list[str]:
+        """Have one."""
+        return ["its jitter has stopped"]
+
     def clear(self) -> None:
         """Note it."""
         self.did.append("clear")
@@ -84,6 +88,7 @@ def test_an_order_is_applied_once_and_measured_whenever_it_comes() -> None:
     said = ordered(queues, Inject(1, "L2", (VIDEO,)), Inject(1, "L2", (VIDEO,)), Inject(2, "", ()))
     assert said[0] == Injected(1, "", "", (("video", 150.1),))
     assert (said[1].number, said[1].because, said[1].measured_ms) == (1, "", (("video", 150.1),))
+    assert said[1].doubts.startswith("its jitter has stopped; ")
     assert "NTP: no packet came through" in said[1].doubts
     assert said[2] == Injected(2, "", "", ())
     both = ((VIDEO,), (PROBE,))

@@ -4,9 +4,12 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
+from lavt.clock import MachineClock
+from lavt.domain import NS_PER_S
 from lavt.transport.shell import NOT_FOUND, Ended, Shell
 
 
@@ -40,6 +43,17 @@ def test_one_that_takes_too_long_is_given_up_and_the_next_is_not_disturbed(shell
     """An answer that does not come in time is none, and is not taken for the answer of the next program."""
     assert shell.run(["sh", "-c", "sleep 0.3; echo late"], 0.05) is None
     assert shell.run(["echo", "next"], 10) == Ended(0, "next\n")
+
+
+def test_the_limit_holds_and_what_took_too_long_is_ended(shell: Shell, tmp_path: Path) -> None:
+    """Who asks is not held up until a program ends that takes longer than it may, and the program does not go on."""
+    os.mkfifo(tmp_path / "said")
+    with os.fdopen(os.open(tmp_path / "said", os.O_RDONLY | os.O_NONBLOCK)) as said:
+        os.set_blocking(said.fileno(), True)
+        began_ns = MachineClock().now().mono_ns
+        assert shell.run(["sh", "-c", 'exec > "$0"; echo begun; exec sleep 60', str(tmp_path / "said")], 1.0) is None
+        assert said.read() == "begun\n"  # to the end, which comes when nobody can write any more
+        assert MachineClock().now().mono_ns - began_ns < 30 * NS_PER_S
 
 
 def test_a_shell_that_was_killed_is_replaced(shell: Shell) -> None:

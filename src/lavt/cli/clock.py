@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
@@ -13,11 +14,13 @@ from lavt.build.clock_source import clock_source
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
+from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, WorkError
 from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
-from lavt.transport.clock_probe import ClockProbe, ProbeReply, decode_reply, encode_request
+from lavt.transport.clock_offset import ClockReport
+from lavt.transport.clock_probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
 from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink, look_up
 
@@ -33,33 +36,41 @@ def register(app: typer.Typer) -> None:
 
 def clock(
     server: Annotated[str | None, typer.Option(help="Also probe the `lavt server` on this host.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = 5602,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = DEFAULT_PORT,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="For how long to probe.")] = 3.0,
     source: Annotated[
-        Literal["chrony", "ptp"], typer.Option(help="Who is asked about this machine's clock.")
+        Literal["chrony", "ptp", "external"], typer.Option(help="Who is asked about this machine's clock.")
     ] = "chrony",
+    correction_ms: Annotated[
+        float | None, typer.Option(help="With external: reference time less this machine's wall clock.")
+    ] = None,
+    bound_ms: Annotated[
+        float | None, typer.Option(help="With external: how far the correction can be from the truth.")
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Say how this machine's clock is and, with --server, how far from the vehicle's; ends with 1 if not good enough.
 
     Example: lavt clock --server 192.0.2.7
     """
+    asked = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
+    config = parse_config(ClockConfig, asked, "lavt clock")
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
     with closing(Shell()) as shell:
-        report = clock_source(ClockConfig(source=source), machine, shell.run)()
-    if report is None:
-        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
-    if address is None:
-        finding = check_host(report)
-    else:
-        probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
-        if latest is None:
-            raise WorkError(
-                f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its clock.probe_port "
-                f"{port}, and does the firewall let it through?"
-            )
-        finding = compare(report, probes, latest, address)
+        ask = clock_source(config, machine, shell.run)
+        report = _answer(ask, source)
+        if address is None:
+            finding = check_host(report)
+        else:
+            probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
+            if latest is None:
+                raise WorkError(
+                    f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its "
+                    f"clock.probe_port {port}, and does the firewall let it through?"
+                )
+            before, report = report, _answer(ask, source)
+            finding = compare(before, report, probes, latest, address)
     if as_json:
         console.show_json({**asdict(finding), "clock": asdict(report)})
     else:
@@ -67,6 +78,13 @@ def clock(
             console.show(f"{sentence}.")
     if not finding.good:
         raise typer.Exit(1)
+
+
+def _answer(ask: Callable[[], ClockReport | None], source: str) -> ClockReport:
+    report = ask()
+    if report is None:
+        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
+    return report
 
 
 def probe(

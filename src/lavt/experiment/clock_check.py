@@ -58,16 +58,27 @@ def check_host(report: ClockReport) -> Finding:
     return Finding(good, (words,) if good else (words, _too_wide(bound_ms)))
 
 
-def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str) -> Finding:
-    """Tell how this host's clock is against that of a server at the address `server` that answered these probes."""
-    best = min(probes, key=lambda probe: probe.round_trip_ns)
+def compare(
+    before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str
+) -> Finding:
+    """Tell how this host's clock is against that of a server at the address `server` that answered these probes.
+
+    `before` and `report` are what this host's source said before and after the probing: the second counts. The
+    server's word is of some moment between: what this clock was corrected by meanwhile is added to the bound.
+    """
+    possible = [probe for probe in probes if probe.round_trip_ns >= 0]
+    if not possible:
+        return Finding(False, ("no answer can be used: a clock was set during each, so ask again when none is set",))
+    best = min(possible, key=lambda probe: probe.round_trip_ns)
     probe = Opinion(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
-    sources = _by_sources(report, latest, server)
+    sources = _by_sources(before, report, latest, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
     says = [check_host(report).says[0]]
     complaints: list[str] = []
     if sources is None:
-        if report.correction_s is not None:
+        if report.correction_s is not None and before.correction_s is None:
+            says.append("this machine's source of time could not tell before the probing: run `lavt clock` again")
+        elif report.correction_s is not None:
             says.append("the server's source of time cannot tell how its clock is: run `lavt clock` there")
         says.append(
             f"Delta (server less client) is by the probe alone: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms. The "
@@ -84,22 +95,23 @@ def compare(report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeRepl
             complaints.append(f"these two disagree: {apart_ms:.3f} ms, where {allowed_ms:.3f} ms are allowed")
         else:
             says.append(f"these two agree: they are {apart_ms:.3f} ms apart, {allowed_ms:.3f} ms are allowed")
-    says.append(f"the shortest of {len(probes)} round trips took {round_trip_ms:.3f} ms")
+    says.append(f"the shortest of {len(possible)} round trips took {round_trip_ms:.3f} ms")
     used = sources or probe
     if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
         complaints.append(_too_wide(used.bound_ms))
     return Finding(not complaints, (*says, *complaints), sources, probe, round_trip_ms)
 
 
-def _by_sources(report: ClockReport, latest: ProbeReply, server: str) -> Opinion | None:
+def _by_sources(before: ClockReport, report: ClockReport, latest: ProbeReply, server: str) -> Opinion | None:
     known = (report.correction_s, report.bound_s, latest.correction_s, latest.bound_s)
-    if known[0] is None or known[1] is None or known[2] is None or known[3] is None:
+    if before.correction_s is None or known[0] is None or known[1] is None or known[2] is None or known[3] is None:
         return None
     path = (report.peer_delay_s, report.peer_dispersion_s, report.skew_ppm, report.age_s)
     delay_s, dispersion_s, skew_ppm, age_s = (math.inf if each is None else each for each in path)
     path_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
     bound_s = min(known[1], path_s) if report.follows == server else known[1] + known[3]
-    return Opinion((known[0] - known[2]) * 1e3, bound_s * 1e3)
+    moved_s = abs(known[0] - before.correction_s)
+    return Opinion((known[0] - known[2]) * 1e3, (bound_s + moved_s) * 1e3)
 
 
 def _path_complaints(report: ClockReport, round_trip_ms: float, server: str) -> list[str]:

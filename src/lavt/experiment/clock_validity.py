@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.clocks import PROBE, SAME_KERNEL, Clocks
+from lavt.experiment.clocks import MARGIN_NS, PROBE, SAME_KERNEL, Clocks, drive_on_client
 from lavt.experiment.offset import follows
 from lavt.experiment.record import Record
 from lavt.experiment.table import MISSING, IntArray, Table
@@ -28,17 +28,22 @@ Sides = tuple[tuple[str, Table, Table, IntArray], ...]
 """Name of a side, its samples, the other side's, and beginning and end of the drive on its wall clock."""
 
 
-def step_reasons(server: Record, client: Record, clocks: Clocks) -> list[str]:
-    """Tell of wall clocks that were set; two sides on one kernel have one clock."""
-    found = {side: _step_ms(record.table("clock")) for side, record in (("server", server), ("client", client))}
+def step_reasons(server: Record, client: Record, clocks: Clocks, began_ns: int, ended_ns: int) -> list[str]:
+    """Tell of wall clocks that were set near the drive; two sides on one kernel have one clock."""
+    found = {
+        "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
+        "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
+    }
     reasons = [f"the wall clock of the {side} stepped by {ms:+.1f} ms" for side, ms in found.items() if ms is not None]
     return reasons[:1] if clocks.source == SAME_KERNEL else reasons
 
 
-def _step_ms(samples: Table) -> float | None:
+def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
     mono_ns, wall_ns = samples.ints("mono_ns"), samples.ints("wall_ns")
     known = (mono_ns != MISSING) & (wall_ns != MISSING)
-    jumps_ms = np.diff(wall_ns[known] - mono_ns[known]) / NS_PER_MS
+    mono_ns, wall_ns = mono_ns[known], wall_ns[known]
+    near = (mono_ns[1:] > drive_ns[0] - MARGIN_NS) & (mono_ns[:-1] < drive_ns[1] + MARGIN_NS)
+    jumps_ms = np.diff(wall_ns - mono_ns)[near] / NS_PER_MS
     if len(jumps_ms) == 0 or np.max(np.abs(jumps_ms)) <= STEP_LIMIT_MS:
         return None
     return float(jumps_ms[np.argmax(np.abs(jumps_ms))])
@@ -47,32 +52,40 @@ def _step_ms(samples: Table) -> float | None:
 def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[str]:
     """Look for samples of the clocks that are missing: without them the offset is only guessed.
 
-    On the server they must follow each other from the drive's beginning to its end. The client's monotonic clock does
-    not know when that was: its samples must follow each other, and reach over as much time as the drive took.
+    On both sides they must follow each other from the drive's beginning to its end.
     """
     if began_ns > ended_ns:
         return []
     server_ns, client_ns = _sampled_ns(server), _sampled_ns(client)
-    in_drive = (server_ns[1:] > began_ns) & (server_ns[:-1] < ended_ns)
+    client_began_ns, client_ended_ns = drive_on_client(server, client, began_ns, ended_ns)
     longest_ns = {
         "server": max(
             *(
                 min(np.abs(server_ns - edge_ns).tolist(), default=ended_ns - began_ns)
                 for edge_ns in (began_ns, ended_ns)
             ),
-            int(np.max(np.diff(server_ns)[in_drive], initial=0)),
+            _longest_gap_ns(server_ns, began_ns, ended_ns),
         ),
-        "client": int(np.max(np.diff(client_ns), initial=0)),
+        "client": _longest_gap_ns(client_ns, client_began_ns, client_ended_ns),
     }
+    limit_ns = POLL_LIMIT_S * NS_PER_S
     reasons = [
         f"the clock of the {side} was not sampled for {gap_ns / NS_PER_S:.1f} s (limit {POLL_LIMIT_S} s)"
         for side, gap_ns in longest_ns.items()
-        if gap_ns > POLL_LIMIT_S * NS_PER_S
+        if gap_ns > limit_ns
     ]
-    covered_s, drive_s = (int(np.ptp(client_ns)) if len(client_ns) else 0) / NS_PER_S, (ended_ns - began_ns) / NS_PER_S
-    if drive_s - covered_s > 2 * POLL_LIMIT_S:  # one at the beginning, one at the end
+    near_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
+    whole = len(client_ns) and client_ns[0] - client_began_ns <= limit_ns >= client_ended_ns - client_ns[-1]
+    if not whole:
+        covered_s, drive_s = (int(np.ptp(near_ns)) if len(near_ns) else 0) / NS_PER_S, (ended_ns - began_ns) / NS_PER_S
         reasons.append(f"the clock samples of the client reach over {covered_s:.1f} s of a drive of {drive_s:.1f} s")
     return reasons
+
+
+def _longest_gap_ns(sampled_ns: IntArray, began_ns: int, ended_ns: int) -> int:
+    """For how long, between two samples, there was none while it was driven."""
+    in_drive = (sampled_ns[1:] > began_ns) & (sampled_ns[:-1] < ended_ns)
+    return int(np.max(np.diff(sampled_ns)[in_drive], initial=0))
 
 
 def _sampled_ns(record: Record) -> IntArray:

@@ -7,13 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from lavt.domain import NS_PER_MS
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.latency import frames_within, look_up
 from lavt.experiment.offset import NO_OFFSET, Exchanges, Offset, by_probe, by_sources, exchanges, known_samples
 from lavt.experiment.record import Record
-from lavt.experiment.table import IntArray, Table
+from lavt.experiment.table import MISSING, IntArray, Table
 
 SAME_KERNEL = "same kernel"
 PROBE = "probe"
+MARGIN_NS = 5 * NS_PER_S
+"""So much before and after the drive the clocks matter: at 500 ppm what was known earlier bounds Delta to 2.5 ms more,
+which is more than a run may have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +101,14 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
 
     Hosts that report the same name share a kernel, and so a clock: Delta is 0 and so is its bound. Else what the hosts'
     sources of time say counts, where both know it with a bound all through the drive and neither leaves it to the
-    probe; else the probe alone; else what the sources say without a bound.
+    probe; else the probe alone; else what the sources say without a bound. Of all of them what was found out near the
+    drive counts: while nobody drove yet a clock may have been set.
     """
-    of_server, of_client = server.table("clock"), client.table("clock")
+    on_client_ns = drive_on_client(server, client, began_ns, ended_ns)
+    of_server = _near(server.table("clock"), (began_ns, ended_ns))
+    of_client = _near(client.table("clock"), on_client_ns)
     server_wall_ns = np.array([wall_ns(server, began_ns), wall_ns(server, max(began_ns, ended_ns))])
-    every = exchanges(client.table("clock_probe"))
+    every = exchanges(_near(client.table("clock_probe"), on_client_ns))
     probed = every.within(*server_wall_ns.tolist())
     probe = by_probe(every) if len(probed) else None
     sources = None if _left_to_the_probe(of_server, of_client) else by_sources(of_server, of_client)
@@ -116,6 +123,28 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
         source, offset = (None, None) if probe is None else (PROBE, probe)
     client_wall_ns = server_wall_ns if offset is None else _on_client(offset, server_wall_ns)
     return Clocks(source, offset, probe, probed, client_wall_ns, server_wall_ns)
+
+
+def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
+    """Give beginning and end of the drive on the client's monotonic clock, which nobody sets; a little wider.
+
+    Pictures are on both monotonic clocks. Where none was read it is all the time in which the client's clocks were
+    sampled, or as much from there on as the drive took.
+    """
+    frames, pictures = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
+    stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), pictures.ints("stamp_ns"))
+    read_ns = pictures.ints("read_mono_ns")
+    ahead_ns = (read_ns - stamped_ns)[(stamped_ns != MISSING) & (read_ns != MISSING)]
+    if len(ahead_ns):
+        return began_ns + int(ahead_ns.min()), ended_ns + int(ahead_ns.max())
+    sampled_ns = client.table("clock").mono_ns
+    first_ns, last_ns = (int(sampled_ns.min()), int(sampled_ns.max())) if len(sampled_ns) else (0, 0)
+    return first_ns, max(last_ns, first_ns + ended_ns - began_ns)
+
+
+def _near(samples: Table, drive_ns: tuple[int, int]) -> Table:
+    """Those that were taken during a drive, on the same monotonic clock, or shortly before or after it."""
+    return samples.where((samples.mono_ns >= drive_ns[0] - MARGIN_NS) & (samples.mono_ns <= drive_ns[1] + MARGIN_NS))
 
 
 def wall_ns(record: Record, mono_ns: int) -> int:

@@ -13,6 +13,8 @@ from lavt.config import ClientConfig, NetworkConfig, RunConfig, ServerConfig, Vi
 from lavt.config_file import condition, load_config
 from lavt.errors import UserError
 from lavt.experiment.directory import check_directory, make_directory
+from lavt.experiment.latency import frames_within
+from lavt.experiment.metrics import driving_interval
 from lavt.experiment.record import read_record
 from lavt.experiment.run import CONFIG, NETWORK, compute_result
 from lavt.experiment.table import MISSING
@@ -48,7 +50,10 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
         vehicle=server.vehicle,
         controller=client.controller,
         camera=server.camera,
-        video=VideoConfig(**{key: getattr(server.video, key) for key in VideoConfig.model_fields}),
+        video=VideoConfig(
+            **{key: getattr(server.video, key) for key in VideoConfig.model_fields}
+            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client's is the one in force
+        ),
         network=NetworkConfig(
             condition=asked.condition or "L0",
             injection="netem" if asked.condition else "none",
@@ -81,8 +86,13 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
 
 
 def _check_same_drive(server: Path, client: Path) -> None:
-    """Raise `UserError` where the client has read no stamp that the server wrote."""
-    written = read_record(server, channels=("frame",)).table("frame").ints("stamp_ns")
+    """Raise `UserError` where the client has read no stamp that the server wrote while it was driven."""
+    vehicle = read_record(server, channels=("event", "frame"))
+    began_ns, ended_ns, _ = driving_interval(vehicle)
+    written = frames_within(vehicle.table("frame"), began_ns, ended_ns).ints("stamp_ns")
     read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
     if not np.isin(read[read != MISSING], written).any():
-        raise UserError(f"{client} has no picture of {server}: name two directories of the same drive")
+        raise UserError(
+            f"{client} has no picture of {server}: name two directories of the same drive; of a server that was "
+            "driven several times only the first drive is joined"
+        )

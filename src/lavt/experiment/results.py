@@ -70,8 +70,9 @@ def run_result(
     was asked of the network); these two are kept. `reasons` are those against the run that records do not show.
     """
     measured = measure(server, client)
-    absent = absent_reasons(measured.entry, identity["injected_ms"]) if "injected_ms" in identity else []
-    against = [*invalid_because(server, client, measured), *reasons, *absent]
+    against = [*invalid_because(server, client, measured), *reasons]
+    if not against and "injected_ms" in identity:  # where clocks are wrong, latencies are
+        against = absent_reasons(measured.entry, identity["injected_ms"])
     further = {key: identity[key] for key in ("axes", "injected_ms") if key in identity}
     return {
         **{key: identity.get(key) for key in IDENTITY},

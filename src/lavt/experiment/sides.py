@@ -13,6 +13,7 @@ from lavt.config import (
     ServerVideoConfig,
     ZenohConfig,
 )
+from lavt.transport import clock_probe
 
 
 def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
@@ -29,7 +30,9 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
     )
 
 
-def client_config(run: RunConfig, *, router: str = "", video_port: int = 0, probe_port: int = 5602) -> ClientConfig:
+def client_config(
+    run: RunConfig, *, router: str = "", video_port: int = 0, probe_port: int = clock_probe.DEFAULT_PORT
+) -> ClientConfig:
     """Give the client's part of a run."""
     return ClientConfig(
         controller=run.controller,

@@ -41,7 +41,7 @@ def _clock_reasons(server: Record, client: Record, measured: Measured) -> list[s
     """Tell of the clocks; where one was set, everything else about them follows from it."""
     began_ns, ended_ns, _ = driving_interval(server)
     polls = poll_reasons(server, client, began_ns, ended_ns)
-    steps = step_reasons(server, client, measured.clocks)
+    steps = step_reasons(server, client, measured.clocks, began_ns, ended_ns)
     if steps:
         return [*steps, *polls]
     return [*offset_reasons(server, client, measured.clocks), *polls, *_closure_reasons(measured)]

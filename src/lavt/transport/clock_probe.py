@@ -18,6 +18,8 @@ import struct
 from lavt.errors import BadMessage
 from lavt.value import value
 
+DEFAULT_PORT = 5602
+"""UDP, of the server."""
 VERSION = 1
 LAYOUT = struct.Struct(">2sBBIqqqdd")
 MAGIC = b"LC"

@@ -63,6 +63,10 @@ class Queues(Protocol):
         """Measure the same, and read nothing back."""
         ...
 
+    def doubts(self) -> list[str]:
+        """Tell what is known to be otherwise than asked without measuring."""
+        ...
+
     def clear(self) -> object:
         """Put everything back."""
         ...
@@ -130,7 +134,7 @@ class Injector:
                     return Injected(order.number, "; ".join(found.reasons), "", ())
             else:  # while it is driven: without starting programs, which would hold it up
                 measured = self._queues.measure(flows, never=self._never, count=FRAMES)
-                found = Verified(judge(flows, self._never, measured), measured)
+                found = Verified(self._queues.doubts() + judge(flows, self._never, measured), measured)
             self._applied = order.number
         except LavtError as error:
             return Injected(order.number, str(error), "", ())
