@@ -295,7 +295,7 @@ def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "stop", "router", "relay", "clock"]
+COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "stop", "router", "relay", "clock", "join"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -313,6 +313,13 @@ def test_list_of_commands(run: Run) -> None:
     assert ended.code == 0
     assert sorted(each.name or "" for each in app.registered_commands) == sorted(COMMANDS)
     assert all(command in ended.out for command in COMMANDS)
+
+
+def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
+    """Directories that no side wrote are refused with what to name instead, and no run is made."""
+    said = run("join", "one", "two", "--out", "joined").refused()
+    assert "one holds no config.yaml: name the --out of `lavt server`" in said
+    assert not (tmp_path / "joined").exists()
 
 
 def test_unknown_command(run: Run) -> None:

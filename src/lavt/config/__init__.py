@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from lavt.config.calibration import CalibrationConfig as CalibrationConfig
+from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
+from lavt.config.injection import Condition as Condition
+from lavt.config.injection import Impairment as Impairment
+from lavt.config.injection import InjectionConfig as InjectionConfig
+from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
+from lavt.config.section import Section as Section
 from lavt.transport import clock_probe
-
-
-class Section(BaseModel):
-    """A part of a config: no unknown keys, no silent conversion, not changed once read."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class VehicleConfig(Section):
@@ -72,47 +73,6 @@ class ClientCameraConfig(CameraConfig):
 
     calibration: str = ""
     """File of a calibration, which then says everything but the rate; empty: the keys above say it."""
-
-
-class CalibrationConfig(Section):
-    """A camera that was calibrated: its size, its lens in OpenCV's terms, and where it sits (vehicle's frame)."""
-
-    width_px: int = Field(ge=64, le=8192)
-    height_px: int = Field(ge=64, le=8192)
-    field_of_view_deg: float | None = Field(None, gt=10, lt=150)
-    """Over the width, with square pixels and the axis in the middle; or the four below."""
-    fx_px: float | None = Field(None, gt=0)
-    fy_px: float | None = Field(None, gt=0)
-    cx_px: float | None = None
-    cy_px: float | None = None
-    lens: Literal["pinhole", "fisheye"] = "pinhole"
-    distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2 (and k3, or k3 to k6) of a pinhole, k1 to k4 of a fisheye; empty: none."""
-    x_m: float
-    y_m: float = 0.0
-    z_m: float = Field(gt=0)
-    yaw_deg: float = Field(0.0, ge=-90, le=90)
-    pitch_deg: float = Field(0.0, ge=-60, le=80)
-    roll_deg: float = Field(0.0, ge=-60, le=60)
-
-    @field_validator("distortion")
-    @classmethod
-    def _whole(cls, distortion: tuple[float, ...], info: Any) -> tuple[float, ...]:
-        lengths = (4,) if info.data.get("lens") == "fisheye" else (0, 4, 5, 8)
-        if len(distortion) not in lengths:
-            raise ValueError(f"must have {' or '.join(str(each) for each in lengths)} coefficients for this lens")
-        return distortion
-
-    @model_validator(mode="after")
-    def _one_focal_length(self) -> CalibrationConfig:
-        matrix = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
-        whole = None not in matrix
-        if whole == (self.field_of_view_deg is not None) or (not whole and matrix != (None,) * 4):
-            raise ValueError("give either field_of_view_deg, or all of fx_px, fy_px, cx_px and cy_px")
-        if self.lens == "fisheye" and not (whole and self.distortion):
-            # Without them it would be taken for a pinhole, which no fisheye is.
-            raise ValueError("a fisheye needs fx_px, fy_px, cx_px, cy_px and its distortion; [0, 0, 0, 0] is none")
-        return self
 
 
 class VideoConfig(Section):
@@ -238,7 +198,7 @@ class SweepConfig(RunConfig):
     routes: tuple[str, ...] = ("a_key",)
     conditions: tuple[str, ...] = ("L0", "L1", "L2", "L3", "L4", "L5")
     repetitions: int = Field(1, ge=1, le=10_000)
-    axes: dict[str, list[Any]] = {}
+    axes: dict[str, list[Any]] = Field(default_factory=dict)
 
 
 class ZenohConfig(Section):
@@ -248,31 +208,6 @@ class ZenohConfig(Section):
     """A JSON5 file: a path, or one of those that come with LAVT."""
     router: str = ""
     """Endpoint of the router; empty: the one the file names."""
-
-
-class InjectionConfig(Section):
-    """How a side of two machines injects delay by `tc netem` into what its machine sends; it takes root."""
-
-    interface: str = ""
-    """The one towards the other machine; empty: this machine delays nothing."""
-    control_protocol: Literal["udp", "tcp"] = "udp"
-    """Of the link between the routers, and the port at which the vehicle's router listens."""
-    control_port: int = Field(7448, ge=1, le=65535)
-
-
-class ServerInjectionConfig(InjectionConfig):
-    """The server's: what it sends is delayed when a client asks for it."""
-
-    remote: bool = False
-    """Whether a client may: for a simulated vehicle at any time, for another one while it stands disarmed."""
-
-
-class ClientInjectionConfig(InjectionConfig):
-    """The client's: which condition it drives under."""
-
-    condition: str = ""
-    """Of `netem/conditions.yaml`; empty: the network is taken as it is."""
-    state_delay: Literal["none", "with_video"] = "none"
 
 
 class ClockConfig(Section):
@@ -369,37 +304,6 @@ class RelayConfig(Section):
     control: DelayConfig = DelayConfig()
     state: DelayConfig = DelayConfig()
     seed: int = Field(1, ge=0, lt=2**63)
-
-
-class Impairment(Section):
-    """What the network does to a flow beside a constant delay; see `docs/netem.md`."""
-
-    jitter_ms: float = Field(0.0, ge=0, le=10_000)
-    """Standard deviation of the delay; of a uniform law the half width."""
-    jitter_correlation: float = Field(0.0, ge=0, lt=1)
-    """Of the delay with itself 20 ms before."""
-    jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] = "normal"
-    loss: float = Field(0.0, ge=0, lt=1)
-    loss_burst_packets: float = Field(0.0, ge=0, le=10_000)
-    """Mean length of a burst of lost packets; 0 or 1: each is lost by itself."""
-    rate_bps: int = Field(0, ge=0, le=10_000_000_000)
-    """0: no limit."""
-    reorder: float = Field(0.0, ge=0, lt=1)
-    """Share of packets that are not delayed, and so overtake."""
-
-
-class Condition(Section):
-    """What is injected under a condition."""
-
-    video_ms: float = Field(ge=0, le=60_000)
-    control_ms: float = Field(ge=0, le=60_000)
-    video: Impairment = Impairment()
-    control: Impairment = Impairment()
-
-    @property
-    def is_delay_only(self) -> bool:
-        """Whether nothing but a constant delay is injected."""
-        return self.video == self.control == Impairment()
 
 
 class Costs(Section):
