@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.kernel.lane import clocks
 from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
-from tests.kernel.lane.driving import REPOSITORY, Drive, Loop
-from tests.kernel.lane.machine import Machine
+from tests.kernel.lane.driving import REPOSITORY, Drive, Loop, start_loop
+from tests.kernel.lane.machine import Machine, wait_until
 from tests.kernel.lane.netem import netem_on_ntp
 
 from lavt.config_file import conditions
@@ -230,3 +232,18 @@ def test_the_probe_alone_is_right_under_delay_of_the_control(
     assert driven.result["delta"]["source"] == "probe"
     assert clock_reasons(driven) == []
     truth.hold_against(driven)
+
+
+def test_the_delay_of_a_client_that_dies_ends_with_its_lease(
+    server_machine: Machine, client_machine: Machine, tmp_path: Path
+) -> None:
+    """When the client is killed in the middle of a drive, the server's queue is soon as it was."""
+    queues = ["tc", "qdisc", "show", "dev", "vec0"]
+    before = server_machine.run(queues)
+    loop = start_loop(
+        server_machine, client_machine, tmp_path / "died", server_changes=(*SHORT, *SERVER), client_changes=under("L4")
+    )
+    wait_until("the video is delayed", lambda: "delay 150ms" in server_machine.run(queues), 60)
+    loop.client.stop(signal.SIGKILL)
+    wait_until("the delay has ended", lambda: server_machine.run(queues) == before, 30)
+    assert loop.server.running
