@@ -201,11 +201,11 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(
     drive: DriveOnce, server_machine: Machine, step_s: int
 ) -> None:
     """With the server's wall clock set by a second in the middle of a drive, no safety state changes; it is invalid."""
-    stepped: list[bool] = []
+    stepped: list[Loop] = []
 
     def step(loop: Loop) -> None:
-        if not stepped and loop.server.latest().get("status", {}).get("progress_m", 0) > 30:
-            stepped.append(True)
+        if loop not in stepped and loop.server.latest().get("status", {}).get("progress_m", 0) > 30:
+            stepped.append(loop)
             server_machine.call(clocks.step, step_s * NS_PER_S)
 
     driven = drive("stepped", server=SHORT, client=SMALL, meanwhile=step)
