@@ -18,7 +18,7 @@ from tests.kernel.lane.netem import netem_on_ntp
 from lavt.config_file import conditions
 from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = pytest.mark.timeout(1800)
 
 DriveOnce = Callable[..., Drive]
 TrueOffset = Callable[[], int]
