@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from lavt.config.calibration import CalibrationConfig as CalibrationConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
+from lavt.config.injection import FlowChanges as FlowChanges
 from lavt.config.injection import Impairment as Impairment
 from lavt.config.injection import InjectionConfig as InjectionConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
@@ -91,6 +92,22 @@ class NetworkConfig(Section):
     inherent: Literal["loopback", "paper_wifi5"] = "loopback"
     injection: Literal["relay", "netem", "none"] = "relay"
     state_delay: Literal["none", "with_video"] = "none"
+    video: FlowChanges = FlowChanges()
+    """Instead of the condition's, value by value, so that a sweep can vary them one by one."""
+    control: FlowChanges = FlowChanges()
+
+    def asked(self, condition: Condition) -> Condition:
+        """Give what is asked of the network: `condition`, the one named here, with the changes."""
+        video_ms, video = self.video.of(condition.video_ms, condition.video)
+        control_ms, control = self.control.of(condition.control_ms, condition.control)
+        return Condition(video_ms=video_ms, control_ms=control_ms, video=video, control=control)
+
+    @property
+    def changes(self) -> str | None:
+        """What differs from the condition, in words; None where nothing does."""
+        flows = {"video": self.video.given, "control": self.control.given}
+        words = [f"{flow}.{name} {value}" for flow, given in flows.items() for name, value in given.items()]
+        return ", ".join(words) or None
 
 
 class SafetyConfig(Section):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -49,6 +49,30 @@ class Impairment(Section):
     """0: no limit."""
     reorder: float = Field(0.0, ge=0, lt=1)
     """Share of packets that are not delayed, and so overtake."""
+
+
+class FlowChanges(Section):
+    """What a run changes of its condition in one direction; where nothing is given, it is as the condition says."""
+
+    delay_ms: float | None = Field(None, ge=0, le=60_000)
+    jitter_ms: float | None = Field(None, ge=0, le=10_000)
+    jitter_correlation: float | None = Field(None, ge=0, lt=1)
+    jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] | None = None
+    loss: float | None = Field(None, ge=0, lt=1)
+    loss_burst_packets: float | None = Field(None, ge=0, le=10_000)
+    rate_bps: int | None = Field(None, ge=0, le=10_000_000_000)
+    reorder: float | None = Field(None, ge=0, lt=1)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What differs from the condition."""
+        return self.model_dump(exclude_none=True)
+
+    def of(self, delay_ms: float, impairment: Impairment) -> tuple[float, Impairment]:
+        """Give delay and impairment as changed."""
+        given = self.given
+        delay_ms = given.pop("delay_ms", delay_ms)
+        return delay_ms, Impairment(**{**impairment.model_dump(), **given})
 
 
 class Condition(Section):

@@ -8,7 +8,6 @@ from types import TracebackType
 from typing import Any
 
 from lavt.build.injection import netem_flows
-from lavt.config_file import condition
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.validity import injection_reasons
 from lavt.transport.netem import Flow, Law
@@ -49,6 +48,7 @@ class NetemRun:
 
     def __init__(self, planned: PlannedRun, netem: Netem | None = None) -> None:
         self._network = planned.config.network
+        self._asked = planned.asked
         self._netem = netem or Netem(LOOPBACK, seed=planned.seed)
         self._flows: list[Flow] = []
         self._restored: list[str] = []
@@ -67,7 +67,7 @@ class NetemRun:
         """Hold the flows of the condition from now on, and measure what happens to them."""
         network = self._network
         self._flows = netem_flows(
-            condition(network.condition), "both", video_port=video_port, control_port=control_port,
+            self._asked, "both", video_port=video_port, control_port=control_port,
             state_delay=network.state_delay,
         )  # fmt: skip
         commands = self._netem.apply(self._flows, condition=network.condition)

@@ -28,11 +28,13 @@ class PlannedRun:
     config: RunConfig
     identity: Mapping[str, Any]
     seed: int
+    asked: Condition
+    """What is asked of the network."""
 
 
 def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
     """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
-    asked = condition(config.network.condition)
+    asked = config.network.asked(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     _check_injection(config, asked)
     nothing = (config.network.inherent, asked.video_ms, asked.control_ms) == ("loopback", 0, 0)
@@ -64,8 +66,9 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         "seed": seed,
         "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
         **({"axes": dict(axes)} if axes else {}),
+        **({"changes": config.network.changes} if config.network.changes else {}),
     }
-    return PlannedRun(name, config, identity, seed)
+    return PlannedRun(name, config, identity, seed, asked)
 
 
 def _check_injection(config: RunConfig, asked: Condition) -> None:

@@ -19,7 +19,6 @@ from pydantic import BaseModel
 
 from lavt.clock import Clock, MachineClock, pause
 from lavt.config import DelayConfig, RelayConfig
-from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.netem_run import NETEM, NetemRun, by_netem
@@ -167,7 +166,7 @@ def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
 def _injected(planned: PlannedRun) -> Network:
     network = planned.config.network
     return injected_network(
-        network.inherent, condition(network.condition), read_costs(), planned.seed, state_delay=network.state_delay
+        network.inherent, planned.asked, read_costs(), planned.seed, state_delay=network.state_delay
     )
 
 

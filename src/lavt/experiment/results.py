@@ -66,14 +66,15 @@ def run_result(
 ) -> dict[str, Any]:
     """Compute the run's entry of `summary.json` from its records.
 
-    `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes) and `injected_ms` (what
-    was asked of the network); these two are kept. `reasons` are those against the run that records do not show.
+    `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes), `changes` (of the
+    condition) and `injected_ms` (what was asked of the network); these are kept. `reasons` are those against the run
+    that records do not show.
     """
     measured = measure(server, client)
     against = [*invalid_because(server, client, measured), *reasons]
     if not against and "injected_ms" in identity:  # where clocks are wrong, latencies are
         against = absent_reasons(measured.entry, identity["injected_ms"])
-    further = {key: identity[key] for key in ("axes", "injected_ms") if key in identity}
+    further = {key: identity[key] for key in ("axes", "changes", "injected_ms") if key in identity}
     return {
         **{key: identity.get(key) for key in IDENTITY},
         **further,

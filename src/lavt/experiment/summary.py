@@ -15,7 +15,7 @@ SCHEMA = 1
 Run = Mapping[str, Any]
 """An entry of `runs`, as `results.run_result` makes it."""
 
-GROUPING = ("fidelity", "inherent", "controller", "preset", "driver")
+GROUPING = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
 """Besides a sweep's own axes, what runs of one group have in common."""
 
 

@@ -13,7 +13,7 @@ from lavt.build.entropy import SeededEntropy
 from lavt.build.fidelity import FIDELITIES
 from lavt.build.sides import ClientNodes, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig
-from lavt.config_file import condition, load_config, shipped
+from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
 from lavt.experiment.directory import make_directory
 from lavt.experiment.network import Network, injected_network, virtual_network
@@ -95,7 +95,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
     """
     config, seed, costs = planned.config, planned.seed, read_costs()
-    asked = condition(config.network.condition)
+    asked = planned.asked
     server_clock, client_clock = clocks or host_clocks(config)
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
