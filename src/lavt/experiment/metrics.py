@@ -45,9 +45,8 @@ def driving_interval(server: Record) -> tuple[int, int, str | None]:
     Without an event `drive_began` nothing was driven: the interval is empty. Without an event `ending` (a crash) it
     reaches to the last message of the record, and the ending is None.
     """
-    last_ns = max((int(table.mono_ns.max()) for table in server.tables.values() if len(table)), default=0)
     began_ns: int | None = None
-    ended_ns, ending = last_ns, None
+    ended_ns, ending = server.last_ns, None
     for kind, mono_ns, detail in _events(server.table("event")):
         if kind == "drive_began" and began_ns is None:
             began_ns = mono_ns
