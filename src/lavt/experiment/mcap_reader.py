@@ -1,15 +1,18 @@
-"""Reading MCAP files (mcap.dev/spec), fast: the package `mcap` finds the chunks, what is in them is taken apart here.
+"""Reading MCAP files (mcap.dev/spec) as `mcap_file.py` writes them, fast: a sweep reads millions of messages.
 
-A message takes 1 us instead of 10: a sweep reads some millions of them.
+The reader of the package `mcap` takes 10 us for a message, this one takes 1: messages are taken apart in place, and the
+indexes, of which it reads every entry, are passed over. Rare records are read with the package's classes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Final
 
@@ -18,17 +21,20 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import CRCValidationError
 
-_LARGEST_BYTES: Final = 256 * 1024 * 1024
-"""A longer entry is damage: a flipped bit in its length must not fill the memory."""
+from lavt.experiment.mcap_file import MAGIC
+
 _HEAD: Final = struct.Struct("<BQ")
 """Opcode, length of what follows."""
 _MESSAGE: Final = struct.Struct("<HIQQ")
 """Channel, sequence, log time, publish time; then the data."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _CHANNEL_OPCODE: Final = int(Opcode.CHANNEL)
-_DAMAGE: Final = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, KeyError, RuntimeError)
+_DAMAGE: Final = (
+    McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, KeyError, RuntimeError, MemoryError
+)  # fmt: skip
+"""What reading damage can raise; memory, where a length is damaged."""
 
 
 @dataclass(slots=True)
@@ -53,18 +59,36 @@ def read_mcap(path: Path, wanted: Callable[[str], bool]) -> McapContent:
     """Read the messages of `wanted` topics, and all metadata, up to the end or to the first damage."""
     content = McapContent()
     messages_of: dict[int, Messages | None] = {}
-    with path.open("rb") as stream:
-        reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_BYTES)
-        try:
-            for item in reader.records:
-                if isinstance(item, Chunk):
-                    _take_apart(_checked(item), messages_of, content, wanted)
-                elif isinstance(item, Metadata):
-                    content.metadata[item.name] = dict(item.metadata)
-        except _DAMAGE:
-            return content  # a cut or damaged end: what came before is whole, each chunk has its own checksum
-    content.complete = True
+    # A cut or damaged end raises: what came before is whole, each chunk has its own checksum.
+    with path.open("rb") as stream, contextlib.suppress(*_DAMAGE), mmap(stream.fileno(), 0, access=ACCESS_READ) as file:
+        for opcode, begin, end in _records(file):
+            if opcode == Opcode.CHUNK:
+                _take_apart(_checked(Chunk.read(_stream(file[begin:end]))), messages_of, content, wanted)
+            elif opcode == Opcode.METADATA:
+                metadata = Metadata.read(_stream(file[begin:end]))
+                content.metadata[metadata.name] = dict(metadata.metadata)
+            elif opcode == Opcode.FOOTER:
+                content.complete = file[end : end + len(MAGIC)] == MAGIC
+                break
     return content
+
+
+def _records(file: mmap) -> Iterator[tuple[int, int, int]]:
+    """Give opcode, begin and end of each record of the file; raises `ValueError` where it is cut."""
+    if file[: len(MAGIC)] != MAGIC:
+        raise ValueError("no MCAP file")
+    end = len(MAGIC)
+    while True:
+        opcode, length = _HEAD.unpack_from(file, end)
+        begin = end + _HEAD.size
+        end = begin + length
+        if end > len(file):
+            raise ValueError("cut in the middle of a record")
+        yield opcode, begin, end
+
+
+def _stream(record: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(record))
 
 
 def _checked(chunk: Chunk) -> bytes:
@@ -104,6 +128,6 @@ def _take_apart(
 def _note_channel(
     record: bytes, messages_of: dict[int, Messages | None], content: McapContent, wanted: Callable[[str], bool]
 ) -> None:
-    channel = Channel.read(ReadDataStream(BytesIO(record)))
+    channel = Channel.read(_stream(record))
     chosen = wanted(channel.topic)
     messages_of[channel.id] = content.topics.setdefault(channel.topic, Messages()) if chosen else None
