@@ -37,6 +37,7 @@ def sweep(
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
+    from lavt.experiment.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
     from lavt.experiment.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
 
@@ -45,6 +46,8 @@ def sweep(
     if cluster and any(each.config.time == "real" for each in planned):
         raise UserError("--cluster is for virtual time: real time is driven on this machine, set time: virtual")
     out = out or Path("out") / "sweep"
+    if cluster:
+        check_cluster(cluster)
     open_sweep(out, resume=resume)
     missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
     with console.interruptible(), progress(f"sweep into {out}", missing) as tell:

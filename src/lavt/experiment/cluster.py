@@ -24,10 +24,7 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
     Raises `UserError` where there is no Dask, no scheduler or no worker, or where a worker has other versions: the same
     digests are promised for equal versions only.
     """
-    try:
-        dask: Any = import_module("distributed")  # an extra
-    except ImportError as error:
-        raise UserError(f"--cluster needs Dask ({error}): pip install 'lavt[cluster]'") from error
+    dask = _dask()
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
         with (
@@ -44,6 +41,21 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
         ) from error
     with client:
         yield _of_client(client, address)
+
+
+def check_cluster(address: str) -> None:
+    """Raise the `UserError` that `cluster` would, before anything is begun."""
+    _dask()
+    if address != LOCAL:
+        with cluster(address, None):
+            pass
+
+
+def _dask() -> Any:
+    try:
+        return import_module("distributed")  # an extra
+    except ImportError as error:
+        raise UserError(f"--cluster needs Dask ({error}): pip install 'lavt[cluster]'") from error
 
 
 def _of_client(client: Any, address: str) -> Workers:
