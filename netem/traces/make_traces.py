@@ -11,7 +11,7 @@ OPPORTUNITY_BITS = 1500 * 8
 
 
 def fading() -> str:
-    """Give a capacity that goes up and down like a cosine, in Mahimahi's format: one opportunity for each 1500 bytes."""
+    """Give a capacity that goes up and down like a cosine, in Mahimahi's format: an opportunity for 1500 bytes."""
     lines, bits = [], 0.0
     for millisecond in range(1, PERIOD_MS + 1):
         share = (1 + math.cos(2 * math.pi * millisecond / PERIOD_MS)) / 2

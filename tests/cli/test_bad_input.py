@@ -96,11 +96,6 @@ BAD_RUNS = {
     "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "virtual time only"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
-    "more than a delay in virtual time": (["--set", "network.condition=jitter"], "network.injection: netem"),
-    "more than a delay by the relay": (
-        ["--set", "network.condition=loss", "--set", "time=real"],
-        "network.injection: netem and time: real",
-    ),
     "a profile that netem cannot do": (
         ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],
         "network.injection relay",

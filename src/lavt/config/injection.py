@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
 from lavt.config.section import Section
 from lavt.transport.link import QUEUE_PACKETS
+
+HALF: Final = 0.5
 
 
 class InjectionConfig(Section):
@@ -95,3 +97,12 @@ class Condition(Section):
     control_ms: float = Field(ge=0, le=60_000)
     video: Impairment = Impairment()
     control: Impairment = Impairment()
+
+    @property
+    def least_ms(self) -> dict[str, float]:
+        """A delay that next to no median of each flow is below: jitter and overtaking make it less than was asked."""
+        flows = {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
+        return {
+            name: 0.0 if each.reorder >= HALF else max(0.0, delay_ms - 4 * each.jitter_ms)
+            for name, (delay_ms, each) in flows.items()
+        }

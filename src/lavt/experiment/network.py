@@ -57,8 +57,8 @@ class Network:
 def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> Network:
     """Give what must be injected on a loopback to have `condition` on top of the inherent `profile`.
 
-    `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition that
-    contradicts itself, and for a trace that is missing or wrong.
+    `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition
+    that contradicts itself, and for a trace that is missing or wrong.
     """
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0

@@ -65,11 +65,18 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         "order": config.study.order,
         "repetition": config.repetition,
         "seed": seed,
-        "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
+        **injected_entry(asked),
         **({"axes": dict(axes)} if axes else {}),
         **({"changes": config.network.changes} if config.network.changes else {}),
     }
     return PlannedRun(name, config, identity, seed, asked)
+
+
+def injected_entry(asked: Condition) -> dict[str, Any]:
+    """Say what is injected and, where jitter or overtaking make that less, how much of it there must be at least."""
+    injected_ms = {"video": asked.video_ms, "control": asked.control_ms}
+    least = {} if asked.least_ms == injected_ms else {"injected_least_ms": asked.least_ms}
+    return {"injected_ms": injected_ms, **least}
 
 
 def _check_injection(config: RunConfig, asked: Condition) -> None:

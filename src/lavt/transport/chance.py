@@ -1,7 +1,7 @@
 """Chance on a link: numbers drawn by index from named streams, and netem's distributions of jitter.
 
-Numbers are drawn in blocks, because a generator of its own for each packet would cost 20 us. A distribution is a table of
-4096 quantiles in standard deviations, as netem's are (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
+Numbers are drawn in blocks, because a generator of its own for each packet would cost 20 us. A distribution is a table
+of 4096 quantiles in standard deviations, as netem's are (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """A link with more than a delay, without input and output: what is lost, what waits, and when each packet leaves.
 
 Virtual time and the relay use it. It does what netem does as `docs/netem.md` has it, in the kernel's order: a packet is
-lost or not; of the others a share overtakes; the rest take their delay in order, and then the rate. Beyond netem a trace
-gives delay or capacity. All chance is drawn by the packet's number, or by the time slot, from a stream for each law: one
-law more leaves what the others do as it was, and runs with one seed stay paired.
+lost or not; of the others a share overtakes; the rest take their delay in order, and then the rate. Beyond netem a
+trace gives delay or capacity. All chance is drawn by the packet's number, or by the time slot, from a stream for each
+law: one law more leaves what the others do as it was, and runs with one seed stay paired.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Bottleneck:
         return self._free_ns
 
     def _delivered_ns(self, capacity: CapacityTrace, gone_ns: int, size_bytes: int) -> int:
-        """Use up opportunities, as Mahimahi does: what one has left is for the next packet only if that waits by then."""
+        """Use up opportunities, as Mahimahi does: the rest of one is for the next packet if that waits by then."""
         first = capacity.first_from(gone_ns)
         if first > self._number:
             self._number, self._left_bytes = first, OPPORTUNITY_BYTES

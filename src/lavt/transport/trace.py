@@ -69,7 +69,7 @@ def parse_mahimahi(text: str, where: str) -> CapacityTrace:
             times_ms.append(_whole_ms(word, f"{where}, line {number}"))
     for number, (before, after) in enumerate(pairwise(times_ms), 2):
         if after < before:
-            raise UserError(f"{where}: entry {number} is {after} ms, earlier than {before} ms before it: sort the times")
+            raise UserError(f"{where}: entry {number} is {after} ms, after one of {before} ms: sort the times")
     if not times_ms or times_ms[-1] == 0:
         raise UserError(f"{where} lasts no time, so it cannot be repeated: give it an opportunity after 0 ms")
     return CapacityTrace(tuple(each * NS_PER_MS for each in times_ms))
