@@ -154,7 +154,7 @@ def test_throughput() -> None:
 
 
 def test_full_queue() -> None:
-    """A queue with room for three holds three, the one being sent among them; what comes then is dropped and counted."""
+    """A queue with room for three holds three, the one being sent among them; the next is dropped and counted."""
     made = link(Law(rate_bps=8000), queue_packets=3)  # 1 s for 1000 bytes
     size_bytes = 1000 - HEADER_BYTES
     assert [made.leaves_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
@@ -292,7 +292,7 @@ def test_loss_does_not_move_overtaking() -> None:
 
 
 def test_a_line_with_a_link() -> None:
-    """A line gives out what its link lets through when that says, early ones first, and tells of each when it is due."""
+    """A line gives out what its link lets through when that says, early ones first, and tells when each is due."""
     law = Law(delay_ms=75, loss=0.1, reorder=0.2)
     line, made = DelayLine(DelayLaw(12.0), link(law)), link(law)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
@@ -323,7 +323,7 @@ def test_contradictions(law: Law, trace: str | None, said: str) -> None:
 
 
 def test_what_the_kernel_refuses_is_allowed() -> None:
-    """Jitter beyond the delay, a correlation without jitter, and overtaking a delay that only a trace has, are no nonsense."""
+    """Jitter beyond the delay, correlation without jitter, and overtaking what only a trace delays are no nonsense."""
     check_injected(Injected(Law(jitter_ms=10), 1, "video"))
     check_injected(Injected(Law(jitter_correlation=0.9), 1, "video"))
     check_injected(Injected(Law(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))

@@ -56,7 +56,7 @@ BAD_MAHIMAHI = [
 @pytest.mark.parametrize(("text", "said"), BAD_MAHIMAHI, ids=[text[:12] for text, _ in BAD_MAHIMAHI])
 def test_bad_capacities(text: str, said: str) -> None:
     """What is no trace of capacity is refused in a sentence that names where it is from and what is wrong."""
-    with pytest.raises(UserError, match="^t") as error:
+    with pytest.raises(UserError, match=r"^t") as error:
         parse_mahimahi(text, "t")
     assert said in str(error.value)
 
@@ -80,7 +80,7 @@ BAD_CSV = [
 @pytest.mark.parametrize(("text", "said"), BAD_CSV, ids=[text[16:30] or text for text, _ in BAD_CSV])
 def test_bad_delays(text: str, said: str) -> None:
     """What is no trace of delay is refused in a sentence that names where it is from and what is wrong."""
-    with pytest.raises(UserError, match="^t") as error:
+    with pytest.raises(UserError, match=r"^t") as error:
         parse_delays(text, "t")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
