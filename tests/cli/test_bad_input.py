@@ -74,6 +74,11 @@ def files(directory: Path) -> Mapping[str, bytes | None]:
     }
 
 
+BY_NETEM = [
+    part
+    for change in ("time=real", "network.injection=netem", "network.inherent=loopback")
+    for part in ("--set", change)
+]
 BAD_RUNS = {
     "unknown key": (["--set", "vehicle.rute=a_key"], "did you mean 'route'?"),
     "wrong type": (["--set", "seed=one"], "'seed'"),
@@ -109,15 +114,15 @@ BAD_RUNS = {
     ),
     "overtaking nothing": (["--set", "network.video.reorder=0.1"], "reorder needs a delay"),
     "a trace by netem": (
-        ["--set", "network.condition=handover", "--set", "time=real", "--set", "network.injection=netem"],
+        ["--set", "network.condition=handover", *BY_NETEM],
         "netem cannot replay the trace 'handover.csv': choose network.injection relay",
     ),
     "a short queue by netem": (
-        ["--set", "network.condition=rate_short_queue", "--set", "time=real", "--set", "network.injection=netem"],
+        ["--set", "network.condition=rate_short_queue", *BY_NETEM],
         "not for queue_packets 50",
     ),
     "jitter beyond the delay by netem": (
-        ["--set", "network.video.jitter_ms=5", "--set", "time=real", "--set", "network.injection=netem"],
+        ["--set", "network.video.jitter_ms=5", *BY_NETEM],
         "would need delays below zero",
     ),
     "loss that nobody injects": (
