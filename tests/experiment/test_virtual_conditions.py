@@ -111,7 +111,7 @@ def test_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> Non
     sweep = {
         "fidelity": fidelity,
         "conditions": ["L1"],
-        "vehicle": {"time_limit_s": 2.0},
+        "vehicle": {"time_limit_s": 6.0 if fidelity == "geometry" else 1.0, "scenery": "light"},
         "record": {"video": False},
         "network": {"control": {"loss": 0.2}, "video": {"jitter_ms": 5.0}},
         "axes": {key: values},
