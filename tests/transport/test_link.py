@@ -327,3 +327,19 @@ def test_what_the_kernel_refuses_is_allowed() -> None:
     check_injected(Injected(Law(jitter_ms=10), 1, "video"))
     check_injected(Injected(Law(jitter_correlation=0.9), 1, "video"))
     check_injected(Injected(Law(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
+
+
+def test_early_ones_keep_their_order() -> None:
+    """What overtakes by not being delayed still has the delay that is there anyway, and keeps order with its like."""
+    made = link(Law(delay_ms=75, reorder=0.999))
+    early = [made.leaves_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))]
+    assert early == [40 * MS, 40 * MS, 52 * MS]
+
+
+@pytest.mark.parametrize("added", [{"loss": 0.5}, {"reorder": 0.5}])
+def test_chances_have_nothing_to_do_with_each_other(added: dict[str, float]) -> None:
+    """Which packets are lost, or overtake, says nothing of the jitter of the others."""
+    delays = held_ms(link(Law(delay_ms=100, jitter_ms=10, **added)))
+    delayed = delays[delays > 0]
+    assert len(delayed) == pytest.approx(COUNT / 2, rel=0.05)
+    assert delayed.mean() == pytest.approx(100, abs=4 * 10 / len(delayed) ** 0.5)
