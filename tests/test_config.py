@@ -15,6 +15,7 @@ from lavt.config import (
     ClocksConfig,
     Costs,
     DelayConfig,
+    NetworkConfig,
     RelayConfig,
     RunConfig,
     SafetyConfig,
@@ -25,16 +26,18 @@ from lavt.config import (
 from lavt.config_file import condition, conditions, load_config, parse_config, parse_yaml, shipped
 from lavt.control.limits import LIMITS
 from lavt.errors import UserError
-from lavt.experiment.plan import plan_sweep
+from lavt.experiment.plan import plan_run, plan_sweep
 
 SCHEMAS: dict[str, type[Section]] = {
     "client.yaml": ClientConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
+    "loss_and_jitter.yaml": SweepConfig,
     "paper.yaml": SweepConfig,
     "paper_designed.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
     "server.yaml": ServerConfig,
+    "speed.yaml": SweepConfig,
     "sweep.yaml": SweepConfig,
 }
 """A file in configs/ that is not here has no test: name its schema."""
@@ -75,6 +78,27 @@ def test_the_paper_sweep_is_what_others_rely_on() -> None:
     assert (paper.safety.lateral_acceleration_mps2, paper.safety.picture_age_limit_ms) == (6.0, 2000.0)
     assert (paper.routes, paper.conditions) == (("a", "a_key", "b", "b_key", "c", "c_key"), tuple(PAPER))
     assert len(plan_sweep(paper)) == 180
+
+
+@pytest.mark.parametrize(("name", "count"), [("loss_and_jitter.yaml", 36), ("speed.yaml", 54)])
+def test_sweeps_over_further_axes(name: str, count: int) -> None:
+    """The sweeps over loss and jitter and over speed can be driven, and have the base config among their axes."""
+    sweep = load_config(SweepConfig, shipped("configs") / name)
+    runs = plan_sweep(sweep)
+    assert len(runs) == count
+    base = sweep.model_dump()
+    for key, values in sweep.axes.items():
+        value = base
+        for part in key.split("."):
+            value = value[part]
+        assert value in values
+
+
+@pytest.mark.parametrize("name", sorted(conditions()))
+def test_every_condition_can_be_driven(name: str) -> None:
+    """Virtual time and the relay accept every condition that comes with LAVT."""
+    for time in ("virtual", "real"):
+        assert plan_run(RunConfig(time=time, network=NetworkConfig(condition=name))).asked == condition(name)
 
 
 PAPER = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
@@ -209,6 +233,9 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (RunConfig, "camera: [640, 480]", "'camera'"),
     (RunConfig, "network: {injection: magic}", "'network.injection'"),
     (RunConfig, "network: {inherent: ether}", "'network.inherent'"),
+    (RunConfig, "network: {video: {loss: 1.0}}", "'network.video.loss'"),
+    (RunConfig, "network: {video: {queue_packets: 0}}", "'network.video.queue_packets'"),
+    (RunConfig, "network: {control: {trace: 3}}", "'network.control.trace'"),
     (RunConfig, "safety: {lateral_acceleration_mps2: 6.1}", "'safety.lateral_acceleration_mps2'"),
     (RunConfig, "safety: {picture_age_limit_ms: 2001}", "'safety.picture_age_limit_ms'"),
     (RunConfig, "safety: {picture_age_limit_ms: -1}", "'safety.picture_age_limit_ms'"),
@@ -224,6 +251,7 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (RelayConfig, "video_server: 127.0.0.1:1", "'control_server' is missing"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {constant_ms: -1}}", "'video.constant_ms'"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {jitter_median_ms: .inf}}", "jitter_median_ms"),
+    (RelayConfig, "{video_server: a:1, control_server: a:1, video: {link: {los: 0.1}}}", "did you mean 'loss'"),
 ]
 
 

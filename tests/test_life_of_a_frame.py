@@ -82,9 +82,8 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 5. The packets travel: all of one frame take the same time, and nothing overtakes.
     video = DelayLine(DelayLaw(VIDEO_DELAY_MS))
-    for packet in packets:
-        now_ns = video.push(packet, START_NS, index=0)
-    assert now_ns == START_NS + 75 * NS_PER_MS
+    now_ns = START_NS + 75 * NS_PER_MS
+    assert {video.push(packet, START_NS, index=0) for packet in packets} == {now_ns}
     assert video.pop_due(now_ns - 1) == []
     arrived = video.pop_due(now_ns)
     assert arrived == packets
@@ -128,7 +127,8 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 11. The command travels, as bytes, and is checked before anybody looks at it.
     control = DelayLine(DelayLaw(CONTROL_DELAY_MS))
-    now_ns = control.push(encode(command), now_ns, index=0)
+    assert control.push(encode(command), now_ns, index=0) == now_ns + 20 * NS_PER_MS
+    now_ns += 20 * NS_PER_MS
     (datagram,) = control.pop_due(now_ns)
     received = decode(Command, datagram)
     assert received == command

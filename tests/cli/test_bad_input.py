@@ -74,6 +74,11 @@ def files(directory: Path) -> Mapping[str, bytes | None]:
     }
 
 
+BY_NETEM = [
+    part
+    for change in ("time=real", "network.injection=netem", "network.inherent=loopback")
+    for part in ("--set", change)
+]
 BAD_RUNS = {
     "unknown key": (["--set", "vehicle.rute=a_key"], "did you mean 'route'?"),
     "wrong type": (["--set", "seed=one"], "'seed'"),
@@ -96,10 +101,33 @@ BAD_RUNS = {
     "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "virtual time only"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
-    "more than a delay in virtual time": (["--set", "network.condition=jitter"], "network.injection: netem"),
-    "more than a delay by the relay": (
-        ["--set", "network.condition=loss", "--set", "time=real"],
-        "network.injection: netem and time: real",
+    "no such trace": (["--set", "network.video.trace=nowhere.csv"], "fading.mahimahi, handover.csv"),
+    "no such trace in real time": (
+        ["--set", "network.video.trace=nowhere", "--set", "time=real"],
+        "there is no trace 'nowhere'",
+    ),
+    "a trace that is a directory": (["--set", "network.video.trace=."], "there is no trace '.'"),
+    "a trace that is none": (["--set", f"network.video.trace={DEMO}"], "is no time of a Mahimahi trace"),
+    "a trace and a rate": (
+        ["--set", "network.condition=fading", "--set", "network.video.rate_bps=1000000"],
+        "give one of the two",
+    ),
+    "overtaking nothing": (["--set", "network.video.reorder=0.1"], "reorder needs a delay"),
+    "a trace by netem": (
+        ["--set", "network.condition=handover", *BY_NETEM],
+        "netem cannot replay the trace 'handover.csv': choose network.injection relay",
+    ),
+    "a short queue by netem": (
+        ["--set", "network.condition=rate_short_queue", *BY_NETEM],
+        "not for queue_packets 50",
+    ),
+    "jitter beyond the delay by netem": (
+        ["--set", "network.video.jitter_ms=5", *BY_NETEM],
+        "would need delays below zero",
+    ),
+    "loss that nobody injects": (
+        ["--set", "network.video.loss=0.1", "--set", "time=real", "--set", "network.injection=none"],
+        "network.injection is none",
     ),
     "a profile that netem cannot do": (
         ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],

@@ -179,11 +179,11 @@ def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
     line = loop.runtime.links["control"].line
     push, counted = line.push, iter(range(10**9))
 
-    def flip(item: tuple[bytes, Any], now_ns: int, index: int) -> int:
+    def flip(item: tuple[bytes, Any], now_ns: int, index: int, size_bytes: int = 0) -> int | None:
         payload, peer = item
         if next(counted) == 50:
             payload = payload[:-12] + bytes([payload[-12] ^ 1]) + payload[-11:]
-        return push((payload, peer), now_ns, index)
+        return push((payload, peer), now_ns, index, size_bytes)
 
     line.push = flip  # type: ignore[method-assign]
 

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
+from lavt.build.links import injected
 from lavt.cli.relay import flows
-from lavt.config import DelayConfig, RelayConfig
+from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.streams import stream
+from lavt.transport.link import Link
 from lavt.transport.relay import Relay
 
 ARRIVES_S = 5.0
@@ -265,6 +267,99 @@ def test_held(net: Net) -> None:
     assert net.relay.held_ms() == {
         "video upstream": 0.0, "video downstream": VIDEO_MS + 7.0, "control upstream": None, "control downstream": None,
     }  # fmt: skip
+
+
+def through(net: Net, law: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
+    """Send numbered packets through a net of this law at a period; gives the number of each that came, and when."""
+    client, seen_at = net.connect("video")
+    came, begin_ns = [], net.clock.mono_ns
+    steps_a_period = round(period_ms * 2)
+    for step in range(count * steps_a_period + round(2 * (law.delay_ms + 8 * law.jitter_ms)) + 400):
+        number, rest = divmod(step, steps_a_period)
+        if rest == 0 and number < count:
+            net.server["video"].send(rtp(3000 * number, number), seen_at)
+            net.step()
+        came += [
+            (int.from_bytes(each[2:4], "big"), (net.clock.mono_ns - begin_ns) / NS_PER_MS) for each in client.waiting()
+        ]
+        net.later(0.5)
+    return came
+
+
+LINKS = {
+    "loss": LinkConfig(delay_ms=75.0, loss=0.3),
+    "bursts": LinkConfig(delay_ms=75.0, loss=0.3, loss_burst_packets=4.0),
+    "jitter": LinkConfig(delay_ms=75.0, jitter_ms=10.0),
+    "wander": LinkConfig(delay_ms=75.0, jitter_ms=10.0, jitter_correlation=0.9),
+    "reorder": LinkConfig(delay_ms=75.0, reorder=0.25),
+    "rate": LinkConfig(delay_ms=20.0, rate_bps=40_000, queue_packets=5),
+    "delays": LinkConfig(trace="handover.csv"),
+    "capacity": LinkConfig(delay_ms=20.0, trace="fading.mahimahi"),
+}
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_the_relay_does_what_the_link_says(name: str) -> None:
+    """Through the relay each packet is lost, or leaves, as the model of the link has it, and that is counted."""
+    law = LINKS[name]
+    with closing(Net(video=DelayConfig(link=law))) as net:
+        asked = injected("video", law.delay_ms, Impairment(**law.model_dump(exclude={"delay_ms"})), 1)
+        assert asked is not None
+        model = Link(asked)
+        came = through(net, law, count := 60, 10.0)
+        counts = net.relay.counts()
+        late_ms = net.relay.late_ms()["video downstream"]
+    left = [model.leaves_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
+    # the relay looks every half millisecond here
+    expected = sorted((each, number) for number, each in enumerate(left) if each is not None)
+    assert [number for number, _ in came] == [number for _, number in expected]
+    assert all(0 <= at - each_ns / NS_PER_MS <= 0.5 for (_, at), (each_ns, _) in zip(came, expected, strict=True))
+    assert counts == {"video downstream": model.counts}
+    assert late_ms is not None
+    assert 0 <= late_ms <= 0.5
+
+
+def test_losses_of_control() -> None:
+    """What is lost upstream of the control is the share asked for; the state and the video are left alone."""
+    with closing(Net(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
+        client = net.end()
+        for number in range(200):
+            client.send(bytes([number]), net.at["control"])
+            net.step()
+        came = net.server["control"].waiting()
+        counts = net.relay.counts()["control upstream"]
+    assert counts["packets"] == 200
+    assert len(came) == 200 - counts["lost"]
+    assert 60 <= counts["lost"] <= 140
+    assert came == sorted(came)
+
+
+def test_each_client_has_a_link_of_its_own() -> None:
+    """What is lost for one client does not depend on what others are sent."""
+    with closing(Net(video=DelayConfig(link=LinkConfig(loss=0.3)))) as net:
+        clients = [net.connect("video") for _ in range(2)]
+        for number in range(100):
+            for _, seen_at in clients:
+                net.server["video"].send(rtp(1, number), seen_at)
+                net.step()
+        one, two = (client.waiting() for client, _ in clients)
+    assert one == two
+    assert 50 < len(one) < 90
+
+
+@pytest.mark.parametrize(
+    ("link", "said"),
+    [
+        (LinkConfig(trace="nowhere"), "there is no trace 'nowhere'"),
+        (LinkConfig(reorder=0.1), "reorder needs a delay"),
+        (LinkConfig(rate_bps=1000, trace="fading.mahimahi"), "give one of the two"),
+    ],
+)
+def test_bad_links(link: LinkConfig, said: str) -> None:
+    """A link that contradicts itself, or has no trace, is refused in a sentence."""
+    config = RelayConfig(video_server="127.0.0.1:1", control_server="127.0.0.1:1", control=DelayConfig(link=link))
+    with pytest.raises(UserError, match=said):
+        flows(config)
 
 
 def test_silent_client(net: Net) -> None:

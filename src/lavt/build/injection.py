@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Final, Literal
 
 from lavt.config import ClientInjectionConfig, Condition, Impairment, ServerInjectionConfig
@@ -9,6 +10,7 @@ from lavt.config_file import condition
 from lavt.domain import NetemRequest
 from lavt.errors import BadMessage, UserError
 from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.transport.link import QUEUE_PACKETS
 from lavt.transport.messages import decode
 from lavt.transport.netem import Flow, Law
 
@@ -48,8 +50,24 @@ def netem_flows(
 
 
 def law(delay_ms: float, impairment: Impairment) -> Law:
-    """Give the law of one flow."""
-    return Law(delay_ms=delay_ms, **impairment.model_dump())
+    """Give the law by which netem does it to one flow; raises `UserError` for what no law of netem's says."""
+    if impairment.trace:
+        raise UserError(
+            f"netem cannot replay the trace {impairment.trace!r}: choose network.injection relay or time virtual, or a "
+            "condition without a trace"
+        )
+    if impairment.queue_packets != QUEUE_PACKETS:
+        raise UserError(
+            f"netem has room for {QUEUE_PACKETS} packets, not for queue_packets {impairment.queue_packets}: choose "
+            "network.injection relay or time virtual, or leave queue_packets out"
+        )
+    return plain_law(delay_ms, impairment)
+
+
+def plain_law(delay_ms: float, impairment: Impairment) -> Law:
+    """Give the law of one flow, which says nothing of a trace and of the queue."""
+    said = {each.name for each in fields(Law)}
+    return Law(delay_ms=delay_ms, **impairment.model_dump(include=said - {"delay_ms"}))
 
 
 def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port: int) -> InjectionNode:

@@ -8,12 +8,15 @@ from typing import Annotated
 import typer
 
 from lavt.build.addresses import resolved_address
+from lavt.build.links import injected
 from lavt.cli import console
 from lavt.clock import MachineClock
-from lavt.config import DelayConfig, RelayConfig
+from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.transport.delay import DelayLaw, Lognormal
+from lavt.transport.link import Injected
+from lavt.transport.netem import Law
 from lavt.transport.relay import NONE, Flow, Relay, is_delayed_video, video_index
 
 
@@ -45,24 +48,27 @@ def relay(
         while not told.is_set():
             opened.step()
     if as_json:
-        console.show_json({"held_ms": opened.held_ms()})
+        console.show_json({"held_ms": opened.held_ms(), "late_ms": opened.late_ms(), "counts": opened.counts()})
     opened.close()
 
 
 def flows(config: RelayConfig) -> list[Flow]:
-    """Give the two flows that are relayed; raises `UserError` for addresses that cannot be used."""
+    """Give the two flows that are relayed; raises `UserError` for addresses, links and traces that cannot be used."""
     seed = config.seed
     return [
         Flow(
             "video", _resolved("video_listen", config.video_listen), _resolved("video_server", config.video_server),
             upstream=NONE, downstream=_law(config.video, seed, "video inherent"),
             held_downstream=is_delayed_video, index_downstream=video_index,
+            downstream_injected=_link("video", config.video, seed),
         ),
         Flow(
             "control", _resolved("control_listen", config.control_listen),
             _resolved("control_server", config.control_server),
             upstream=_law(config.control, seed, "control inherent"),
             downstream=_law(config.state, seed, "state inherent"),
+            upstream_injected=_link("control", config.control, seed),
+            downstream_injected=_link("state", config.state, seed),
         ),
     ]  # fmt: skip
 
@@ -70,6 +76,16 @@ def flows(config: RelayConfig) -> list[Flow]:
 def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
     return DelayLaw(config.constant_ms, jitter, seed, name)
+
+
+def _link(name: str, config: DelayConfig, seed: int) -> Injected | None:
+    """Give what `link` asks for, if it asks for anything."""
+    if config.link == LinkConfig():
+        return None
+    impairment = Impairment(**config.link.model_dump(exclude={"delay_ms"}))
+    return injected(name, config.link.delay_ms, impairment, seed) or Injected(
+        Law(delay_ms=config.link.delay_ms), seed, name
+    )
 
 
 def _resolved(key: str, text: str) -> tuple[str, int]:

@@ -60,7 +60,7 @@ def _read_result(path: Path) -> dict[str, Any]:
     missing = [key for key in IDENTITY if key not in result]
     if missing:
         raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
-    for key in ("axes", "injected_ms"):
+    for key in ("axes", "injected_ms", "injected_least_ms"):
         if not isinstance(result.get(key, {}), dict):
             raise WorkError(f"{path} is not the result of a run: {key!r} is no JSON object")
     return result

@@ -12,6 +12,7 @@ from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges
 from lavt.config.injection import Impairment as Impairment
 from lavt.config.injection import InjectionConfig as InjectionConfig
+from lavt.config.injection import LinkConfig as LinkConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
 from lavt.config.section import Section as Section
 from lavt.transport import clock_probe
@@ -303,11 +304,12 @@ class ClientConfig(Section):
 
 
 class DelayConfig(Section):
-    """One direction of a relayed flow: a constant delay and, on top, a lognormal one."""
+    """One direction of a relayed flow: a constant delay, a lognormal one on top, and what a condition does."""
 
     constant_ms: float = Field(0.0, ge=0, le=60_000)
     jitter_median_ms: float = Field(0.0, ge=0, le=60_000)
     jitter_sigma: float = Field(0.0, ge=0, le=3)
+    link: LinkConfig = LinkConfig()
 
 
 class RelayConfig(Section):

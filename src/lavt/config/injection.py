@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
 from lavt.config.section import Section
+from lavt.transport.link import QUEUE_PACKETS
+
+HALF: Final = 0.5
 
 
 class InjectionConfig(Section):
@@ -35,7 +38,7 @@ class ClientInjectionConfig(InjectionConfig):
 
 
 class Impairment(Section):
-    """What the network does to a flow beside a constant delay; see `docs/netem.md`."""
+    """What the network does to a flow beside a constant delay; see `docs/network.md`."""
 
     jitter_ms: float = Field(0.0, ge=0, le=10_000)
     """Standard deviation of the delay; of a uniform law the half width."""
@@ -49,6 +52,16 @@ class Impairment(Section):
     """0: no limit."""
     reorder: float = Field(0.0, ge=0, lt=1)
     """Share of packets that are not delayed, and so overtake."""
+    trace: str = ""
+    """A delay (a name that ends in .csv) or a capacity (Mahimahi) over time: one of `netem/traces`, or a path."""
+    queue_packets: int = Field(QUEUE_PACKETS, ge=1, le=1_000_000)
+    """So many wait for `rate_bps` or a capacity; what comes then is dropped."""
+
+
+class LinkConfig(Impairment):
+    """What is injected into one direction of a relayed flow, as a condition has it."""
+
+    delay_ms: float = Field(0.0, ge=0, le=60_000)
 
 
 class FlowChanges(Section):
@@ -62,6 +75,8 @@ class FlowChanges(Section):
     loss_burst_packets: float | None = Field(None, ge=0, le=10_000)
     rate_bps: int | None = Field(None, ge=0, le=10_000_000_000)
     reorder: float | None = Field(None, ge=0, lt=1)
+    trace: str | None = None
+    queue_packets: int | None = Field(None, ge=1, le=1_000_000)
 
     @property
     def given(self) -> dict[str, Any]:
@@ -84,6 +99,10 @@ class Condition(Section):
     control: Impairment = Impairment()
 
     @property
-    def is_delay_only(self) -> bool:
-        """Whether nothing but a constant delay is injected."""
-        return self.video == self.control == Impairment()
+    def least_ms(self) -> dict[str, float]:
+        """A delay that next to no median of each flow is below: jitter and overtaking make it less than was asked."""
+        flows = {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
+        return {
+            name: 0.0 if each.reorder >= HALF else max(0.0, delay_ms - 4 * each.jitter_ms)
+            for name, (delay_ms, each) in flows.items()
+        }

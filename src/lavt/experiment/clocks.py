@@ -126,9 +126,10 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
 
 
 def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
-    """Give beginning and end of the drive on the client's monotonic clock, which nobody sets; a little wider.
+    """Give beginning and end of the drive on the client's monotonic clock, which nobody sets.
 
-    Pictures are on both monotonic clocks. Where none was read it is all the time in which the client's clocks were
+    Pictures are on both monotonic clocks, and the one that took least to be read says how these differ: others can have
+    waited for seconds in a full queue. Where none was read it is all the time in which the client's clocks were
     sampled, or as much from there on as the drive took.
     """
     frames, pictures = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
@@ -136,7 +137,7 @@ def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int
     read_ns = pictures.ints("read_mono_ns")
     ahead_ns = (read_ns - stamped_ns)[(stamped_ns != MISSING) & (read_ns != MISSING)]
     if len(ahead_ns):
-        return began_ns + int(ahead_ns.min()), ended_ns + int(ahead_ns.max())
+        return began_ns + int(ahead_ns.min()), ended_ns + int(ahead_ns.min())
     sampled_ns = client.table("clock").mono_ns
     first_ns, last_ns = (int(sampled_ns.min()), int(sampled_ns.max())) if len(sampled_ns) else (0, 0)
     return first_ns, max(last_ns, first_ns + ended_ns - began_ns)

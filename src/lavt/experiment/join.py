@@ -15,6 +15,7 @@ from lavt.errors import UserError
 from lavt.experiment.directory import check_directory, make_directory
 from lavt.experiment.latency import frames_within
 from lavt.experiment.metrics import driving_interval
+from lavt.experiment.plan import injected_entry
 from lavt.experiment.record import read_record
 from lavt.experiment.run import CONFIG, NETWORK, compute_result
 from lavt.experiment.table import MISSING
@@ -81,7 +82,7 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
         "driver": run.controller.kind,
         "repetition": 0,
         "seed": run.seed,
-        "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
+        **injected_entry(asked),
     }
 
 

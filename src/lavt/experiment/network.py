@@ -1,11 +1,13 @@
-"""What the network of a run does: the latency that is there anyway, and what is injected, as delay laws."""
+"""What the network of a run does: the latency that is there anyway, and what is injected, as laws."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from lavt.build.links import injected
 from lavt.config import Condition, Costs
 from lavt.transport.delay import DelayLaw, Lognormal
+from lavt.transport.link import Injected
 
 US_PER_MS = 1000.0
 
@@ -39,18 +41,24 @@ INHERENT = {
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """How long things take: video, state (server to client), control (client to server), and what is never held."""
+    """How long things take: video, state (server to client), control (client to server), and what is never held.
+
+    A constant delay that is injected is part of these. Where more is, all that is injected is beside them.
+    """
 
     video: DelayLaw
     control: DelayLaw
     state: DelayLaw
     unheld: DelayLaw
+    video_injected: Injected | None = None
+    control_injected: Injected | None = None
 
 
 def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> Network:
     """Give what must be injected on a loopback to have `condition` on top of the inherent `profile`.
 
-    `profile` "loopback" adds nothing: the machine's own latency is there anyway.
+    `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition
+    that contradicts itself, and for a trace that is missing or wrong.
     """
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0
@@ -59,21 +67,26 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
         jitter = inherent.video_jitter
         control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _hops_ms(costs, SENT_TO_RECEIVED)
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
+    video = injected("video", condition.video_ms, condition.video, seed)
+    control = injected("control", condition.control_ms, condition.control, seed)
     return Network(
-        DelayLaw(max(0.0, video_ms) + condition.video_ms, jitter, seed, "video inherent"),
-        DelayLaw(max(0.0, control_ms) + condition.control_ms),
+        DelayLaw(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
+        DelayLaw(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
         DelayLaw(max(0.0, control_ms) + state_ms),
         DelayLaw(0.0),
+        video,
+        control,
     )
 
 
-def virtual_network(injected: Network, costs: Costs) -> Network:
+def virtual_network(asked: Network, costs: Costs) -> Network:
     """Add what a real loopback has by itself, as measured."""
-    return Network(
-        _later(injected.video, costs.links_us["video"]),
-        _later(injected.control, costs.links_us["control"]),
-        _later(injected.state, costs.links_us["state"]),
-        _later(injected.unheld, costs.links_us["state"]),
+    return replace(
+        asked,
+        video=_later(asked.video, costs.links_us["video"]),
+        control=_later(asked.control, costs.links_us["control"]),
+        state=_later(asked.state, costs.links_us["state"]),
+        unheld=_later(asked.unheld, costs.links_us["state"]),
     )
 
 

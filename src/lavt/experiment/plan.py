@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from lavt.build.entropy import run_seed
-from lavt.build.injection import netem_flows
+from lavt.build.injection import NO_CONDITION, netem_flows
+from lavt.build.links import injected
 from lavt.build.sides import check_names
 from lavt.config import Condition, RunConfig, SweepConfig
 from lavt.config_file import condition, parse_config
@@ -37,7 +38,7 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
     asked = config.network.asked(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     _check_injection(config, asked)
-    nothing = (config.network.inherent, asked.video_ms, asked.control_ms) == ("loopback", 0, 0)
+    nothing = config.network.inherent == "loopback" and asked == NO_CONDITION
     if config.time == "real" and config.network.injection == "none" and not nothing:
         raise UserError(
             "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
@@ -64,15 +65,22 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         "order": config.study.order,
         "repetition": config.repetition,
         "seed": seed,
-        "injected_ms": {"video": asked.video_ms, "control": asked.control_ms},
+        **injected_entry(asked),
         **({"axes": dict(axes)} if axes else {}),
         **({"changes": config.network.changes} if config.network.changes else {}),
     }
     return PlannedRun(name, config, identity, seed, asked)
 
 
+def injected_entry(asked: Condition) -> dict[str, Any]:
+    """Say what is injected and, where jitter or overtaking make that less, how much of it there must be at least."""
+    injected_ms = {"video": asked.video_ms, "control": asked.control_ms}
+    least = {} if asked.least_ms == injected_ms else {"injected_least_ms": asked.least_ms}
+    return {"injected_ms": injected_ms, **least}
+
+
 def _check_injection(config: RunConfig, asked: Condition) -> None:
-    """Raise `UserError` where what injects cannot do what the condition or the profile asks."""
+    """Raise `UserError` where what injects cannot do what the condition or the profile asks, or nobody could."""
     network = config.network
     if config.time == "real" and network.injection == "netem":
         if network.inherent != "loopback":
@@ -81,11 +89,9 @@ def _check_injection(config: RunConfig, asked: Condition) -> None:
                 "network.injection relay"
             )
         check_flows(netem_flows(asked, "both", video_port=1, control_port=2, state_delay=network.state_delay))
-    elif not asked.is_delay_only:
-        raise UserError(
-            f"condition {network.condition} has more than a constant delay, which only the kernel can do so far: "
-            "choose network.injection: netem and time: real"
-        )
+    else:
+        injected("video", asked.video_ms, asked.video, seed=0)
+        injected("control", asked.control_ms, asked.control, seed=0)
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:

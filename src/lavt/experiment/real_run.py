@@ -17,8 +17,9 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
+from lavt.build.links import trace_path
 from lavt.clock import Clock, MachineClock, pause
-from lavt.config import DelayConfig, RelayConfig
+from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.netem_run import NETEM, NetemRun, by_netem
@@ -27,17 +28,20 @@ from lavt.experiment.plan import PlannedRun
 from lavt.experiment.processes import LAVT, Process, Processes
 from lavt.experiment.results import write_json
 from lavt.experiment.sides import client_config, server_config
-from lavt.experiment.validity import injection_reasons
+from lavt.experiment.validity import injection_reasons, lateness_reasons
 from lavt.experiment.virtual_run import read_costs
 from lavt.transport.delay import DelayLaw
 
 RELAY = "relay.json"
 """In a run directory: the delays asked of the relay, and for how long it held what it carried."""
+WAYS = {"video": "video downstream", "control": "control upstream"}
+"""The direction of a relayed flow that is delayed."""
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_S = 40
 """The drive has begun by then, or the run has failed."""
 LONGEST_S = 900
+NOTHING = Impairment()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
@@ -150,17 +154,30 @@ def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: 
         raise WorkError(f"the server failed: {loop.server.said()}")
 
 
-def _asked_ms(planned: PlannedRun) -> dict[str, float]:
-    """Tell the median delay asked of the relay in each direction, that of the inherent profile included."""
+def _asked_ms(planned: PlannedRun) -> dict[str, float | None]:
+    """Tell the median delay asked of the relay in each direction, that of the inherent profile included.
+
+    None where more than a constant delay is asked: its median depends on what else is sent.
+    """
     laws = _injected(planned)
-    return {"video": laws.video.median_ms(), "control": laws.control.median_ms()}
+    return {
+        "video": laws.video.median_ms() if laws.video_injected is None else None,
+        "control": laws.control.median_ms() if laws.control_injected is None else None,
+    }
 
 
 def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
-    """Compare for how long the relay held what it carried with what was asked of it (the content of `relay.json`)."""
-    held = relay.get("held_ms", {})
-    measured = {"video": held.get("video downstream"), "control": held.get("control upstream")}
-    return injection_reasons(relay.get("asked_ms", {"video": 0.0, "control": 0.0}), measured)
+    """Compare for how long the relay held what it carried with what was asked of it (the content of `relay.json`).
+
+    Where more than a constant delay was asked, the times at which packets left are compared with what the law gave.
+    """
+    asked_ms = relay.get("asked_ms", {"video": 0.0, "control": 0.0})
+    constant = {flow: delay_ms for flow, delay_ms in asked_ms.items() if delay_ms is not None}
+    held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
+    return [
+        *injection_reasons(constant, {flow: held.get(WAYS[flow]) for flow in constant}),
+        *lateness_reasons({flow: late.get(WAYS[flow]) for flow in asked_ms if flow not in constant}),
+    ]
 
 
 def _injected(planned: PlannedRun) -> Network:
@@ -183,22 +200,27 @@ def _start_router(
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
-    injected = _injected(planned)
+    injected, asked = _injected(planned), planned.asked
     return RelayConfig(
         video_server=f"127.0.0.1:{video_port}",
         control_server=f"127.0.0.1:{control_port}",
-        video=_delay(injected.video),
-        control=_delay(injected.control),
+        video=_delay(injected.video, asked.video_ms, asked.video),
+        control=_delay(injected.control, asked.control_ms, asked.control),
         state=_delay(injected.state),
         seed=planned.seed,
     )
 
 
-def _delay(law: DelayLaw) -> DelayConfig:
+def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: Impairment = NOTHING) -> DelayConfig:
+    link = LinkConfig()
+    if impairment != NOTHING:
+        asked = impairment.model_dump()
+        asked["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
+        link = LinkConfig(delay_ms=delay_ms, **asked)
     if law.jitter is None:
-        return DelayConfig(constant_ms=law.constant_ms)
+        return DelayConfig(constant_ms=law.constant_ms, link=link)
     return DelayConfig(
-        constant_ms=law.constant_ms, jitter_median_ms=law.jitter.median_ms, jitter_sigma=law.jitter.sigma
+        constant_ms=law.constant_ms, jitter_median_ms=law.jitter.median_ms, jitter_sigma=law.jitter.sigma, link=link
     )
 
 

@@ -33,6 +33,9 @@ IDENTITY = (
 )
 """What says which run it was: known before it is driven. What does not apply is null."""
 
+FURTHER = ("axes", "changes", "injected_ms", "injected_least_ms")
+"""What some runs have beside it."""
+
 MEASURES = (
     "route_length_m",
     "distance_m",
@@ -78,14 +81,14 @@ def run_result(
     """Compute the run's entry of `summary.json` from its records.
 
     `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes), `changes` (of the
-    condition) and `injected_ms` (what was asked of the network); these are kept. `reasons` are those against the run
-    that records do not show.
+    condition), `injected_ms` (what was asked of the network) and `injected_least_ms` (where that is less); these are
+    kept. `reasons` are those against the run that records do not show.
     """
     measured = measure(server, client)
     against = [*invalid_because(server, client, measured), *reasons]
     if not against and "injected_ms" in identity:  # where clocks are wrong, latencies are
-        against = absent_reasons(measured.entry, identity["injected_ms"])
-    further = {key: identity[key] for key in ("axes", "changes", "injected_ms") if key in identity}
+        against = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
+    further = {key: identity[key] for key in FURTHER if key in identity}
     return {
         **{key: identity.get(key) for key in IDENTITY},
         **further,

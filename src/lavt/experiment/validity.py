@@ -75,6 +75,17 @@ def _tick_reasons(server: Record) -> list[str]:
     return reasons
 
 
+def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[str]:
+    """Judge how much later than its law said the relay let go what it held, in the median, per direction."""
+    reasons = []
+    for direction, median_ms in late_ms.items():
+        if median_ms is None:
+            reasons.append(f"nobody measured the injected delay of {direction}")
+        elif abs(median_ms) > INJECTION_LIMIT_MS:
+            reasons.append(f"{direction} left the relay {median_ms:.1f} ms later than was asked, in the median")
+    return reasons
+
+
 def injection_reasons(asked_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]) -> list[str]:
     """Compare the delay asked for with the median that the relay or netem measured, per direction, in milliseconds."""
     reasons = []

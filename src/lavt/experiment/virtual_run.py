@@ -6,7 +6,7 @@ import functools
 import gc
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from lavt.experiment.record import RecordWriter
 from lavt.experiment.sides import client_config, server_config
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.delay import DelayLaw, DelayLine
+from lavt.transport.link import Injected, Link
 from lavt.transport.relay import video_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
@@ -145,20 +146,27 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
 
 
 def virtual_links(network: Network) -> dict[str, VirtualLink]:
-    """Make the links of all channels that cross the network."""
+    """Make the links of all channels that cross the network.
+
+    Commands and requests for the session share a path in reality; here each has a line and streams of its own, so that
+    neither changes what happens to the other.
+    """
 
     def counted(_payload: bytes, count: int) -> int:
         return count
 
-    def link(law: DelayLaw, index: Callable[[bytes, int], int] = counted) -> VirtualLink:
-        return VirtualLink(DelayLine(law), index)
+    def link(
+        law: DelayLaw, injected: Injected | None = None, index: Callable[[bytes, int], int] = counted
+    ) -> VirtualLink:
+        return VirtualLink(DelayLine(law, None if injected is None else Link(injected)), index)
 
+    session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {
-        "rtp": link(network.video, lambda payload, _count: video_index(payload)),
-        "control": link(network.control),
+        "rtp": link(network.video, network.video_injected, lambda payload, _count: video_index(payload)),
+        "control": link(network.control, network.control_injected),
         "state": link(network.state),
         "feedback": link(network.unheld),
-        "session": link(network.control),
+        "session": link(network.control, session),
         "session_reply": link(network.state),
         "probe_request": link(network.unheld),
         "probe_reply": link(network.unheld),

@@ -166,12 +166,16 @@ class VirtualRuntime:
         return False
 
     def close(self) -> None:
-        """Write the counters of nodes and inboxes into the records."""
+        """Write the counters of nodes, inboxes and links that do more than delay into the records."""
         for host in self.hosts.values():
             now = host.clock.at(self.true_ns)
             for name, running in host.running.items():
                 counts: dict[str, Any] = {**running.node.counts, **running.inbox.counts}
                 host.recorder.write("counts", {"node": name, **counts}, now)
+            for channel, link in self.links.items():
+                if link.line.link is not None and CHANNELS[channel].sender in host.running:
+                    did = {f"link_{name}": number for name, number in link.line.link.counts.items()}
+                    host.recorder.write("counts", {"node": f"link {channel}", **did}, now)
 
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
         """Let a message arrive on a side, now; what came over the network is written down."""
@@ -249,8 +253,10 @@ class VirtualRuntime:
         link.count += 1
         if not link.open:
             return
-        due_ns = link.line.push((send.payload, host.peer), self.true_ns, link.index(send.payload, link.count))
-        self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
+        payload: bytes = send.payload
+        due_ns = link.line.push((payload, host.peer), self.true_ns, link.index(payload, link.count), len(payload))
+        if due_ns is not None:
+            self.at(due_ns, self._arrive, link, send.channel, self._other[host.side])
 
     def _arrive(self, link: VirtualLink, channel: str, side: str) -> None:
         for payload, peer in link.line.pop_due(self.true_ns):

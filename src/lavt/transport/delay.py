@@ -1,18 +1,20 @@
 """Delay as a law and as a queue; the relay and the virtual runtime use the same two.
 
 A law says how long the thing with a given index takes; its randomness is a named stream indexed by that number, so that
-runs with one seed stay paired whatever else is drawn. A line keeps order: nothing overtakes.
+runs with one seed stay paired whatever else is drawn. A line keeps order: nothing overtakes, unless a `Link` does more
+than delay.
 """
 
 from __future__ import annotations
 
-from collections import deque
+import heapq
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 from lavt.domain import NS_PER_MS
 from lavt.streams import stream
+from lavt.transport.link import Link
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,18 +51,29 @@ def _lognormal_ms(seed: int, name: str, index: int, law: Lognormal) -> float:
 
 
 class DelayLine:
-    """A queue in which everything waits for its delay and nothing overtakes."""
+    """A queue in which everything waits for its delay and nothing overtakes; with a `Link`, what that says happens."""
 
-    def __init__(self, law: DelayLaw) -> None:
+    def __init__(self, law: DelayLaw, link: Link | None = None) -> None:
         self.law = law
-        self._waiting: deque[tuple[int, Any]] = deque()
+        self.link = link
+        self._waiting: list[tuple[int, int, Any]] = []
+        self._number = 0
+        self._last_ns = 0
 
-    def push(self, item: Any, now_ns: int, index: int) -> int:
-        """Let `item` in at `now_ns` and tell when it is due: after its delay, not before what came in earlier."""
-        due_ns = now_ns + self.law.delay_ns(index)
-        if self._waiting:
-            due_ns = max(due_ns, self._waiting[-1][0])
-        self._waiting.append((due_ns, item))
+    def push(self, item: Any, now_ns: int, index: int, size_bytes: int = 0) -> int | None:
+        """Let `item` in at `now_ns` and tell when it is due; None: it is lost.
+
+        Without a link that is after its delay, and not before what came in earlier.
+        """
+        delay_ns = self.law.delay_ns(index)
+        if self.link is None:
+            due_ns = self._last_ns = max(now_ns + delay_ns, self._last_ns)
+        elif (left_ns := self.link.leaves_ns(now_ns, delay_ns, size_bytes)) is None:
+            return None
+        else:
+            due_ns = left_ns
+        self._number += 1
+        heapq.heappush(self._waiting, (due_ns, self._number, item))
         return due_ns
 
     def next_due_ns(self) -> int | None:
@@ -71,5 +84,5 @@ class DelayLine:
         """Take out all that is due at `now_ns`, in order."""
         due = []
         while self._waiting and self._waiting[0][0] <= now_ns:
-            due.append(self._waiting.popleft()[1])
+            due.append(heapq.heappop(self._waiting)[2])
         return due

@@ -75,24 +75,17 @@ NEVER: Final = (Port("udp", 123, "NTP"), Port("tcp", 22, "ssh"))
 """Never held on any machine; the clock probe's port is added by whoever knows it."""
 
 
-def check_law(name: str, law: Law) -> None:
-    """Raise `UserError` for what netem cannot do."""
+def check_sense(name: str, law: Law) -> None:
+    """Raise `UserError` for what contradicts itself, whoever is to do it."""
     numbers = [getattr(law, each.name) for each in fields(law) if each.name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise UserError(f"{name}: no quantity of netem is below zero or infinite: correct {law}")
+        raise UserError(f"{name}: no quantity of a law is below zero or infinite: correct {law}")
     if max(law.loss, law.reorder, law.jitter_correlation) >= 1:
         raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {law}")
     if law.jitter_distribution not in DISTRIBUTIONS:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
-    if law.jitter_ms > law.delay_ms:
-        raise UserError(
-            f"{name}: a jitter of {law.jitter_ms:g} ms on a delay of {law.delay_ms:g} ms would need delays below zero: "
-            "give a longer delay or less jitter"
-        )
-    if law.reorder and not law.delay_ms:
-        raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
-    if law.jitter_correlation and (law.jitter_distribution != "normal" or not law.jitter_ms):
-        raise UserError(f"{name}: correlated jitter is normal: give jitter_ms, and jitter_distribution normal")
+    if law.jitter_correlation and law.jitter_distribution != "normal":
+        raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
     if law.loss_burst_packets > 1 and gilbert(law)[0] > 1:
         raise UserError(
             f"{name}: a loss of {law.loss:g} in bursts of {law.loss_burst_packets:g} packets leaves no room between "
@@ -100,6 +93,20 @@ def check_law(name: str, law: Law) -> None:
         )
     if law.rate_bps and not 8 <= law.rate_bps <= ORDER_RATE_BPS:
         raise UserError(f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {law.rate_bps}")
+
+
+def check_law(name: str, law: Law) -> None:
+    """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
+    check_sense(name, law)
+    if law.jitter_ms > law.delay_ms:
+        raise UserError(
+            f"{name}: a jitter of {law.jitter_ms:g} ms on a delay of {law.delay_ms:g} ms would need delays below zero: "
+            "give a longer delay or less jitter"
+        )
+    if law.reorder and not law.delay_ms:
+        raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
+    if law.jitter_correlation and not law.jitter_ms:
+        raise UserError(f"{name}: correlated jitter needs jitter_ms: give it, or no correlation")
 
 
 def check_flows(flows: Sequence[Flow], never: Sequence[Port] = ()) -> None:

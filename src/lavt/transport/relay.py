@@ -12,7 +12,7 @@ import selectors
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -21,6 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
 from lavt.transport.delay import DelayLaw, DelayLine
+from lavt.transport.link import Injected, Link
 
 LONGEST_DATAGRAM = 65_535
 BUFFER_BYTES = 4 * 1024 * 1024
@@ -59,6 +60,9 @@ class Flow:
     held_downstream: Callable[[bytes], bool] = lambda _datagram: True
     index_downstream: Callable[[bytes], int] | None = None
     """From a datagram to the index of its delay; None: datagrams are counted."""
+    upstream_injected: Injected | None = None
+    downstream_injected: Injected | None = None
+    """More than a delay; each client has a link of its own."""
 
 
 @dataclass
@@ -70,9 +74,11 @@ class _Way:
     index: Callable[[bytes], int] | None
     held: Callable[[bytes], bool]
     count: int = 0
-    in_heap: bool = False
+    looked_at_ns: int | None = None
     held_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     """For how long the last datagrams were held, from their arrival to their leaving."""
+    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    """How much later they left than they were due."""
 
 
 @dataclass
@@ -93,6 +99,8 @@ class Relay:
         self._selector = selectors.SelectSelector()  # epoll's timeouts are whole milliseconds, rounded up
         self._heap: list[tuple[int, int, _Way]] = []
         self._number = 0
+        self.start_ns = clock.now().mono_ns
+        """When traces begin."""
         self.not_sent = 0
         self._flows: list[_OpenFlow] = []
         try:
@@ -108,12 +116,25 @@ class Relay:
 
     def held_ms(self) -> dict[str, float | None]:
         """Tell for each flow and direction the median of how long its datagrams were held; None where none came."""
-        held = {
-            f"{each.flow.name} {direction}": [held_ns for way in ways for held_ns in way.held_ns]
-            for each in self._flows
-            for direction, ways in each.ways().items()
+        return {name: _median_ms([each for way in ways for each in way.held_ns]) for name, ways in self._ways()}
+
+    def late_ms(self) -> dict[str, float | None]:
+        """Tell the same of how much later they left than they were due."""
+        return {name: _median_ms([each for way in ways for each in way.late_ns]) for name, ways in self._ways()}
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Tell what became of the packets of each flow and direction that are not only delayed; of all its clients."""
+        links = {name: [way.line.link for way in ways if way.line.link is not None] for name, ways in self._ways()}
+        return {
+            name: {key: sum(link.counts[key] for link in each) for key in each[0].counts}
+            for name, each in links.items()
+            if each
         }
-        return {name: median(values) / NS_PER_MS if values else None for name, values in held.items()}
+
+    def _ways(self) -> Iterator[tuple[str, list[_Way]]]:
+        for each in self._flows:
+            for direction, ways in each.ways().items():
+                yield f"{each.flow.name} {direction}", ways
 
     def step(self, longest_pause_s: float = LONGEST_PAUSE_S) -> None:
         """Wait for what comes first, a datagram, one that is due or the longest pause, and deal with it."""
@@ -156,23 +177,29 @@ class Relay:
             return
         way.count += 1
         index = way.count if way.index is None else way.index(datagram)
-        way.line.push((datagram, arrived_ns), arrived_ns, index)
+        way.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
         self._schedule(way)
 
     def _schedule(self, way: _Way) -> None:
+        """Look at a way when its first is due, unless that is asked for already."""
         due_ns = way.line.next_due_ns()
-        if due_ns is not None and not way.in_heap:
+        if due_ns is not None and (way.looked_at_ns is None or due_ns < way.looked_at_ns):
             self._number += 1
-            way.in_heap = True
+            way.looked_at_ns = due_ns
             heapq.heappush(self._heap, (due_ns, self._number, way))
 
     def _release(self) -> None:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
-            _, _, way = heapq.heappop(self._heap)
-            way.in_heap = False
-            for datagram, arrived_ns in way.line.pop_due(now_ns):
-                self._send(way, datagram)
-                way.held_ns.append(self.now_ns() - arrived_ns)
+            look_ns, _, way = heapq.heappop(self._heap)
+            if look_ns != way.looked_at_ns:
+                continue  # one that overtook had it looked at earlier
+            way.looked_at_ns = None
+            while (due_ns := way.line.next_due_ns()) is not None and due_ns <= now_ns:
+                for datagram, arrived_ns in way.line.pop_due(due_ns):
+                    self._send(way, datagram)
+                    sent_ns = self.now_ns()
+                    way.held_ns.append(sent_ns - arrived_ns)
+                    way.late_ns.append(sent_ns - due_ns)
             self._schedule(way)
 
     def _send(self, way: _Way, datagram: bytes) -> None:
@@ -212,11 +239,13 @@ class _OpenFlow:
         self._forget_silent()
         towards_server = _bound_socket(("", 0), self.flow.name)
         flow = self.flow
+        upstream = self._line(flow.upstream, flow.upstream_injected)
+        downstream = self._line(flow.downstream, flow.downstream_injected)
         client = _Client(
             towards_server,
-            _Way(DelayLine(flow.upstream), lambda data: towards_server.sendto(data, flow.server), None, _always),
+            _Way(upstream, lambda data: towards_server.sendto(data, flow.server), None, _always),
             _Way(
-                DelayLine(flow.downstream), lambda data: self._socket.sendto(data, address), flow.index_downstream,
+                downstream, lambda data: self._socket.sendto(data, address), flow.index_downstream,
                 flow.held_downstream,
             ),
             self._relay.now_ns(),
@@ -224,6 +253,9 @@ class _OpenFlow:
         self._clients[address] = client
         self._relay.watch(towards_server, lambda: self._from_server(client))
         return client
+
+    def _line(self, law: DelayLaw, injected: Injected | None) -> DelayLine:
+        return DelayLine(law, None if injected is None else Link(injected, self._relay.start_ns))
 
     def _from_server(self, client: _Client) -> None:
         for datagram, ancillary, address in _drain(client.upstream_socket):
@@ -239,6 +271,10 @@ class _OpenFlow:
         for address, client in list(self._clients.items()):
             if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
                 self._relay.unwatch(self._clients.pop(address).upstream_socket)
+
+
+def _median_ms(values_ns: Sequence[int]) -> float | None:
+    return median(values_ns) / NS_PER_MS if values_ns else None
 
 
 def _always(_datagram: bytes) -> bool:
