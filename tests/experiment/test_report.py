@@ -11,11 +11,12 @@ import pytest
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
-from lavt.experiment import page
+from lavt.experiment import tabular
 from lavt.experiment.breakdown import breakdown, capture_to_stamp_ms
-from lavt.experiment.figures import condition_colours
+from lavt.experiment.figure_style import condition_colours
 from lavt.experiment.record import RecordWriter, read_record
-from lavt.experiment.report import received_pictures, write_report
+from lavt.experiment.report import write_report
+from lavt.experiment.report_drives import received_pictures
 from lavt.experiment.report_tables import hop_table
 from lavt.experiment.results import run_result, write_json
 from lavt.nodes.reports import VideoUnit
@@ -180,10 +181,10 @@ def test_every_condition_has_a_colour_of_its_own() -> None:
 def test_what_is_undefined_is_a_dash() -> None:
     """A number, a share, an interval or a latency that is not known is shown as a dash, and a bound as unknown."""
     nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
-    dashes = [page.number(None), page.percent(None), page.interval(None), page.latency(nothing)]
-    assert dashes == [page.NOTHING] * 4
-    unbounded = page.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
-    assert unbounded.replace(page.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
+    dashes = [tabular.number(None), tabular.percent(None), tabular.interval(None), tabular.latency(nothing)]
+    assert dashes == [tabular.NOTHING] * 4
+    unbounded = tabular.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
+    assert unbounded.replace(tabular.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
 
 
 def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
