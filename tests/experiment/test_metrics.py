@@ -10,8 +10,9 @@ import pytest
 from lavt.experiment.latency import picture_age, rtp_timestamp
 from lavt.experiment.metrics import Measured, measure
 from lavt.experiment.record import read_record
+from lavt.experiment.steering import steering_reversals
 from lavt.experiment.table import Table, table_of
-from lavt.experiment.tracking import cross_track, sampled_by_distance, steering_reversals
+from lavt.experiment.tracking import cross_track, sampled_by_distance
 
 MakeRun = Callable[..., Path]
 MICROSECOND_MS = 1e-3

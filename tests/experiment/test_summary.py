@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from lavt.experiment.statistics import bootstrap_interval, wilson_interval
+from lavt.experiment.statistics import bootstrap_interval
 from lavt.experiment.summary import summarize
 
 SPEED = {"simulated_s": 100.0, "wall_s": 10.0, "jobs": 2}
@@ -24,6 +24,7 @@ def run(**changes: Any) -> dict[str, Any]:
         "ending": "completed",
         "valid": True,
         "p95_m": 1.0,
+        "distance_m": 500.0,
         "collisions": 0,
         "lane_invasions": 2,
         "tau_v_ms": latency,
@@ -32,20 +33,6 @@ def run(**changes: Any) -> dict[str, Any]:
         "injected_ms": {"video": 75.0, "control": 0.0},
         **changes,
     }
-
-
-@pytest.mark.parametrize(
-    ("successes", "low", "high"), [(30, 0.886, 1.0), (15, 0.332, 0.668), (3, 0.035, 0.256), (0, 0.0, 0.114)]
-)
-def test_wilson_interval_of_thirty_runs(successes: int, low: float, high: float) -> None:
-    """The interval of 30, 15, 3 and 0 successes in 30 runs is the published one of Wilson."""
-    assert wilson_interval(successes, 30) == pytest.approx([low, high], abs=6e-4)
-
-
-def test_intervals_of_nothing_are_null() -> None:
-    """No runs give no interval, and one run gives no bootstrap interval."""
-    assert wilson_interval(0, 0) is None
-    assert bootstrap_interval([1.0]) is None
 
 
 def test_bootstrap_is_repeatable_and_about_right() -> None:
@@ -83,7 +70,7 @@ def test_a_condition_without_valid_runs_is_null() -> None:
 def test_real_and_virtual_runs_are_never_mixed() -> None:
     """Runs in real time are under `real`, runs in virtual time under `conditions`, and all under `runs`."""
     summary = summarize([run(), run(time="real", condition="L5")], SPEED)
-    assert set(summary) == {"schema", "speed", "runs", "conditions", "real", "groups"}
+    assert set(summary) == {"schema", "speed", "runs", "conditions", "contrasts", "real", "groups", "paper"}
     assert set(summary["conditions"]) == {"L0"}
     assert set(summary["real"]) == {"L5"}
     assert len(summary["runs"]) == 2
