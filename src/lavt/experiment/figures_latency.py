@@ -70,7 +70,13 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
     panels[1, 0].set_ylim(bottom=0)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
-        diamond: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "white", "color": "0.4", "linestyle": "none"}
+        diamond: dict[str, Any] = {
+            "marker": "D",
+            "markersize": 4,
+            "markerfacecolor": "white",
+            "color": "0.4",
+            "linestyle": "none",
+        }
         handles.append(Line2D([], [], label="error up to the common distance", **diamond))
     if paper:
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))

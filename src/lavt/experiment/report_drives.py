@@ -103,8 +103,8 @@ def single_run_parts(report: Report, sets: DriveSets) -> Parts:
         if driven:
             names = ", ".join(str(drive.result["run"]) for drive in driven)
             caption = (
-                f"Road wheel angle and distance from the lane's centre over time, left positive; {kind} time, one run of "
-                f"each condition: {names}."
+                f"Road wheel angle and distance from the lane's centre over time, left positive; {kind} time, one run "
+                f"of each condition: {names}."
             )
             figure = time_figure(driven, report.colours)
             parts.append(save_figure(report.directory, f"time_{kind}", figure, "steering over time", caption))

@@ -109,9 +109,9 @@ def conditions_parts(report: Report) -> Parts:
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     parts.append(
         page.paragraph(
-            "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop latency, "
-            "frame stamped to its command applied on the server's own clock, needs no offset; the paper has none, so the "
-            "sum of its two medians stands beside it. P95 of the cross-track error three ways: over completed runs, as "
+            "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop "
+            "latency, frame stamped to its command applied on the server's own clock, needs no offset; the paper has "
+            "none, so the sum of its two medians stands beside it. P95 of the cross-track error three ways: over completed runs, as "
             "in the paper, so read it beside the completion; of all runs up to the farthest place that all runs of a "
             "route and repetition reached; and of all runs in order, one that ended early being last: median "
             "(quartiles). docs/metrics.md defines every number.",
@@ -137,8 +137,8 @@ def contrast_parts(report: Report) -> Parts:
             name = f"contrasts_{page.slug(title)}"
             parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], shown)))
     note = (
-        "Completion under two conditions. Ours: McNemar's exact test on pairs with the same route, repetition and seed; "
-        "Holm's correction over the contrasts, which were planned before any run was driven."
+        "Completion under two conditions. Ours: McNemar's exact test on pairs with the same route, repetition and "
+        "seed; Holm's correction over the contrasts, which were planned before any run was driven."
     )
     parts.append(
         page.paragraph(note + (" The paper's: Fisher's exact test on its counts." if shown else ""), note=True)
@@ -187,8 +187,8 @@ def survival_parts(report: Report) -> Parts:
         many = {
             "survival": (
                 survival_figure,
-                "Runs that are still driving after each distance (Kaplan-Meier, 95 %): any ending but completed counts, and "
-                "a completed run leaves at the route's end.",
+                "Runs that are still driving after each distance (Kaplan-Meier, 95 %): any ending but completed counts, "
+                "and a completed run leaves at the route's end.",
             ),
             "incidence": (incidence_figure, "Cumulative incidence: the share of the runs that has ended in each way."),
         }
@@ -210,7 +210,7 @@ def hop_parts(report: Report, captured_ms: Mapping[str, Mapping[str, float | Non
         hops = {name: _with_rest(entry) for name, entry in conditions.items() if entry.get("hops_ms")}
         if not hops:
             continue
-        caption = f"Where the median loop goes, in the order of a frame's life; {kind} time, medians over all frames of all runs."
+        caption = f"Where the median loop goes, in the order of a frame's life; {kind} time, medians over all runs."
         parts.append(save_figure(report.directory, f"hops_{kind}", hops_figure(hops), "latency of each hop", caption))
         parts.append(save_table(report.directory, f"hops_{kind}", hop_table(hops, captured_ms.get(kind))))
     return parts
@@ -254,7 +254,8 @@ def axis_parts(report: Report) -> Parts:
     parts = []
     for title, groups in alike.items():
         figure = axis_figure(groups, along, report.colours)
-        caption = f"What {' and '.join(short(axis) for axis in along)} do{'es' if len(along) == 1 else ''}, virtual time{f', {title}' if title else ''}."
+        what = " and ".join(short(axis) for axis in along)
+        caption = f"Driving over {what}, virtual time{f', {title}' if title else ''}."
         name = "_".join(["axes", *(page.slug(title),)]) if title else "axes"
         parts.append(save_figure(report.directory, name, figure, f"driving over {short(along[0])}", caption))
     return parts

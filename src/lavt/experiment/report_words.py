@@ -75,8 +75,8 @@ def _where_it_falls(known: Sequence[tuple[str, float, float]]) -> list[str]:
         return ["Completion does not fall with latency."] if len(known) > 1 else []
     _, before, after = max(falls, key=lambda fall: fall[0])
     parts = [
-        f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}: between "
-        f"{before[1]:.0f} and {after[1]:.0f} ms in all."
+        f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}: "
+        f"between {before[1]:.0f} and {after[1]:.0f} ms in all."
     ]
     below = [loop_ms for _, loop_ms, rate in known if rate < 0.5]
     if below:
@@ -111,14 +111,14 @@ def _equal_total(
     loops_ms = [conditions[name]["loop_ms"]["p50"] for name in (a, b)]
     if contrast["p_holm"] <= DISTINGUISHED_P:
         return (
-            f"{begin}, and yet they can be told apart (p {contrast['p_holm']:.2g} after Holm; {pairs}): something that sees "
-            "one channel only matters here."
+            f"{begin}, and yet they can be told apart (p {contrast['p_holm']:.2g} after Holm; {pairs}): something that "
+            "sees one channel only matters here."
         )
     if None in loops_ms or abs(loops_ms[0] - loops_ms[1]) > SAME_LOOP_MS:
         return f"{begin}; they cannot be told apart ({pairs}), though their loops differ."
     why = (
-        f"{begin}, and so make the same loop: {loops_ms[0]:.1f} and {loops_ms[1]:.1f} ms were measured. They cannot be told "
-        f"apart ({pairs}), and this is why: with pure delays and paired seeds only what sees one channel alone can "
+        f"{begin}, and so make the same loop: {loops_ms[0]:.1f} and {loops_ms[1]:.1f} ms were measured. They cannot be "
+        f"told apart ({pairs}), and this is why: with pure delays and paired seeds only what sees one channel alone can "
         "make a difference: feedback of the speed, a limit on the picture's age, a controller that knows its delay."
     )
     if theirs and theirs["p"] > DISTINGUISHED_P:
@@ -127,7 +127,7 @@ def _equal_total(
 
 
 def differences(conditions: Conditions, paper: Conditions) -> list[str]:
-    """Say where these results differ from the paper's, and why; nothing where the paper's conditions are not all here."""
+    """Say where these results differ from the paper's, and why; nothing where one of the paper's conditions lacks."""
     if not paper or any(name not in conditions or not conditions[name]["runs"] for name in paper):
         return []
     said = [
@@ -135,8 +135,8 @@ def differences(conditions: Conditions, paper: Conditions) -> list[str]:
         _reference(conditions, paper),
         _rails(conditions, paper),
         _first_step(conditions, paper),
-        "What “completed” means: here a collision, leaving the road, a safe stop or the time limit ends a run. The paper "
-        "counts collisions in conditions that are completed in full, and does not say what ends a run.",
+        "What “completed” means: here a collision, leaving the road, a safe stop or the time limit ends a run. The "
+        "paper counts collisions in conditions that are completed in full, and does not say what ends a run.",
         "Where completion falls is a property of the controller's gains, which the paper does not publish: "
         "`paper_calibrated` was set by hand to fall where the paper's falls, and other gains on the same testbed fall "
         "elsewhere or not at all. So the fall is no proof of anything about latency alone.",
@@ -155,8 +155,8 @@ def _sharper(conditions: Conditions, paper: Conditions) -> str:
         ", ".join(f"{of[name]['completion_rate'] * 100:.0f}" for name in paper) for of in (conditions, paper)
     )
     return (
-        f"Completion falls more sharply here ({ours} %) than in the paper ({theirs} %): the routes are on one kind of road, "
-        "driven at one speed, and share one stability margin. What spreads the paper's runs is not in its text."
+        f"Completion falls more sharply here ({ours} %) than in the paper ({theirs} %): the routes are on one kind of "
+        "road, driven at one speed, and share one stability margin. What spreads the paper's runs is not in its text."
     )
 
 
@@ -166,8 +166,8 @@ def _reference(conditions: Conditions, paper: Conditions) -> str:
     if ours_m is None or theirs_m < 5 * ours_m:
         return ""
     return (
-        f"P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the middle is out of the "
-        f"lane, but the paper counts {paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its "
+        f"P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the "
+        f"middle is out of the lane, but the paper counts {paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its "
         "reference, one of its own drives, is probably not the middle of the lane that was driven. Ours is that middle."
     )
 
@@ -178,8 +178,8 @@ def _rails(conditions: Conditions, paper: Conditions) -> str:
     if not ours or max(ours) >= theirs_m:
         return ""
     return (
-        f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our roads have rails and a "
-        "median barrier, and whoever reaches one has collided and does not complete. They bound the error of a "
+        f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our "
+        "roads have rails and a median barrier, and whoever reaches one has collided and does not complete. They bound the error of a "
         "completed run."
     )
 
@@ -191,6 +191,6 @@ def _first_step(conditions: Conditions, paper: Conditions) -> str:
     its, ours = paper[name], conditions[name]["completion_interval"]
     overlap = " The 95 % intervals overlap." if ours and ours[0] <= its["completion_interval"][1] else ""
     return (
-        f"{name} is completed in full here, and {its['completed']} times of {its['runs']} in the paper, which does not say "
-        f"what stopped the others; nothing that is modelled here would.{overlap}"
+        f"{name} is completed in full here, and {its['completed']} times of {its['runs']} in the paper, which does "
+        f"not say what stopped the others; nothing that is modelled here would.{overlap}"
     )
