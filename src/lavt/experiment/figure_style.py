@@ -66,7 +66,7 @@ def beside(kind: str) -> dict[str, Any]:
 
 def legend_below(figure: Figure, handles: list[Any]) -> None:
     """Put a legend below all panels."""
-    columns = min(len(handles), 6)
+    columns = min(len(handles), 8)
     figure.legend(handles=handles, fontsize=SMALL, ncols=columns, loc="outside lower center", frameon=False)
 
 

@@ -105,7 +105,8 @@ def cross_track_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) 
         if ends:
             axes.plot(*np.transpose(ends), **CROSS)
         tidy(axes, "", "", f"Route {route}")
-    figure.supxlabel("distance along the route (m)", fontsize=10)
+    for axes in panels[-1]:
+        axes.set_xlabel("distance along the route (m)")
     figure.supylabel("left of lane centre (m)", fontsize=10)
     _legend(figure, routes, colours)
     return figure
@@ -127,7 +128,7 @@ def time_figure(drives: Sequence[Drive], colours: Colours) -> Figure:
         row[0].plot(time_s, np.degrees(drive.truth.floats("steering_rad")), color=colour, linewidth=1)
         row[1].plot(time_s, drive.truth.floats("cross_track_m"), color=colour, linewidth=1)
         tidy(row[0], "", "steering (°)", f"{drive.condition}, {drive.result['ending']}")
-        tidy(row[1], "", "left of centre (m)")
+        tidy(row[1], "", "left (m)")
     for axes in rows[-1]:
         axes.set_xlabel("time (s)")
     return figure

@@ -20,6 +20,8 @@ ENDING_DASHES: Mapping[str, Any] = {
     "timeout": (0, (6, 1.5, 1, 1.5)),
 }
 
+MOST_BANDS = 2
+
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
     ("cross-track error, p95 (m)", "p95_m", 1.0),
@@ -34,21 +36,25 @@ def routes_with_survival(conditions: Conditions) -> list[str]:
 
 
 def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
-    """How many runs are still driving after each distance: a panel a route, a line a condition, with 95 % intervals."""
+    """How many runs are still driving after each distance: a panel a route, a line a condition.
+
+    Of a few conditions the 95 % intervals are drawn, too; those of more would hide each other.
+    """
     routes = routes_with_survival(conditions)
     figure, panels = _panels(len(routes))
     for axes, route in zip(panels, routes, strict=True):
-        for name, entry in conditions.items():
+        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
             curve = (entry.get("survival") or {}).get(route)
-            if curve and curve["distance_m"]:
-                distance_m = curve["distance_m"]
-                low, high = (np.array(curve[side], np.float64) * 100 for side in ("low", "high"))
-                axes.fill_between(distance_m, low, high, step="post", color=colours[name], alpha=0.1, linewidth=0)
-                surviving = np.array(curve["surviving"], np.float64) * 100
-                axes.step(distance_m, surviving, where="post", color=colours[name], linewidth=1.4)
+            if not curve or not curve["distance_m"]:
+                continue
+            distance_m = curve["distance_m"]
+            low, high, surviving = (np.array(curve[key], np.float64) * 100 for key in ("low", "high", "surviving"))
+            if len(conditions) <= MOST_BANDS:
+                axes.fill_between(distance_m, low, high, step="post", color=colours[name], alpha=0.15, linewidth=0)
+            axes.step(distance_m, surviving, where="post", color=colours[name], linewidth=width)
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
-    figure.supxlabel("distance driven (m)", fontsize=10)
+    _label_lowest(panels, "distance driven (m)")
     figure.supylabel("runs still driving (%)", fontsize=10)
     legend_below(figure, list(condition_handles(conditions, colours)))
     return figure
@@ -60,20 +66,30 @@ def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
     figure, panels = _panels(len(routes))
     shown: dict[str, Any] = {}
     for axes, route in zip(panels, routes, strict=True):
-        for name, entry in conditions.items():
+        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
             curve = (entry.get("survival") or {}).get(route) or {"incidence": {}}
             for ending, incidence in (curve.get("incidence") or {}).items():
                 if any(incidence):
                     shown[ending] = ENDING_DASHES.get(ending, "solid")
-                    style = {"color": colours[name], "linestyle": shown[ending], "linewidth": 1.4}
+                    style = {"color": colours[name], "linestyle": shown[ending], "linewidth": width}
                     axes.step(curve["distance_m"], np.array(incidence, np.float64) * 100, where="post", **style)
         tidy(axes, "", "", f"Route {route}")
         axes.set_ylim(-4, 104)
-    figure.supxlabel("distance driven (m)", fontsize=10)
+    _label_lowest(panels, "distance driven (m)")
     figure.supylabel("runs that ended so (%)", fontsize=10)
     endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in shown.items()]
     legend_below(figure, [*condition_handles(conditions, colours), *endings])
     return figure
+
+
+def _widths(many: int) -> list[float]:
+    """Give the width of each line: those drawn first are wider, so that one under another can be seen."""
+    return [float(width) for width in np.linspace(4.0 if many > 1 else 1.2, 1.2, many)]
+
+
+def _label_lowest(panels: Sequence[Axes], label: str) -> None:
+    for axes in panels[-3:]:
+        axes.set_xlabel(label)
 
 
 def _panels(many: int) -> tuple[Figure, list[Axes]]:

@@ -84,7 +84,7 @@ def write_report(
         ("How far the runs came", survival_parts(report)),
         ("Boundaries", boundary_parts(boundaries, report_dir)),
         ("Where the latency comes from", hop_parts(report, captured_ms(sets))),
-        ("Groups compared", group_parts(report)),
+        ("Presets and settings compared", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
         ("Route by route", route_parts(report)),
         ("Single runs", single_run_parts(report, sets)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -18,7 +19,7 @@ LARGEST_SHOWN_BYTES = 400_000
 SHORT_ROWS = 30
 """A longer table may be cut by the end of a printed page, with its head on each."""
 
-_SVG = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
+_SVG: Any = {"svg.hashsalt": "lavt", "svg.fonttype": "none", "path.simplify_threshold": 0.3}
 """The same figure gives the same bytes; text stays text."""
 
 _NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
@@ -39,9 +40,17 @@ def save_table(report_dir: Path, name: str, table: TableData) -> str:
     """Write a table as tables/`name`.csv and .tex, and return the HTML that shows it; nothing for one without rows."""
     if not table.rows:
         return ""
+    return page.table(html_of(table), _write_table(report_dir, name, table), is_short=len(table.rows) <= SHORT_ROWS)
+
+
+def link_table(report_dir: Path, name: str, table: TableData) -> str:
+    """Write a table that is too long for the page, and return the HTML that links to it."""
+    return page.table("", _write_table(report_dir, name, table), is_short=True) if table.rows else ""
+
+
+def _write_table(report_dir: Path, name: str, table: TableData) -> list[str]:
     directory = report_dir / "tables"
     directory.mkdir(exist_ok=True)
     (directory / f"{name}.csv").write_text(csv_of(table), encoding="utf-8")
     (directory / f"{name}.tex").write_text(tex_of(table), encoding="utf-8")
-    names = [f"tables/{name}.csv", f"tables/{name}.tex"]
-    return page.table(html_of(table), names, is_short=len(table.rows) <= SHORT_ROWS)
+    return [f"tables/{name}.csv", f"tables/{name}.tex"]

@@ -35,6 +35,9 @@ Parts = list[str]
 ONE_CLOCK = (None, SAME_KERNEL)
 """Sources of Delta that have no figure: unknown, as the run's own row says, or the same clock."""
 
+LEAST_REST_MS = 0.5
+"""Less than this is not told as a hop of its own."""
+
 COMPARED_GROUPS = 6
 """More groups than these are not drawn as lines of one figure; their table and the figure of their axes are there."""
 
@@ -67,13 +70,15 @@ class Report:
         """Give the paper's conditions that are among these."""
         return paper_beside(conditions, (self.summary.get("paper") or {}).get("conditions") or {})
 
-    def name_of(self, kind: str) -> str:
-        """Say what the conditions of a kind of time are of: how it was driven and, of several groups, which."""
-        runs = [run for run in self.summary["runs"] if run["time"] == kind]
-        driven = how_it_was_driven(runs)
+    def how(self, kind: str) -> str:
+        """Say how the runs of a kind of time were driven, and which of several groups its conditions are of."""
+        driven = how_it_was_driven([run for run in self.summary["runs"] if run["time"] == kind])
+        return f"{driven[0].upper()}{driven[1:]}{self.which(kind)}"
+
+    def which(self, kind: str = "virtual") -> str:
+        """Say in brackets which group the conditions in virtual time are of."""
         names = differing(self.groups) or ["preset"]
-        told = title_of(self.base[0], names) if kind == "virtual" and self.base else ""
-        return f"{driven[0].upper()}{driven[1:]}{f' ({told})' if told else ''}"
+        return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
 def head(report: Report, left_out: Sequence[str]) -> Parts:
@@ -85,7 +90,7 @@ def head(report: Report, left_out: Sequence[str]) -> Parts:
     if "virtual" in report.kinds:
         compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
         said = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
-        said = said or {report.name_of("virtual").partition(":")[0]: report.kinds["virtual"]}
+        said = said or {f"Virtual time{report.which()}": report.kinds["virtual"]}
     if "real" in report.kinds:
         said["Real time"] = report.kinds["real"]
     sentences = [headline(name, conditions) for name, conditions in said.items()]
@@ -101,20 +106,22 @@ def head(report: Report, left_out: Sequence[str]) -> Parts:
 
 def conditions_parts(report: Report) -> Parts:
     """Show the paper's table, with the paper's own figures where the conditions are the same; a kind of time each."""
+    if not report.kinds:
+        return [page.paragraph("No run has the values of the sweep's own config: see the groups.", note=True)]
     parts = []
     for kind, conditions in report.kinds.items():
         paper = report.paper(conditions)
-        parts.append(page.heading(report.name_of(kind)))
+        parts.append(page.heading(report.how(kind)))
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     parts.append(
         page.paragraph(
             "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop "
             "latency, frame stamped to its command applied on the server's own clock, needs no offset; the paper has "
-            "none, so the sum of its two medians stands beside it. P95 of the cross-track error three ways: over completed runs, as "
-            "in the paper, so read it beside the completion; of all runs up to the farthest place that all runs of a "
-            "route and repetition reached; and of all runs in order, one that ended early being last: median "
-            "(quartiles). docs/metrics.md defines every number.",
+            "none, so the sum of its two medians stands beside it. P95 of the cross-track error three ways: over "
+            "completed runs, as in the paper, so read it beside the completion; of all runs up to the farthest place "
+            "that all runs of a route and repetition reached; and of all runs in order, one that ended early being "
+            "last: median (quartiles). docs/metrics.md defines every number.",
             note=True,
         )
     )
@@ -156,11 +163,19 @@ def difference_parts(report: Report) -> Parts:
     return [page.bullets(said)] if said else []
 
 
+def of_base(report: Report) -> str:
+    """Say below a figure of both kinds of time which group the virtual runs in it are of, where there are several."""
+    return f" Virtual runs:{report.which()}." if len(report.groups) > 1 and report.base else ""
+
+
 def injected_parts(report: Report) -> Parts:
     """Show injected against measured latency."""
+    if not report.kinds:
+        return []
     caption = (
         "Injected against measured one-way latency: median, p5 to p95. The grey line is the latency of the least "
         "delayed condition, plus the injected delay; below, how far each median is from it, with the bound."
+        f"{of_base(report)}"
     )
     figure = injected_figure(report.kinds, report.colours)
     return [save_figure(report.directory, "injected", figure, "injected against measured latency", caption)]
@@ -168,11 +183,14 @@ def injected_parts(report: Report) -> Parts:
 
 def degradation_parts(report: Report) -> Parts:
     """Show what latency does to driving."""
+    if not any(entry["loop_ms"]["p50"] is not None for of in report.kinds.values() for entry in of.values()):
+        return []
     paper = report.paper(report.summary["conditions"])
     caption = (
         "Completion and error over the median loop latency (frame stamped to its command applied) and over the mean "
         "age of the picture that the vehicle acts on; 95 % intervals."
         + (" The paper's points stand at the sum of its two one-way medians." if paper else "")
+        + of_base(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
@@ -187,8 +205,8 @@ def survival_parts(report: Report) -> Parts:
         many = {
             "survival": (
                 survival_figure,
-                "Runs that are still driving after each distance (Kaplan-Meier, 95 %): any ending but completed counts, "
-                "and a completed run leaves at the route's end.",
+                "Runs that are still driving after each distance (Kaplan-Meier): any ending but completed "
+                "counts, and a completed run leaves at the route's end. The table has the 95 % intervals.",
             ),
             "incidence": (incidence_figure, "Cumulative incidence: the share of the runs that has ended in each way."),
         }
@@ -210,7 +228,10 @@ def hop_parts(report: Report, captured_ms: Mapping[str, Mapping[str, float | Non
         hops = {name: _with_rest(entry) for name, entry in conditions.items() if entry.get("hops_ms")}
         if not hops:
             continue
-        caption = f"Where the median loop goes, in the order of a frame's life; {kind} time, medians over all runs."
+        caption = (
+            f"Where the median loop goes, in the order of a frame's life: medians over all runs. {kind.capitalize()} "
+            f"time{report.which(kind)}."
+        )
         parts.append(save_figure(report.directory, f"hops_{kind}", hops_figure(hops), "latency of each hop", caption))
         parts.append(save_table(report.directory, f"hops_{kind}", hop_table(hops, captured_ms.get(kind))))
     return parts
@@ -219,11 +240,9 @@ def hop_parts(report: Report, captured_ms: Mapping[str, Mapping[str, float | Non
 def _with_rest(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Add to the hops of a condition what is left of its median loop: every wait for a next tick."""
     hops, loop_ms = list(entry["hops_ms"]), entry["loop_ms"]["p50"]
-    rest_ms = None if loop_ms is None else loop_ms - sum(hop["p50"] or 0.0 for hop in hops)
-    return [
-        *hops,
-        {"node": "rest", "hop": "waiting, and what medians do not add up to", "p50": max(rest_ms or 0.0, 0.0)},
-    ]
+    rest_ms = 0.0 if loop_ms is None else loop_ms - sum(hop["p50"] or 0.0 for hop in hops)
+    rest = {"node": "rest", "hop": "waiting, and what medians do not add up to", "p50": rest_ms}
+    return [*hops, rest] if rest_ms > LEAST_REST_MS else hops
 
 
 def group_parts(report: Report) -> Parts:
@@ -271,7 +290,7 @@ def route_parts(report: Report) -> Parts:
     parts = []
     for kind, conditions in report.kinds.items():
         if any(entry.get("routes") for entry in conditions.values()):
-            parts.append(page.heading(report.name_of(kind).partition(":")[0]))
+            parts.append(page.heading(f"{kind.capitalize()} time{report.which(kind)}"))
             parts.append(save_table(report.directory, f"routes_{kind}_overview", route_overview(conditions)))
             parts.append(save_table(report.directory, f"routes_{kind}", route_table(conditions)))
     return parts

@@ -16,6 +16,7 @@ from lavt.experiment.tabular import (
     latencies,
     number,
     numbers,
+    percent,
     probabilities,
     share_intervals,
     shares,
@@ -274,6 +275,26 @@ def _completed(entry: Mapping[str, Any] | None) -> str | None:
     return None if entry is None else f"{entry['completed']} of {entry['runs']}"
 
 
+def survival_table(conditions: Conditions) -> TableData:
+    """Where each step of each survival curve is: long, for computing and drawing with something else."""
+    columns = [
+        words("route"),
+        words("condition"),
+        numbers("distance m", 1),
+        shares("still driving"),
+        share_intervals("95 % interval"),
+        words("ended so far"),
+    ]
+    rows = []
+    for name, entry in conditions.items():
+        for route, curve in (entry.get("survival") or {}).items():
+            steps = zip(curve["distance_m"], curve["surviving"], curve["low"], curve["high"], strict=True)
+            for index, (distance_m, surviving, low, high) in enumerate(steps):
+                ended = ", ".join(f"{ending} {percent(each[index])}" for ending, each in curve["incidence"].items())
+                rows.append([route, name, distance_m, surviving, (low, high), ended or None])
+    return TableData(columns, rows)
+
+
 def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     """One row a run: what it was, how it ended, and whether it may count."""
     columns = [
@@ -353,5 +374,10 @@ def hop_table(
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
     """Show what a run's record says of versions and machine."""
     columns = [words("of"), words("what", is_long=True), words("value", is_long=True)]
-    rows = [[name, key, value] for name in sorted(annotations) for key, value in annotations[name].items()]
+    rows = [
+        [name, key, value]
+        for name in sorted(annotations)
+        for key, value in annotations[name].items()
+        if key != "condition"  # which is told of each run, and no matter of the machine
+    ]
     return TableData(columns, rows or [["not recorded", None, None]])

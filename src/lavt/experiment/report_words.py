@@ -26,7 +26,7 @@ def _known(conditions: Conditions) -> list[tuple[str, float, float]]:
         for name, entry in conditions.items()
         if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
     ]
-    return sorted(known, key=lambda each: each[1])
+    return sorted(known, key=lambda each: (round(each[1]), each[0]))
 
 
 def what_was_driven(runs: Sequence[Mapping[str, Any]], left_out: int = 0) -> str:
@@ -107,7 +107,7 @@ def _equal_total(
     ]
     begin = f"{ways[0]} and {ways[1]} inject the same total, {sum(injected[0].values()):.0f} ms"
     only = contrast["only_a"] + contrast["only_b"]
-    pairs = f"{contrast['pairs'] - only} of {contrast['pairs']} pairs ended alike"
+    pairs = f"{contrast['pairs'] - only} of {contrast['pairs']} pairs are alike in their completion"
     loops_ms = [conditions[name]["loop_ms"]["p50"] for name in (a, b)]
     if contrast["p_holm"] <= DISTINGUISHED_P:
         return (
@@ -118,8 +118,8 @@ def _equal_total(
         return f"{begin}; they cannot be told apart ({pairs}), though their loops differ."
     why = (
         f"{begin}, and so make the same loop: {loops_ms[0]:.1f} and {loops_ms[1]:.1f} ms were measured. They cannot be "
-        f"told apart ({pairs}), and this is why: with pure delays and paired seeds only what sees one channel alone can "
-        "make a difference: feedback of the speed, a limit on the picture's age, a controller that knows its delay."
+        f"told apart ({pairs}), and this is why: with pure delays and paired seeds only what sees one channel alone "
+        "can make a difference: feedback of the speed, a limit on the picture's age, a controller that knows its delay."
     )
     if theirs and theirs["p"] > DISTINGUISHED_P:
         why += f" Nor can the paper's counts be told apart (Fisher, p {theirs['p']:.2f})."
@@ -167,8 +167,9 @@ def _reference(conditions: Conditions, paper: Conditions) -> str:
         return ""
     return (
         f"P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the "
-        f"middle is out of the lane, but the paper counts {paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its "
-        "reference, one of its own drives, is probably not the middle of the lane that was driven. Ours is that middle."
+        "middle is out of the lane, but the paper counts "
+        f"{paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its reference, one of its own "
+        "drives, is probably not the middle of the lane that was driven. Ours is that middle."
     )
 
 
@@ -179,8 +180,8 @@ def _rails(conditions: Conditions, paper: Conditions) -> str:
         return ""
     return (
         f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our "
-        "roads have rails and a median barrier, and whoever reaches one has collided and does not complete. They bound the error of a "
-        "completed run."
+        "roads have rails and a median barrier, and whoever reaches one has collided and does not complete. They bound "
+        "the error of a completed run."
     )
 
 
