@@ -76,7 +76,7 @@ def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: Offs
     known = pictures.flags("readable") & np.all([each != MISSING for each in (left_ns, stamped_ns, *needed)], axis=0)
     read = pictures.where(known)
     on_client_ns = read.ints("read_mono_ns") - read.ints("packet_mono_ns")
-    return video_latency_ns(read, offset) - (left_ns - stamped_ns)[known] - on_client_ns
+    return np.asarray(video_latency_ns(read, offset) - (left_ns - stamped_ns)[known] - on_client_ns, np.int64)
 
 
 def _receiver_ns(timelines: Table, pictures: Table, frames: Table) -> IntArray:
@@ -90,7 +90,7 @@ def _receiver_ns(timelines: Table, pictures: Table, frames: Table) -> IntArray:
     packet_ns = look_up(pictures.ints("stamp_ns"), pictures.ints("packet_mono_ns"), stamps)
     unit_ns = look_up(units.ints("stamp_ns"), units.ints("arrived_mono_ns"), stamps)
     known = (packet_ns != MISSING) & (unit_ns != MISSING)
-    return unit_ns[known] - packet_ns[known]
+    return np.asarray(unit_ns[known] - packet_ns[known], np.int64)
 
 
 def _timed(timelines: Table, node: str, frames: Table, *, from_stamp: bool = False) -> Durations:

@@ -162,7 +162,7 @@ def ages_at_actuation_ns(frames: Table, admissions: Table, began_ns: int, ended_
     applied_ns = commands.ints("applied_mono_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     known = (stamped_ns != MISSING) & (applied_ns >= began_ns) & (applied_ns <= ended_ns)
-    return applied_ns[known] - stamped_ns[known]
+    return np.asarray(applied_ns[known] - stamped_ns[known], np.int64)
 
 
 def _percentile_of_ramps(low: FloatArray, high: FloatArray, share: float) -> float:
