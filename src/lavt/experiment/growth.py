@@ -16,7 +16,7 @@ from lavt.experiment.watched_drive import WatchedDrive, watch_drive
 from lavt.vehicle.sim.simulator import start_of
 
 ROAD = "straight"
-LONGEST_S = 60.0
+LONGEST_S = 45.0
 """Of a drive, from before the arming on."""
 CALM_START = (0.02, math.radians(0.2))
 """At most so far aside and turned a car begins: a swing that is small has room to grow."""
@@ -35,9 +35,7 @@ def half_swings(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArr
     """
     crossings = np.flatnonzero(np.diff(np.signbit(cross_track_m))) + 1
     size_m = np.abs(cross_track_m)
-    largest = [
-        begin + int(np.argmax(size_m[begin:end])) for begin, end in zip(crossings, crossings[1:], strict=False)
-    ]
+    largest = [begin + int(np.argmax(size_m[begin:end])) for begin, end in itertools.pairwise(crossings)]
     return time_s[largest], size_m[largest]
 
 

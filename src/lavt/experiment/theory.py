@@ -70,7 +70,7 @@ class LateralLoop:
 
 
 def configured_loop(config: RunConfig) -> LateralLoop | None:
-    """Give the loop as a run has it: preset and what replaces its settings, frame rate, car with its lags and dead time.
+    """Give the loop as a run has it: preset and what replaces its settings, frame rate, car with lags and dead time.
 
     The lookahead is the one driven at the preset's speed, within the controller's bounds. None where the car or the
     controller is not of LAVT: nothing is known of them. Raises `UserError` for a preset or car that does not exist.

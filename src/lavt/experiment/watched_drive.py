@@ -76,7 +76,7 @@ def watched(payloads: dict[str, list[Any]]) -> WatchedDrive:
     obeyed = [each for each in obeyed if began_ns <= each.applied_mono_ns <= ended_ns]
 
     def since_began_s(times_ns: list[int]) -> FloatArray:
-        return (np.array(times_ns, np.int64) - began_ns) / NS_PER_S
+        return np.asarray((np.array(times_ns, np.int64) - began_ns) / NS_PER_S, np.float64)
 
     events = [event for event in payloads["event"] if began_ns <= event.mono_ns <= ended_ns]
     return WatchedDrive(
