@@ -27,6 +27,7 @@ from lavt.experiment.boundary import (
 from lavt.experiment.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import groups_of, summary
+from lavt.experiment.tabular import html_of
 from lavt.experiment.watched_drive import watched
 from lavt.nodes.reports import Admission, Event, FrameWritten
 
@@ -219,7 +220,7 @@ def test_figure_and_table_show_every_group() -> None:
     assert {text.get_text() for text in axes.texts} == {
         "\N{RIGHTWARDS ARROW}6", "\N{RIGHTWARDS ARROW}1", "\N{LEFTWARDS ARROW}1", "\N{RIGHTWARDS ARROW}7",
     }  # fmt: skip
-    html = boundary_table(found)
+    html = html_of(boundary_table(found))
     assert html.count("<tr>") == 4
     assert "360\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}410" in html
 

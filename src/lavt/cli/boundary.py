@@ -58,7 +58,7 @@ def lines(found: dict[str, Any]) -> list[str]:
     """Say for each route and preset the medians with their intervals."""
     from lavt.experiment.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
     from lavt.experiment.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.page import number  # noqa: PLC0415 (with them)
+    from lavt.experiment.tabular import number  # noqa: PLC0415 (with them)
 
     table = [("route", "preset", "seeds", "theory", *CRITERIA)]
     for group in found["groups"]:

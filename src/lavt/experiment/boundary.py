@@ -26,6 +26,7 @@ from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import CRITERIA, groups_of
 from lavt.experiment.growth import straight_growth
 from lavt.experiment.plan import PlannedRun, plan_run
+from lavt.experiment.report_files import save_figure
 from lavt.experiment.results import write_json
 from lavt.experiment.theory import configured_loop, critical_delay_s
 from lavt.experiment.watched_drive import WatchedDrive, watch_drive
@@ -219,7 +220,5 @@ def boundary(
         rows.writeheader()
         rows.writerows(runs)
     if runs:
-        figure = boundary_figure(entry)
-        for ending in ("svg", "png"):
-            figure.savefig(out / f"boundary.{ending}", dpi=150, bbox_inches="tight")
+        save_figure(out, "boundary", boundary_figure(entry), "boundaries", "")
     return entry, done

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.experiment.boundary_summary import CRITERIA
-from lavt.experiment.page import NOTHING, UNBROKEN, number, table
+from lavt.experiment.tabular import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, words
 
 LOOKS = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion": ("#d55e00", "D")}
 """Colour (Okabe and Ito) and marker of each criterion: told apart without colour, too."""
@@ -88,29 +88,27 @@ def _criterion(
             axes.annotate(f"{sign}{count}", (place_ms, height), color=colour, fontsize=8, ha=side, va="center")
 
 
-def boundary_table(boundary: Boundary) -> str:
-    """Make the table of all groups as HTML: median, its interval, and quartiles of each criterion."""
-    headers = ["route", "preset", "seeds", "onset by theory (ms)"]
-    headers += [
-        f"{LABELS[name]}: {part}"
-        for name in CRITERIA
-        for part in ("median (ms)", "95 % interval", "quartiles", "in range")
-    ]
-    headers.append("not monotone")
-    return table(headers, [_row(group) for group in boundary["groups"]])
+def boundary_table(boundary: Boundary) -> TableData:
+    """Make the table of all groups: median, its interval, and quartiles of each criterion, in ms."""
+    columns = [words("route"), words("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
+    for name in CRITERIA:
+        columns += [
+            numbers(f"{LABELS[name]}: median (ms)", 0),
+            Column(f"{LABELS[name]}: 95 % interval", span, LOW_HIGH),
+            Column(f"{LABELS[name]}: quartiles", span, LOW_HIGH),
+            numbers(f"{LABELS[name]}: in range", 0),
+        ]
+    columns.append(numbers("not monotone", 0))
+    return TableData(columns, [_row(group) for group in boundary["groups"]])
 
 
-def _row(group: Mapping[str, Any]) -> list[str]:
-    cells = [group["route"] or ALL_ROUTES, group["preset"], str(group["n"]), number(group["theory_ms"], 0)]
+def _row(group: Mapping[str, Any]) -> list[Any]:
+    cells = [group["route"] or ALL_ROUTES, group["preset"], group["n"], group["theory_ms"]]
     for name in CRITERIA:
         of_criterion = group[f"{name}_ms"]
-        cells += [
-            number(of_criterion["p50"], 0),
-            span(of_criterion["interval"]),
-            span([of_criterion["p25"], of_criterion["p75"]]),
-            str(of_criterion["n"]),
-        ]
-    return [*cells, str(sum(group["not_monotone"].values()))]
+        quartiles = [of_criterion["p25"], of_criterion["p75"]]
+        cells += [of_criterion["p50"], of_criterion["interval"], quartiles, of_criterion["n"]]
+    return [*cells, sum(group["not_monotone"].values())]
 
 
 def span(ends: Sequence[float | None] | None) -> str:

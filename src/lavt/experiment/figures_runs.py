@@ -21,11 +21,12 @@ ENDING_DASHES: Mapping[str, Any] = {
 }
 
 MOST_BANDS = 2
+MOST_TICKS = 8
 
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
-    ("cross-track error, p95 (m)", "p95_m", 1.0),
-    ("picture age, mean (ms)", "picture_age_ms", 1.0),
+    ("error, p95 (m)", "p95_m", 1.0),
+    ("picture age (ms)", "picture_age_ms", 1.0),
 )
 """What is drawn over an axis of a sweep: label, key of a condition, unit."""
 
@@ -124,7 +125,7 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
         title = f"{short(second[0])} {value}" if second else ""
         for row, (label, key, unit) in enumerate(rows):
             axes = panels[row, column]
-            for name in names:
+            for name, width in zip(names, _widths(len(names)), strict=True):
                 points = sorted(
                     (places[str(group.get(along))], _value(group["conditions"][name], key) * unit)
                     for group in members
@@ -132,10 +133,10 @@ def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Col
                 )
                 if points:
                     x, y = zip(*points, strict=True)
-                    axes.plot(x, y, marker="o", markersize=4, linewidth=1.2, color=colours[name])
+                    axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
             tidy(axes, "", label if column == 0 else "", title if row == 0 else "")
-            if labels:
-                axes.set_xticks(range(len(labels)), labels)
+            if labels or len(places) <= MOST_TICKS:
+                axes.set_xticks(list(places.values()), labels or list(places))
     for axes in panels[:, 0]:
         axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     panels[0, 0].set_ylim(-5, 105)

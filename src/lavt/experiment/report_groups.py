@@ -26,6 +26,17 @@ def axes_of(groups: Sequence[Group]) -> list[str]:
     return [name for name in names if len({str(group.get(name)) for group in groups}) > 1]
 
 
+def in_order(groups: Sequence[Group]) -> list[Group]:
+    """Put groups into the order of their axes' values; what axes do not tell apart keeps its order."""
+    axes = axes_of(groups)
+    return sorted(groups, key=lambda group: [_place(group.get(name)) for name in axes])
+
+
+def _place(value: Any) -> tuple[bool, float, str]:
+    is_number = isinstance(value, int | float)
+    return not is_number, float(value) if is_number else 0.0, str(value)
+
+
 def differing(groups: Sequence[Group]) -> list[str]:
     """Name the fewest settings that tell the groups apart: further axes first, then what those do not tell."""
     told: list[str] = []

@@ -13,7 +13,7 @@ from lavt.experiment.figure_style import Colours, Conditions
 from lavt.experiment.figures_latency import degradation_figure, hops_figure, injected_figure, presets_figure
 from lavt.experiment.figures_runs import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report_files import save_figure, save_table
-from lavt.experiment.report_groups import Group, axes_of, differing, short, title_of
+from lavt.experiment.report_groups import Group, axes_of, differing, in_order, short, title_of
 from lavt.experiment.report_tables import (
     clock_table,
     contrast_table,
@@ -53,7 +53,7 @@ class Report:
     @property
     def groups(self) -> Sequence[Group]:
         """Give the groups of the runs in virtual time."""
-        return self.summary.get("groups") or []
+        return in_order(self.summary.get("groups") or [])
 
     @property
     def kinds(self) -> dict[str, Conditions]:
@@ -86,11 +86,10 @@ def head(report: Report, left_out: Sequence[str]) -> Parts:
     runs, speed = report.summary["runs"], report.summary["speed"]
     parts = [page.paragraph(what_was_driven(runs))]
     names = differing(report.groups)
-    said = {}
-    if "virtual" in report.kinds:
-        compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
-        said = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
-        said = said or {f"Virtual time{report.which()}": report.kinds["virtual"]}
+    compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
+    said = {f"Virtual time, {title_of(group, names)}": group["conditions"] for group in compared}
+    if "virtual" in report.kinds and not said:
+        said = {f"Virtual time{report.which()}": report.kinds["virtual"]}
     if "real" in report.kinds:
         said["Real time"] = report.kinds["real"]
     sentences = [headline(name, conditions) for name, conditions in said.items()]
