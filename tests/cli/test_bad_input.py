@@ -264,6 +264,18 @@ def test_report_of_what_is_no_result(case: str, run: Run, tmp_path: Path) -> Non
     assert files(tmp_path) == before
 
 
+def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
+    """A boundary alone is refused, and a boundary.json that is none ends the report with 1 and one sentence."""
+    (tmp_path / "found").mkdir()
+    (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
+    assert "found holds a boundary and no runs" in run("report", "found").refused()
+    (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
+    ended = run("report", "found")
+    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
+    assert "is not what `lavt boundary` writes" in ended.err
+    assert list(files(tmp_path / "found")) == ["boundary.json"]
+
+
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     """A sweep that was never begun cannot be resumed."""
     assert "nothing to resume in never" in run("sweep", SWEEP, "--resume", "--out", "never").refused()

@@ -76,10 +76,11 @@ def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
 
 
 def _read_boundary(directory: Path) -> dict[str, Any]:
-    boundary = read_json(directory / BOUNDARY)
-    if not isinstance(boundary, dict) or not isinstance(boundary.get("groups"), list):
-        raise WorkError(f"{directory / BOUNDARY} is not what `lavt boundary` writes: it has no list of groups")
-    return boundary
+    boundary: Any = read_json(directory / BOUNDARY)
+    lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
+    if not lists or not all(isinstance(each, list) and each for each in lists):
+        raise WorkError(f"{directory / BOUNDARY} is not what `lavt boundary` writes: it holds no runs and groups")
+    return dict(boundary)
 
 
 def _runs(directory: Path) -> list[Path]:

@@ -24,6 +24,9 @@ COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#cc79a7")
 """Told apart with any colour vision, on white and on black (Okabe and Ito, "Color universal design")."""
 
 WIDTH_IN = 8.0
+LINE_CHARACTERS = 115
+"""So many small ones fit below a figure, with a handle for 5 of them."""
+
 SMALL = 8
 """Points of a small text."""
 
@@ -66,7 +69,8 @@ def beside(kind: str) -> dict[str, Any]:
 
 def legend_below(figure: Figure, handles: list[Any]) -> None:
     """Put a legend below all panels."""
-    columns = min(len(handles), 8)
+    lengths = [len(str(handle.get_label())) + 5 for handle in handles]
+    columns = len(handles) if sum(lengths) <= LINE_CHARACTERS else max(1, LINE_CHARACTERS // max(lengths))
     figure.legend(handles=handles, fontsize=SMALL, ncols=columns, loc="outside lower center", frameon=False)
 
 

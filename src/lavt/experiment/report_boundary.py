@@ -18,8 +18,8 @@ def boundary_parts(boundaries: Sequence[Mapping[str, Any]], report_dir: Path) ->
         name = "boundary" if len(boundaries) == 1 else f"boundary_{number}"
         caption = (
             "Total delay, middle of exposure to the wheel's command, at which a swing begins to grow, the car first "
-            "leaves its lane, and the route is no longer completed: ticks are seeds, a large point and its bar the median and "
-            "its 95 % interval, the dashed line the onset by theory."
+            "leaves its lane, and the route is no longer completed: ticks are seeds, a large point and its bar the "
+            "median and its 95 % interval, the dashed line the onset by theory."
         )
         figure = boundary_figure(boundary)
         parts.append(save_figure(report_dir, name, figure, "boundaries beside theory", caption))

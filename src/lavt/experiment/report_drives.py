@@ -7,8 +7,7 @@ from pathlib import Path
 
 from lavt.domain import Picture
 from lavt.experiment import page
-from lavt.experiment.breakdown import capture_to_stamp_ms
-from lavt.experiment.drives import Drive, one_of_each_condition, read_drive
+from lavt.experiment.drives import Drive, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.figures_drives import cross_track_figure, frames_figure, time_figure, trajectories_figure
 from lavt.experiment.record import read_record
 from lavt.experiment.report_files import save_figure, save_table
@@ -130,7 +129,7 @@ def captured_ms(sets: DriveSets) -> dict[str, dict[str, float | None]]:
     """Tell by kind of time and condition how long a frame's stamp came after its exposure, of one run each."""
     return {
         kind: {
-            drive.condition: capture_to_stamp_ms(read_record(drive.directory / "server.mcap", ("frame", "event")))
+            drive.condition: capture_to_stamp_ms(drive.directory / "server.mcap")
             for drive in one_of_each_condition(drives)
         }
         for kind, drives in _first_sets(sets).items()

@@ -35,6 +35,17 @@ Parts = list[str]
 ONE_CLOCK = (None, SAME_KERNEL)
 """Sources of Delta that have no figure: unknown, as the run's own row says, or the same clock."""
 
+LATENCIES_NOTE = (
+    "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop latency, frame "
+    "stamped to its command applied on the server's own clock, needs no offset."
+)
+PAPER_NOTE = " The paper measured no loop: the sum of its two medians stands beside ours."
+ERRORS_NOTE = (
+    " P95 of the cross-track error three ways: over completed runs, so read it beside the completion; of all runs up to "
+    "the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended early "
+    "being last: median (quartiles). docs/metrics.md defines every number."
+)
+
 LEAST_REST_MS = 0.5
 """Less than this is not told as a hop of its own."""
 
@@ -113,18 +124,8 @@ def conditions_parts(report: Report) -> Parts:
         parts.append(page.heading(report.how(kind)))
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
-    parts.append(
-        page.paragraph(
-            "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop "
-            "latency, frame stamped to its command applied on the server's own clock, needs no offset; the paper has "
-            "none, so the sum of its two medians stands beside it. P95 of the cross-track error three ways: over "
-            "completed runs, as in the paper, so read it beside the completion; of all runs up to the farthest place "
-            "that all runs of a route and repetition reached; and of all runs in order, one that ended early being "
-            "last: median (quartiles). docs/metrics.md defines every number.",
-            note=True,
-        )
-    )
-    return parts
+    beside = any(report.paper(conditions) for conditions in report.kinds.values())
+    return [*parts, page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ERRORS_NOTE, note=True)]
 
 
 def contrast_parts(report: Report) -> Parts:
