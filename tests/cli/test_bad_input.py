@@ -272,7 +272,7 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
     ended = run("report", "found")
     assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
-    assert "is not what `lavt boundary` writes" in ended.err
+    assert "boundary.json holds no boundary" in ended.err
     assert list(files(tmp_path / "found")) == ["boundary.json"]
 
 

@@ -79,7 +79,7 @@ def _read_boundary(directory: Path) -> dict[str, Any]:
     boundary: Any = read_json(directory / BOUNDARY)
     lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
     if not lists or not all(isinstance(each, list) and each for each in lists):
-        raise WorkError(f"{directory / BOUNDARY} is not what `lavt boundary` writes: it holds no runs and groups")
+        raise WorkError(f"{directory / BOUNDARY} holds no boundary: it lacks runs or groups")
     return dict(boundary)
 
 

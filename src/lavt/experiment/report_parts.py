@@ -36,14 +36,14 @@ ONE_CLOCK = (None, SAME_KERNEL)
 """Sources of Delta that have no figure: unknown, as the run's own row says, or the same clock."""
 
 LATENCIES_NOTE = (
-    "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop latency, frame "
-    "stamped to its command applied on the server's own clock, needs no offset."
+    "Latencies in ms: median (p5 to p95) ± how wrong the offset between the clocks can make them. The loop latency, "
+    "frame stamped to its command applied on the server's own clock, needs no offset."
 )
 PAPER_NOTE = " The paper measured no loop: the sum of its two medians stands beside ours."
 ERRORS_NOTE = (
-    " P95 of the cross-track error three ways: over completed runs, so read it beside the completion; of all runs up to "
-    "the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended early "
-    "being last: median (quartiles). docs/metrics.md defines every number."
+    " P95 of the cross-track error three ways: over completed runs, so read it beside the completion; of all runs up "
+    "to the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended "
+    "early being last: median (quartiles). docs/metrics.md defines every number."
 )
 
 LEAST_REST_MS = 0.5
