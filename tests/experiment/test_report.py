@@ -33,7 +33,7 @@ def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual",
         "time": time,
         "injection": "model" if time == "virtual" else "relay",
         "inherent": "paper_wifi5",
-        "route": "A <key>",
+        "route": "A <key> $^$",
         "condition": condition,
         "controller": "lane",
         "preset": "designed",
@@ -152,7 +152,7 @@ def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
 
 
 def test_names_cannot_become_html(sweep: Path) -> None:
-    """Whatever a route or a run is called, the page shows it as text."""
+    """Whatever a route or a run is called, the page and the figures show it as text."""
     html = page_of(sweep)
     assert "A &lt;key&gt;" in html
     assert "<key>" not in html

@@ -66,7 +66,7 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
                 error.plot(x, y, marker="D", markersize=4, markerfacecolor="white", color=colours[name], zorder=4)
         tidy(completion, "", "runs completed (%)" if column == 0 else "")
         tidy(error, label, "cross-track error, p95 (m)" if column == 0 else "")
-    panels[0, 0].set_ylim(-9, 106)  # names of points at the bottom stand below them
+    panels[0, 0].set_ylim(-9, 112)  # names of points stand below them, or above
     panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):

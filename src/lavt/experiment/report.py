@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+
 from lavt.errors import WorkError
 from lavt.experiment import page
 from lavt.experiment.drives import Drive
 from lavt.experiment.figure_style import condition_colours
 from lavt.experiment.report_boundary import boundary_parts
 from lavt.experiment.report_drives import (
+    DriveSets,
     captured_ms,
     drawn_runs,
     machine_parts,
@@ -73,7 +76,21 @@ def write_report(
     report_dir.mkdir(parents=True, exist_ok=True)
     report = Report(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
-    sections: list[page.Section] = [
+    with mpl.rc_context({"text.parse_math": False}):  # a name with a dollar is no formula
+        sections = _sections(report, sets, left_out, boundaries)
+    index = report_dir / "index.html"
+    index.write_text(page.page(TITLE, sections), encoding="utf-8")
+    return index
+
+
+def _sections(
+    report: Report,
+    sets: DriveSets,
+    left_out: Sequence[str],
+    boundaries: Sequence[Mapping[str, Any]],
+) -> list[page.Section]:
+    """Make the page's sections in their order."""
+    return [
         ("Summary", head(report, left_out)),
         ("Conditions", conditions_parts(report)),
         ("Planned contrasts", contrast_parts(report)),
@@ -82,7 +99,7 @@ def write_report(
         ("Injected and measured latency", injected_parts(report)),
         ("Driving against latency", degradation_parts(report)),
         ("How far the runs came", survival_parts(report)),
-        ("Boundaries", boundary_parts(boundaries, report_dir)),
+        ("Boundaries", boundary_parts(boundaries, report.directory)),
         ("Where the latency comes from", hop_parts(report, captured_ms(sets))),
         ("Presets and settings compared", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
@@ -92,9 +109,6 @@ def write_report(
         ("Clocks of two machines", clock_parts(report)),
         ("Versions and machine", machine_parts(report, sets)),
     ]
-    index = report_dir / "index.html"
-    index.write_text(page.page(TITLE, sections), encoding="utf-8")
-    return index
 
 
 def _read_results(
