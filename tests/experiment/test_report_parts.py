@@ -237,6 +237,7 @@ def test_boundaries_stand_in_the_report(make_run: MakeRun, tmp_path: Path) -> No
     html = write_report(tmp_path, boundaries=[boundary]).read_text()
     assert '<h2 id="boundaries">' in html
     assert 'href="boundary.svg"' in html
+    assert "designed, route a: by theory a swing grows from 204 ms of total delay" in html
     assert "210" in (tmp_path / "report" / "tables" / "boundary.csv").read_text()
     assert '<h2 id="boundaries">' not in write_report(tmp_path).read_text()
     assert json.loads((tmp_path / "summary.json").read_text())["schema"] == 1

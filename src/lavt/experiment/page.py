@@ -42,7 +42,7 @@ td.long { white-space: normal; text-align: left; min-width: 14rem; }
 @media print { body { max-width: none; font-size: 10pt; padding: 0; } nav, .files { display: none; }
                h2, h3 { break-after: avoid; } figure, tr { break-inside: avoid; } thead { display: table-header-group; }
                .scroll { overflow: visible; } .short { break-inside: avoid; }
-               table { font-size: 7pt; } th, td { padding: .12rem .25rem; } }
+               table { font-size: 7pt; } th, td { padding: .12rem .25rem; } td.long { min-width: 0; } }
 </style>
 </head>
 <body>

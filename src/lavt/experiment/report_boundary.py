@@ -9,6 +9,7 @@ from typing import Any
 from lavt.experiment import page
 from lavt.experiment.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.report_files import save_figure, save_table
+from lavt.experiment.report_words import boundary_sentences
 
 
 def boundary_parts(boundaries: Sequence[Mapping[str, Any]], report_dir: Path) -> list[str]:
@@ -21,6 +22,7 @@ def boundary_parts(boundaries: Sequence[Mapping[str, Any]], report_dir: Path) ->
             "leaves its lane, and the route is no longer completed: ticks are seeds, a large point and its bar the "
             "median and its 95 % interval, the dashed line the onset by theory."
         )
+        parts.append(page.bullets(boundary_sentences(boundary["groups"])))
         figure = boundary_figure(boundary)
         parts.append(save_figure(report_dir, name, figure, "boundaries beside theory", caption))
         parts.append(save_table(report_dir, name, boundary_table(boundary)))

@@ -195,3 +195,23 @@ def _first_step(conditions: Conditions, paper: Conditions) -> str:
         f"{name} is completed in full here, and {its['completed']} times of {its['runs']} in the paper, which does "
         f"not say what stopped the others; nothing that is modelled here would.{overlap}"
     )
+
+
+def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say of each preset of a boundary, over all routes where there are several, what theory and the drives say."""
+    over_all = [group for group in groups if group["route"] is None] or groups
+    return [
+        f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from "
+        f"{_delay(group['theory_ms'])} of total delay; in the median of {group['n']} seeds it does so from "
+        f"{_delay(group['onset_ms']['p50'])}, the car first leaves its lane at {_delay(group['departure_ms']['p50'])}, "
+        f"and the route is no longer completed at {_delay(group['completion_ms']['p50'])}."
+        for group in over_all
+    ]
+
+
+def _where(route: str | None) -> str:
+    return "all routes" if route is None else f"route {route}"
+
+
+def _delay(delay_ms: float | None) -> str:
+    return "none that was searched" if delay_ms is None else f"{delay_ms:.0f} ms"
