@@ -70,7 +70,7 @@ def trajectory_parts(report: Report, sets: DriveSets) -> Parts:
         suffix = "_".join(word for word in (kind, page.slug(title)) if word)
         for name, shown in _figures_of(list(routes)):
             figure = trajectories_figure({route: routes[route] for route in shown}, report.colours)
-            caption = f"Every run from above, {which}, north not up. A red cross is where a run ended before its goal."
+            caption = f"Every run from above, turned to fit; {which}. A red cross is where one ended before its goal."
             alternative = f"trajectories on the routes {', '.join(shown)}"
             parts.append(save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption))
         if routes:

@@ -24,6 +24,8 @@ from lavt.experiment.tabular import (
     words,
 )
 
+FLOWS = ("video", "control")
+
 ENDED_EARLY = "ended early"
 """What a quantile is over all runs where it lies among those that were not completed."""
 
@@ -50,7 +52,7 @@ def paper_beside(conditions: Conditions, paper: Conditions) -> Conditions:
     return {
         name: paper[name]
         for name, entry in conditions.items()
-        if name in paper and entry["injected_ms"] == paper[name]["injected_ms"]
+        if name in paper and all(entry["injected_ms"][flow] == paper[name]["injected_ms"][flow] for flow in FLOWS)
     }
 
 

@@ -90,12 +90,16 @@ def equal_totals(contrasts: Sequence[Contrast], conditions: Conditions, paper: S
     said = []
     for contrast in contrasts:
         a, b = contrast["a"], contrast["b"]
-        injected = [conditions[name]["injected_ms"] for name in (a, b) if name in conditions]
+        injected = [_injected(conditions[name]) for name in (a, b) if name in conditions]
         if len(injected) < 2 or any(None in each.values() for each in injected) or contrast["p_holm"] is None:
             continue
         if len({sum(each.values()) for each in injected}) == 1:
             said.append(_equal_total(contrast, conditions, injected, theirs.get((a, b))))
     return said
+
+
+def _injected(entry: Mapping[str, Any]) -> dict[str, float]:
+    return {flow: entry["injected_ms"][flow] for flow in ("video", "control")}
 
 
 def _equal_total(
@@ -161,7 +165,7 @@ def _sharper(conditions: Conditions, paper: Conditions) -> str:
 
 
 def _reference(conditions: Conditions, paper: Conditions) -> str:
-    name = min(paper, key=lambda each: sum(paper[each]["injected_ms"].values()))
+    name = min(paper, key=lambda each: sum(_injected(paper[each]).values()))
     ours_m, theirs_m = conditions[name]["p95_m"], paper[name]["p95_m"]
     if ours_m is None or theirs_m < 5 * ours_m:
         return ""
@@ -186,7 +190,7 @@ def _rails(conditions: Conditions, paper: Conditions) -> str:
 
 
 def _first_step(conditions: Conditions, paper: Conditions) -> str:
-    name = next((each for each in paper if sum(paper[each]["injected_ms"].values()) > 0), None)
+    name = next((each for each in paper if sum(_injected(paper[each]).values()) > 0), None)
     if name is None or not (paper[name]["completion_rate"] < 1.0 == conditions[name]["completion_rate"]):
         return ""
     its, ours = paper[name], conditions[name]["completion_interval"]
