@@ -301,6 +301,26 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     assert "a_key paper_calibrated 01 failed: the vehicle was never armed" in told
 
 
+def test_what_was_found_before_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Ctrl-C after the second seed: nothing more is begun, and what was found is in boundary.json and the pictures."""
+    monkeypatch.setattr(boundary_module, "search", lambda asked: run_entry("a_key", int(asked.name[-2:])))
+    monkeypatch.setattr(boundary_module, "ProcessPoolExecutor", _InThisProcess)
+    told: list[str] = []
+
+    def tell(line: str) -> None:
+        told.append(line)
+        if len(told) == 2:
+            raise KeyboardInterrupt
+
+    asked = small("repetitions=5")
+    found, done = boundary_module.boundary(asked, plan_boundary(asked), tmp_path, jobs=1, tell=tell)
+    assert (len(told), done) == (2, False)
+    assert len(found["runs"]) == 2
+    assert json.loads((tmp_path / "boundary.json").read_text()) == found
+    assert (tmp_path / "boundary.csv").read_text().count("\n") == 3
+    assert (tmp_path / "boundary.png").stat().st_size > 1000
+
+
 class _InThisProcess:
     """An executor that needs no processes."""
 
@@ -311,6 +331,9 @@ class _InThisProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
+        pass
+
+    def shutdown(self, **_: Any) -> None:
         pass
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
