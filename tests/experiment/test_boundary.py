@@ -27,6 +27,7 @@ from lavt.experiment.boundary import (
 from lavt.experiment.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import groups_of, summary
+from lavt.experiment.growth import growth_per_s
 from lavt.experiment.watched_drive import watched
 from lavt.nodes.reports import Admission, Event, FrameWritten
 
@@ -162,6 +163,15 @@ def test_a_drive_departs_with_the_first_invasion_and_fails_with_any_other_ending
         assert (departed(drive), not_completed(drive)) == expected
 
 
+def test_a_vehicle_that_is_never_armed_has_not_completed() -> None:
+    """Without a beginning there are no rows and no delay; nothing was left, nothing completed, and nothing swings."""
+    never = payloads()
+    never["event"] = [Event(600 * MS, "lane_invasion", "")]
+    drive = watched(never)
+    assert (len(drive.time_s), math.isnan(drive.total_delay_ms)) == (0, True)
+    assert (departed(drive), not_completed(drive), growth_per_s(drive)) == (False, True, -math.inf)
+
+
 # What many say together.
 
 
@@ -282,6 +292,15 @@ def test_one_real_search() -> None:
     assert high_ms - low_ms == pytest.approx(400, abs=1)
     assert found["below"] == []
     json.dumps(found)
+
+
+def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
+    """With a limit of 100 ms the vehicle is not even armed beyond it: completion ends there, and no swing has begun."""
+    (asked,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
+    found = search(asked)
+    assert (found["onset_ms"], found["departure_ms"]) == (None, None)
+    assert found["completion_ms"] == pytest.approx(100, abs=60)
+    assert found["searched_ms"][1] == pytest.approx(412, abs=2)
 
 
 def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
