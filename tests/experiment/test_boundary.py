@@ -27,6 +27,7 @@ from lavt.experiment.boundary import (
 from lavt.experiment.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import groups_of, summary
+from lavt.experiment.growth import growth_per_s
 from lavt.experiment.tabular import html_of
 from lavt.experiment.watched_drive import watched
 from lavt.nodes.reports import Admission, Event, FrameWritten
@@ -163,6 +164,15 @@ def test_a_drive_departs_with_the_first_invasion_and_fails_with_any_other_ending
         assert (departed(drive), not_completed(drive)) == expected
 
 
+def test_a_vehicle_that_is_never_armed_has_not_completed() -> None:
+    """Without a beginning there are no rows and no delay; nothing was left, nothing completed, and nothing swings."""
+    never = payloads()
+    never["event"] = [Event(600 * MS, "lane_invasion", "")]
+    drive = watched(never)
+    assert (len(drive.time_s), math.isnan(drive.total_delay_ms)) == (0, True)
+    assert (departed(drive), not_completed(drive), growth_per_s(drive)) == (False, True, -math.inf)
+
+
 # What many say together.
 
 
@@ -285,6 +295,15 @@ def test_one_real_search() -> None:
     json.dumps(found)
 
 
+def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
+    """With a limit of 100 ms the vehicle is not even armed beyond it: completion ends there, and no swing has begun."""
+    (asked,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
+    found = search(asked)
+    assert (found["onset_ms"], found["departure_ms"]) == (None, None)
+    assert found["completion_ms"] == pytest.approx(100, abs=60)
+    assert found["searched_ms"][1] == pytest.approx(412, abs=2)
+
+
 def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told with its reason, and what the others found is there."""
 
@@ -302,6 +321,26 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     assert "a_key paper_calibrated 01 failed: the vehicle was never armed" in told
 
 
+def test_what_was_found_before_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Ctrl-C after the second seed: nothing more is begun, and what was found is in boundary.json and the pictures."""
+    monkeypatch.setattr(boundary_module, "search", lambda asked: run_entry("a_key", int(asked.name[-2:])))
+    monkeypatch.setattr(boundary_module, "ProcessPoolExecutor", _InThisProcess)
+    told: list[str] = []
+
+    def tell(line: str) -> None:
+        told.append(line)
+        if len(told) == 2:
+            raise KeyboardInterrupt
+
+    asked = small("repetitions=5")
+    found, done = boundary_module.boundary(asked, plan_boundary(asked), tmp_path, jobs=1, tell=tell)
+    assert (len(told), done) == (2, False)
+    assert len(found["runs"]) == 2
+    assert json.loads((tmp_path / "boundary.json").read_text()) == found
+    assert (tmp_path / "boundary.csv").read_text().count("\n") == 3
+    assert (tmp_path / "boundary.png").stat().st_size > 1000
+
+
 class _InThisProcess:
     """An executor that needs no processes."""
 
@@ -312,6 +351,9 @@ class _InThisProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
+        pass
+
+    def shutdown(self, **_: Any) -> None:
         pass
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:

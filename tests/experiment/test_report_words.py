@@ -95,3 +95,8 @@ def test_differences_are_told_where_they_are_true() -> None:
     assert "completed in full here" not in told
     assert "gains" in told
     assert differences(conditions(1.0, 1.0), PAPER["conditions"]) == []
+    steady = " ".join(differences(conditions(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), PAPER["conditions"]))
+    assert "sharply" not in steady
+    assert "rails" not in steady
+    few = {name: {**each, "runs": 5} for name, each in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
+    assert differences(few, PAPER["conditions"]) == []

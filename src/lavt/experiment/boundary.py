@@ -20,7 +20,7 @@ import numpy as np
 from lavt.config import BoundaryConfig, RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS
-from lavt.errors import LavtError, UserError
+from lavt.errors import LavtError, UserError, WorkError
 from lavt.experiment.boundary_figure import boundary_figure
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import CRITERIA, groups_of
@@ -112,21 +112,28 @@ def search(asked: Search) -> dict[str, Any]:
     added_ms: list[float] = []
 
     def growth(delay_ms: float) -> float:
-        total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
-        added_ms.append(total_ms - delay_ms)
+        measured_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
+        added_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
     grid_ms = _grid(asked.longest_delay_ms, asked.grid_ms)
     first_total_ms = drive(0.0).total_delay_ms
+    if math.isnan(first_total_ms):
+        raise WorkError("nothing is driven even without added delay: look at lavt run with the same config")
+
+    def total_ms(delay_ms: float) -> float:
+        measured_ms = drive(delay_ms).total_delay_ms
+        return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # pictures too old to be obeyed
+
     theory_ms = theoretical_ms(config)
     guess_ms = asked.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
     onset = zero_bracket(functools.cache(growth), guess_ms, asked.longest_delay_ms, asked.within_ms)
     departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), grid_ms, asked.within_ms)
     completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, asked.within_ms)
     found: dict[str, tuple[Bracket, Totals]] = {
-        "onset": (onset, lambda delay_ms: delay_ms + float(np.median(added_ms))),
-        "departure": (departure, lambda delay_ms: drive(delay_ms).total_delay_ms),
-        "completion": (completion, lambda delay_ms: drive(delay_ms).total_delay_ms),
+        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
+        "departure": (departure, total_ms),
+        "completion": (completion, total_ms),
     }
     return {
         "route": identity["route"],
@@ -135,7 +142,7 @@ def search(asked: Search) -> dict[str, Any]:
         "repetition": identity["repetition"],
         **{f"{name}_ms": _middle_ms(bracket, total) for name, (bracket, total) in found.items()},
         "theory_ms": theory_ms,
-        "searched_ms": [first_total_ms, drive(grid_ms[-1]).total_delay_ms],
+        "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
         "below": [name for name, (bracket, _) in found.items() if bracket.low_ms is None],
         "not_monotone": [name for name, (bracket, _) in found.items() if not bracket.monotone],
     }

@@ -27,7 +27,8 @@ def boundary_figure(boundary: Boundary) -> Figure:
     """Total delays at which each criterion is first met: a panel a preset, a row a route, a small point a seed.
 
     The large point is the median, the bar its 95 % interval, the dashed line what theory says of the onset. What was
-    not met within the searched range is counted at the right edge, what was met already at its beginning at the left.
+    not met within the searched range is counted at the right edge, what was met already at its beginning at the left;
+    an interval that ends out of range is drawn to its edge.
     """
     presets = list(dict.fromkeys(group["preset"] for group in boundary["groups"]))
     rows = {preset: [each for each in boundary["groups"] if each["preset"] == preset] for preset in presets}
@@ -80,12 +81,15 @@ def _criterion(
         axes.plot(summary["p50"], height, marker, color=colour, markersize=6, markeredgecolor="white", zorder=3)
     below = sum(name in run["below"] for run in runs)
     above = len(runs) - len(found_ms) - below
-    for count, place_ms, side, sign in (
-        (below, lowest_ms, "right", "\N{LEFTWARDS ARROW}"),
-        (above, highest_ms, "left", "\N{RIGHTWARDS ARROW}"),
+    for count, place_ms, (aside, side, sign) in (
+        (below, lowest_ms, (-4, "right", "\N{LEFTWARDS ARROW}")),
+        (above, highest_ms, (4, "left", "\N{RIGHTWARDS ARROW}")),
     ):
         if count:
-            axes.annotate(f"{sign}{count}", (place_ms, height), color=colour, fontsize=8, ha=side, va="center")
+            axes.annotate(
+                f"{sign}{count}", (place_ms, height), xytext=(aside, 0), textcoords="offset points", color=colour,
+                fontsize=8, ha=side, va="center",
+            )  # fmt: skip
 
 
 def boundary_table(boundary: Boundary) -> TableData:

@@ -45,8 +45,10 @@ def growth_per_s(drive: WatchedDrive) -> float:
     It is the slope of the straight line of least squares through the logarithms of the largest distances from the
     centre in each half swing, from when the speed has settled until the swing is over `SMALL_SWING_M` or the vehicle's
     safety changes a command. With fewer than four half swings in there it is infinite: positive where the swing was
-    over before, negative where it died away without swinging.
+    over before, negative where it died away without swinging, or where nobody drove.
     """
+    if len(drive.time_s) == 0:
+        return -math.inf
     unsettled = np.flatnonzero(np.abs(drive.speed_mps / drive.speed_mps[-1] - 1) > SETTLED_SHARE)
     begin = int(unsettled[-1]) + 1 if len(unsettled) else 0
     begin_s = float(drive.time_s[min(begin, len(drive.time_s) - 1)])

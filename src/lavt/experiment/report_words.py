@@ -11,6 +11,9 @@ from lavt.experiment.figure_style import Conditions
 LISTED = 8
 """More conditions than these are not listed in a sentence; the tables have them."""
 
+LEAST_RUNS = 6
+"""A condition with fewer runs than there are routes in the paper is not compared with it in words."""
+
 SAME_LOOP_MS = 3.0
 """Medians of loop latency that are nearer than this are one place on its axis."""
 
@@ -131,8 +134,8 @@ def _equal_total(
 
 
 def differences(conditions: Conditions, paper: Conditions) -> list[str]:
-    """Say where these results differ from the paper's, and why; nothing where one of the paper's conditions lacks."""
-    if not paper or any(name not in conditions or not conditions[name]["runs"] for name in paper):
+    """Say where these results differ from the paper's, and why; nothing where one of its conditions lacks."""
+    if not paper or any(name not in conditions or conditions[name]["runs"] < LEAST_RUNS for name in paper):
         return []
     said = [
         _sharper(conditions, paper),
@@ -153,7 +156,9 @@ def _spread(conditions: Conditions) -> int:
 
 
 def _sharper(conditions: Conditions, paper: Conditions) -> str:
-    if _spread({name: conditions[name] for name in paper}) >= _spread(paper):
+    shared = {name: conditions[name] for name in paper}
+    lowest = min(entry["completion_rate"] for entry in shared.values())
+    if lowest > 0.5 or _spread(shared) >= _spread(paper):
         return ""
     ours, theirs = (
         ", ".join(f"{of[name]['completion_rate'] * 100:.0f}" for name in paper) for of in (conditions, paper)
@@ -180,7 +185,7 @@ def _reference(conditions: Conditions, paper: Conditions) -> str:
 def _rails(conditions: Conditions, paper: Conditions) -> str:
     ours = [conditions[name]["p95_m"] for name in paper if conditions[name]["p95_m"] is not None]
     theirs_m = max(paper[name]["p95_m"] for name in paper)
-    if not ours or max(ours) >= theirs_m:
+    if not ours or max(ours) >= theirs_m or all(conditions[name]["completion_rate"] == 1.0 for name in paper):
         return ""
     return (
         f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our "

@@ -12,12 +12,15 @@ import cv2
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
-from lavt.errors import WorkError
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.virtual_run import EndingTap, build_loop, drive
 from lavt.nodes.reports import Admission, FrameWritten
 
 KEPT = frozenset({"truth", "event", "frame", "admission"})
+
+
+NEVER_NS = 2**62
+"""When a drive began that did not."""
 
 
 class Keeper:
@@ -34,7 +37,7 @@ class Keeper:
 
 @dataclass(frozen=True, slots=True)
 class WatchedDrive:
-    """What was seen of one drive, from its beginning to its ending."""
+    """What was seen of one drive, from its beginning to its ending; no rows where the vehicle was never armed."""
 
     ending: str | None
     lane_invasions: int
@@ -49,7 +52,7 @@ class WatchedDrive:
 
 
 def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> WatchedDrive:
-    """Drive, keeping in memory what is watched; raises `WorkError` where nobody got to drive.
+    """Drive, keeping in memory what is watched.
 
     It is the drive that `run_once` makes, but for its records: they are begun in a temporary directory that is removed.
     """
@@ -61,14 +64,12 @@ def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> WatchedDrive
         loop.runtime.hosts["server"].recorder = tap
         loop.runtime.hosts["client"].recorder = Keeper()
         drive(replace(loop, tap=tap), limit_ns=round(limit_s * NS_PER_S))
-    if not tap.began:
-        raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
     return watched(keeper.payloads)
 
 
 def watched(payloads: dict[str, list[Any]]) -> WatchedDrive:
     """Make of the payloads of each channel of the server what is known of the drive."""
-    began_ns = next(event.mono_ns for event in payloads["event"] if event.kind == "drive_began")
+    began_ns = next((event.mono_ns for event in payloads["event"] if event.kind == "drive_began"), NEVER_NS)
     ended = next(((each.mono_ns, each.detail) for each in payloads["event"] if each.kind == "ending"), None)
     ended_ns, ending = ended or (payloads["truth"][-1].mono_ns, None)
     within = [truth for truth in payloads["truth"] if began_ns <= truth.mono_ns <= ended_ns]
