@@ -5,7 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-BENCHMARK = Path(__file__).parents[1] / "benchmarks" / "virtual_loop.py"
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+BENCHMARK = BENCHMARKS / "virtual_loop.py"
 
 
 def test_the_benchmark_of_the_virtual_loop_runs() -> None:
@@ -19,3 +20,15 @@ def test_the_benchmark_of_the_virtual_loop_runs() -> None:
     assert last["geometry_x"] > 0
     for stage in ("render", "encode", "decode", "perception", "control", "rest"):
         assert f"{stage} " in done.stdout
+
+
+def test_the_benchmark_of_the_onset_runs() -> None:
+    """`benchmarks/growth_onset.py` prints theory and measurement of each case as a row of a table."""
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / "growth_onset.py", "--lookaheads", "0.74", "--rates", "15", "--speeds", "6"],
+        capture_output=True, text=True, check=True, timeout=300,
+    )  # fmt: skip
+    header, _, row = done.stdout.splitlines()
+    assert header == "| lookahead | frame rate | speed | theory | measured | difference |"
+    assert row.startswith("| 0.74 s | 15 Hz | 6 m/s | 177.3 ms | ")
+    assert abs(float(row.split("|")[-2].removesuffix(" ms "))) < 10

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from lavt.build.sides import limits_of
 from lavt.config import (
+    BoundaryConfig,
     ClientConfig,
     ClockConfig,
     ClocksConfig,
@@ -29,6 +30,7 @@ from lavt.errors import UserError
 from lavt.experiment.plan import plan_run, plan_sweep
 
 SCHEMAS: dict[str, type[Section]] = {
+    "boundary.yaml": BoundaryConfig,
     "client.yaml": ClientConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,

@@ -22,6 +22,7 @@ from lavt.experiment.results import IDENTITY
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
+BOUNDARY = str(shipped("configs/boundary.yaml"))
 SWEEP = str(shipped("configs/sweep.yaml"))
 SERVER = str(shipped("configs/server.yaml"))
 CLIENT = str(shipped("configs/client.yaml"))
@@ -146,6 +147,26 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
         changes = [each.replace("vehicle.route=nowhere", "routes=[nowhere]") for each in changes]
     ended = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
     assert said in ended.refused()
+    assert files(tmp_path) == {}
+
+
+BAD_BOUNDARIES = {
+    "the delay that is searched": (["network.video.delay_ms=5"], "network.video.delay_ms is what is searched for"),
+    "unknown road": (["routes=[nowhere]"], "there is no road 'nowhere'"),
+    "unknown preset": (["presets=[swift]"], "no preset 'swift'"),
+    "a route twice": (["routes=[a, a]"], "each once"),
+    "no grid": (["grid_ms=0"], "'grid_ms'"),
+    "a sweep's key": (["conditions=[L0]"], "unknown key 'conditions'"),
+    "real time": (["time=real"], "virtual time"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_BOUNDARIES)
+def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
+    """A boundary that cannot be searched is refused in one sentence, and no directory is made for it."""
+    changes, said = BAD_BOUNDARIES[case]
+    options = [part for change in changes for part in ("--set", change)]
+    assert said in run("boundary", BOUNDARY, *options, "--out", "mine").refused()
     assert files(tmp_path) == {}
 
 
@@ -290,6 +311,18 @@ def test_report_of_what_is_no_result(case: str, run: Run, tmp_path: Path) -> Non
     assert said in ended.err
     assert "b/result.json" in ended.err
     assert files(tmp_path) == before
+
+
+def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
+    """A boundary alone is refused, and a boundary.json that is none ends the report with 1 and one sentence."""
+    (tmp_path / "found").mkdir()
+    (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
+    assert "found holds a boundary and no runs" in run("report", "found").refused()
+    (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
+    ended = run("report", "found")
+    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
+    assert "boundary.json holds no boundary" in ended.err
+    assert list(files(tmp_path / "found")) == ["boundary.json"]
 
 
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:

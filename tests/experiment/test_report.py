@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Callable
@@ -11,13 +12,14 @@ import pytest
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
-from lavt.experiment import page
-from lavt.experiment.breakdown import breakdown, capture_to_stamp_ms
-from lavt.experiment.figures import condition_colours
+from lavt.experiment import tabular
+from lavt.experiment.drives import capture_to_stamp_ms, read_drive
+from lavt.experiment.figure_style import condition_colours
 from lavt.experiment.record import RecordWriter, read_record
-from lavt.experiment.report import received_pictures, write_report
+from lavt.experiment.report import write_report
+from lavt.experiment.report_drives import received_pictures
 from lavt.experiment.report_tables import hop_table
-from lavt.experiment.results import run_result, write_json
+from lavt.experiment.results import read_json, run_result, write_json
 from lavt.nodes.reports import VideoUnit
 
 MakeRun = Callable[..., Path]
@@ -31,7 +33,7 @@ def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual",
         "time": time,
         "injection": "model" if time == "virtual" else "relay",
         "inherent": "paper_wifi5",
-        "route": "A <key>",
+        "route": "A <key> $^$",
         "condition": condition,
         "controller": "lane",
         "preset": "designed",
@@ -64,15 +66,21 @@ def page_of(sweep: Path) -> str:
 
 
 def test_the_report_is_whole(sweep: Path) -> None:
-    """The page, every figure it names, and the summary are there; nothing on the page comes from a network."""
+    """The page, every file it names in each of its formats, and the summary are there; nothing is from a network."""
     html = page_of(sweep)
-    images = re.findall(r'src="([^"]+)"', html)
-    assert {"loop.png", "injected.png", "hops_virtual.png", "time_virtual.png", "route_A_key_virtual.png"} <= set(
-        images
-    )
-    assert "route_A_key_real.png" in images
-    for image in images:
-        assert (sweep / "report" / image).read_bytes().startswith(b"\x89PNG")
+    figures = {name.rpartition(".")[0] for name in re.findall(r'src="([^"]+)"', html)}
+    assert figures == {
+        "degradation", "injected", "hops_virtual", "hops_real", "time_virtual", "time_real", "survival_virtual",
+        "survival_real", "incidence_virtual", "incidence_real", "trajectories_whole_virtual", "trajectories_whole_real",
+        "cross_track_virtual", "cross_track_real",
+    }  # fmt: skip
+    for figure in figures:
+        assert (sweep / "report" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<text" in (sweep / "report" / f"{figure}.svg").read_text()
+    linked = set(re.findall(r'href="([^"#]+)"', html))
+    assert {f"{figure}.{ending}" for figure in figures for ending in ("svg", "png")} < linked
+    assert {"tables/runs.csv", "tables/runs.tex", "tables/conditions_real_driving.csv"} < linked
+    assert all((sweep / "report" / name).is_file() for name in linked)
     assert "http" not in html
     assert "3.0 times as fast" in html
     summary = json.loads((sweep / "summary.json").read_text())
@@ -81,17 +89,60 @@ def test_the_report_is_whole(sweep: Path) -> None:
     assert summary["speed"]["jobs"] == 2
 
 
+def test_every_section_has_a_link_and_is_in_order(sweep: Path) -> None:
+    """The page links to each of its sections, in the order in which they come."""
+    html = page_of(sweep)
+    names = re.findall(r'<h2 id="([^"]+)"', html)
+    assert re.findall(r'<a href="#([^"]+)"', html) == names
+    assert names == [
+        "conditions", "planned_contrasts", "trajectories", "injected_and_measured_latency", "driving_against_latency",
+        "how_far_the_runs_came", "where_the_latency_comes_from", "route_by_route", "single_runs", "every_run",
+        "clocks_of_two_machines", "versions_and_machine",
+    ]  # fmt: skip
+
+
+def test_the_same_runs_give_the_same_bytes(sweep: Path) -> None:
+    """A report made again, of drives that were read before, is the same file by file, figures and page included."""
+    before = files_of(sweep)
+    assert len(before) > 40
+    directories = [sweep / "runs" / name for name in "012356"]
+    drives = {directory: read_drive(directory, read_json(directory / "result.json")) for directory in directories}
+    write_report(sweep, drives=drives)
+    assert files_of(sweep) == before
+
+
+def files_of(sweep: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((sweep / "report").rglob("*.*"))}
+
+
+def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
+    """The CSV of a table has each number to its last digit, an interval in two columns, and what is unknown empty."""
+    summary = json.loads((sweep / "summary.json").read_text())
+    with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
+        rows = {row["condition"]: row for row in csv.DictReader(file)}
+    entry = summary["conditions"]["L1"]
+    read = [float(rows["L1"][f"95 %, these routes {end}"]) for end in ("low", "high")]
+    assert read == entry["completion_interval"]
+    assert float(rows["L1"]["lane invasions / km"]) == entry["lane_invasions_per_km"]
+    with (sweep / "report" / "tables" / "conditions_virtual_latency.csv").open(newline="") as file:
+        latencies = {row["condition"]: row for row in csv.DictReader(file)}
+    assert float(latencies["L0"]["τ video ms p50"]) == summary["conditions"]["L0"]["tau_v_ms"]["p50"]
+    with (sweep / "report" / "tables" / "conditions_virtual_error.csv").open(newline="") as file:
+        errors = {row["condition"]: row for row in csv.DictReader(file)}
+    assert errors["L1"]["p95 m, all runs ranked p75"] == ""
+
+
 def test_real_and_virtual_runs_have_tables_of_their_own(sweep: Path) -> None:
     """The page says of each table whether time was real and who injected; an invalid run is named with its reason."""
     html = page_of(sweep)
-    assert "virtual time, fidelity video: network and clocks are modelled" in html
-    assert "real time, injected by relay" in html
+    assert "Virtual time, fidelity video: network and clocks are modelled" in html
+    assert "Real time, injected by relay" in html
     assert "not valid: the offset between the clocks is only known to 6.00 ms" in html
 
 
 def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
     """Of runs on two machines the page has Delta, its source, bound and drift, and the probe's Delta; of others not."""
-    clocks = page_of(sweep).partition("Clocks of two machines")[2].partition("Versions and machine")[0]
+    clocks = page_of(sweep).partition('id="clocks_of_two_machines"')[2].partition('id="versions_and_machine"')[0]
     rows = re.findall(r"<tr><td.*?</tr>", clocks.replace("\n", ""))
     cells = [[re.sub("<[^>]*>|\xa0", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
     assert [row[:2] for row in cells] == [["3", "chrony"], ["5", "probe"]]
@@ -101,7 +152,7 @@ def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
 
 
 def test_names_cannot_become_html(sweep: Path) -> None:
-    """Whatever a route or a run is called, the page shows it as text."""
+    """Whatever a route or a run is called, the page and the figures show it as text."""
     html = page_of(sweep)
     assert "A &lt;key&gt;" in html
     assert "<key>" not in html
@@ -121,34 +172,14 @@ def test_unfinished_runs_are_left_out_and_named(sweep: Path) -> None:
         write_report(sweep / "report")
 
 
-def test_the_shares_of_the_loop_are_those_recorded(make_run: MakeRun, tmp_path: Path) -> None:
-    """Hops keep their recorded durations, what was before the stamp is left out, and the shares sum to the loop."""
-    make_run(tmp_path, seconds=3.0)
-    server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
-    shares = breakdown(server, client, run_result({}, server, client))
-    milliseconds = {(node, hop): duration_ms for node, hop, duration_ms in shares}
-    assert milliseconds["driver", "decode"] == pytest.approx(2.0)
-    assert milliseconds["receiver", "reorder and depacketize"] == pytest.approx(6.0)
-    nodes = [node for node, _, _ in shares]
-    assert nodes.index("driver") == nodes.index("receiver") + 1
-    assert milliseconds["camera", "encode"] == pytest.approx(4.0)
-    assert ("camera", "capture") not in milliseconds
-    assert milliseconds["network", "control link"] == pytest.approx(9.0, abs=1e-3)
-    assert sum(milliseconds.values()) == pytest.approx(76.0, abs=1e-3)
-
-
 def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
-    """From capture to stamp is a row of the table of hops and no share of the loop; unknown where no camera told."""
+    """From capture to stamp is the first row of the table of hops; a dash where no camera told."""
     make_run(tmp_path, seconds=3.0, capture_ms=7.5)
-    server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
-    assert capture_to_stamp_ms(server) == 7.5
-    shares = breakdown(server, client, run_result({}, server, client))
-    assert sum(duration_ms for _, _, duration_ms in shares) == pytest.approx(76.0, abs=1e-3)
+    assert capture_to_stamp_ms(tmp_path / "server.mcap") == 7.5
+    assert capture_to_stamp_ms(sweep / "runs" / "0" / "server.mcap") is None
     row = "camera: capture to stamp, before the loop"
-    assert row in hop_table({"L0": shares}, {"L0": 7.5})
-    assert "7.50" in hop_table({"L0": []}, {"L0": 7.5})
-    assert capture_to_stamp_ms(read_record(sweep / "runs" / "0" / "server.mcap")) is None
-    assert re.search(f"{row}.*?unknown", page_of(sweep).replace("\n", " "))
+    assert list(hop_table({"L0": []}, {"L0": 7.5}).rows) == [[row, 7.5]]
+    assert re.search(f"{row}</td><td>–</td>", page_of(sweep))
 
 
 def test_received_pictures_are_decoded(tmp_path: Path) -> None:
@@ -180,10 +211,10 @@ def test_every_condition_has_a_colour_of_its_own() -> None:
 def test_what_is_undefined_is_a_dash() -> None:
     """A number, a share, an interval or a latency that is not known is shown as a dash, and a bound as unknown."""
     nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
-    dashes = [page.number(None), page.percent(None), page.interval(None), page.latency(nothing)]
-    assert dashes == [page.NOTHING] * 4
-    unbounded = page.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
-    assert unbounded.replace(page.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
+    dashes = [tabular.number(None), tabular.percent(None), tabular.interval(None), tabular.latency(nothing)]
+    assert dashes == [tabular.NOTHING] * 4
+    unbounded = tabular.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
+    assert unbounded.replace(tabular.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
 
 
 def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
@@ -196,5 +227,5 @@ def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
     identity = {"run": "0", "time": "real", "injection": "none", "route": "A", "condition": "L0"}
     write_json(directory / "result.json", run_result(identity, server, client))
     html = write_report(tmp_path).read_text()
-    assert "real time, nothing injected" in html
+    assert "Real time, nothing injected" in html
     assert "the record has no ending" in html

@@ -4,10 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
 from lavt.control.drive_controller import PRESETS
 from lavt.experiment.theory import (
     DELAY_PER_LOOKAHEAD,
     LateralLoop,
+    configured_loop,
     critical_delay_s,
     open_loop,
     phase_margin_rad,
@@ -103,3 +106,55 @@ def test_the_designed_preset_is_what_the_model_gives() -> None:
     """The lookahead in the table of presets is the smallest with 30 degrees of margin at 81 ms, rounded up."""
     smallest_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
     assert PRESETS["designed"].lookahead_s == math.ceil(100 * smallest_s) / 100
+
+
+def config(*changes: str) -> RunConfig:
+    return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
+
+
+def test_the_loop_as_configured_is_the_one_driven() -> None:
+    """Preset, what replaces its settings, frame rate, car and lags are those of the run."""
+    assert configured_loop(config()) == LateralLoop(0.74, supposed_wheelbase_m=LINCOLN_MKZ.wheelbase_m)
+    changed = configured_loop(
+        config(
+            "controller.preset=designed",
+            "controller.lookahead_s=1.2",
+            "controller.speed_mps=10",
+            "controller.wheelbase_m=3.0",
+            "camera.rate_hz=15",
+            "vehicle.steering_lag_ms=200",
+            "vehicle.steering_dead_time_ms=60",
+        )
+    )
+    assert changed == LateralLoop(
+        1.2,
+        10.0,
+        15.0,
+        car=replace(LINCOLN_MKZ, steering_lag_s=0.2, steering_dead_time_s=0.06),
+        supposed_wheelbase_m=3.0,
+    )
+
+
+@pytest.mark.parametrize(("lookahead_s", "speed_mps", "driven_m"), [(0.74, 5.0, 4.0), (3.0, 10.0, 20.0)])
+def test_the_lookahead_is_within_the_controllers_bounds(lookahead_s: float, speed_mps: float, driven_m: float) -> None:
+    """What would be nearer than 4 m or farther than 20 m is driven at 4 or 20 m."""
+    loop = configured_loop(config(f"controller.lookahead_s={lookahead_s}", f"controller.speed_mps={speed_mps}"))
+    assert loop is not None
+    assert loop.lookahead_s * speed_mps == pytest.approx(driven_m)
+
+
+@pytest.mark.parametrize("change", ["controller.kind=my_controller", "vehicle.kind=my_car"])
+def test_of_others_nothing_is_known(change: str) -> None:
+    """For a controller or a vehicle that is not of LAVT there is no model."""
+    assert configured_loop(config(change)) is None
+
+
+def test_dead_time_of_the_steering_comes_off_the_delay() -> None:
+    """With 60 ms of dead time the loop bears just 60 ms less."""
+    late = LateralLoop(1.01, car=replace(LINCOLN_MKZ, steering_dead_time_s=0.06))
+    assert critical_delay_s(late) == pytest.approx(critical_delay_s(LateralLoop(1.01)) - 0.06, abs=1e-6)
+
+
+def test_a_wheelbase_supposed_too_long_steers_too_much() -> None:
+    """The controller's gain is that of the wheelbase it supposes, so more of it bears less delay."""
+    assert critical_delay_s(LateralLoop(1.01, supposed_wheelbase_m=3.5)) < critical_delay_s(LateralLoop(1.01))

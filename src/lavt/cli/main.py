@@ -8,6 +8,7 @@ import typer
 
 import lavt
 from lavt.cli import (
+    boundary,
     client,
     clock,
     console,
@@ -33,7 +34,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS = (demo, run, sweep, report, join, road, perception, server, client, stop, router, relay, netem, clock)
+COMMANDS = (
+    demo,
+    run,
+    sweep,
+    boundary,
+    report,
+    join,
+    road,
+    perception,
+    server,
+    client,
+    stop,
+    router,
+    relay,
+    netem,
+    clock,
+)
 for command in COMMANDS:
     command.register(app)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +15,8 @@ from lavt.experiment.directory import make_directory
 from lavt.experiment.results import IDENTITY, read_json
 from lavt.experiment.run import RESULT, compute_result
 
+BOUNDARY = "boundary.json"
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -20,26 +24,63 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    directories: Annotated[list[Path], typer.Argument(help="Run directories, or sweep directories of runs.")],
+    directories: Annotated[
+        list[Path], typer.Argument(help="Run directories, sweep directories of runs, and those of `lavt boundary`.")
+    ],
     out: console.Out = None,
 ) -> None:
     """Compute the results of runs again from their records, and write summary.json and report/index.html.
 
-    Example: lavt report out/sweep --out out/sweep
+    Example: lavt report out/paper out/designed --out out/both
     """
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
     from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    runs = [run for directory in directories for run in _runs(directory)]
+    boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
+    driven = {directory: _runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
+    if not driven:
+        raise UserError(f"{directories[0]} holds a boundary and no runs: name the directory of a sweep beside it")
+    runs = [run for runs in driven.values() for run in runs]
     results = [_read_result(run / RESULT) for run in runs]  # all of them, before any is written
     for run, result in zip(runs, results, strict=True):
         compute_result(run, result, result.get("digest"))
-    base = recorded_base(directories[0]) if len(directories) == 1 else None
+    names = _sweep_names(list(driven))
+    sweeps = {run: name for directory, name in names.items() for run in driven[directory]}
     make_directory(out)
-    console.show(f"the report is {write_report(out, run_dirs=runs, base=base)}")
+    page = write_report(out, run_dirs=runs, base=_base(list(driven), names), sweeps=sweeps, boundaries=boundaries)
+    console.show(f"the report is {page}")
+
+
+def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
+    """Tell what the runs of the first sweep's base config have in common; None where all runs are reported alike."""
+    from lavt.experiment.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
+
+    if len(directories) == 1:
+        return recorded_base(directories[0])
+    first = next(iter(names), None)
+    return None if first is None else {**(recorded_base(first) or {}), "sweep": names[first]}
+
+
+def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
+    """Name each sweep after its directory, with those above it where two would have one name; none for one alone."""
+    sweeps = [directory for directory in directories if not (directory / RESULT).is_file()]
+    if len(sweeps) < 2:
+        return {}
+    parts = {directory: directory.resolve().parts for directory in sweeps}
+    length = 1
+    while max(Counter(parts[directory][-length:] for directory in sweeps).values()) > 1:
+        length += 1
+    return {directory: "/".join(parts[directory][-length:]) for directory in sweeps}
+
+
+def _read_boundary(directory: Path) -> dict[str, Any]:
+    boundary: Any = read_json(directory / BOUNDARY)
+    lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
+    if not lists or not all(isinstance(each, list) and each for each in lists):
+        raise WorkError(f"{directory / BOUNDARY} holds no boundary: it lacks runs or groups")
+    return dict(boundary)
 
 
 def _runs(directory: Path) -> list[Path]:

@@ -219,6 +219,20 @@ class SweepConfig(RunConfig):
     axes: dict[str, list[Any]] = Field(default_factory=dict)
 
 
+class BoundaryConfig(RunConfig):
+    """Many searches for the delay that a loop bears: every route with every preset, repeated with other seeds."""
+
+    routes: tuple[str, ...] = ("a_key",)
+    presets: tuple[str, ...] = ("designed", "paper_calibrated")
+    repetitions: int = Field(10, ge=1, le=10_000)
+    longest_delay_ms: float = Field(700.0, gt=0, le=5000)
+    """Of the video, on top of what is there anyway: searched from 0 to here."""
+    grid_ms: float = Field(100.0, gt=0, le=1000)
+    """So far apart are the delays that are tried first."""
+    within_ms: float = Field(2.0, ge=0.1, le=100)
+    """So exactly each boundary is found between two of them."""
+
+
 class ZenohConfig(Section):
     """The session to the router on this machine."""
 

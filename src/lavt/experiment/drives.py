@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from lavt.domain import FloatArray
+from lavt.domain import NS_PER_MS, FloatArray
+from lavt.experiment.latency import frames_within
 from lavt.experiment.metrics import driving_interval
 from lavt.experiment.record import read_record
-from lavt.experiment.table import Table
+from lavt.experiment.table import MISSING, Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,3 +55,13 @@ def one_of_each_condition(drives: Sequence[Drive]) -> list[Drive]:
     for drive in sorted(drives, key=lambda drive: not drive.result["valid"]):
         chosen.setdefault(drive.condition, drive)
     return [chosen[name] for name in sorted(chosen)]
+
+
+def capture_to_stamp_ms(server_record: Path) -> float | None:
+    """Median time from a frame's exposure to its stamp, which is before the loop; None where no camera told of it."""
+    server = read_record(server_record, channels=("frame", "event"))
+    began_ns, ended_ns, _ = driving_interval(server)
+    frames = frames_within(server.table("frame"), began_ns, ended_ns)
+    capture_ns = frames.ints("capture_ns")
+    times_ns = (frames.ints("stamped_mono_ns") - capture_ns)[capture_ns != MISSING]
+    return float(np.median(times_ns)) / NS_PER_MS if len(times_ns) else None

@@ -15,6 +15,9 @@ SCHEMA = 1
 GROUPING = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
 """Besides a sweep's own axes, what runs of one group have in common."""
 
+SWEEP = "sweep"
+"""The same, where runs of several sweeps are reported together: the name of each run's sweep."""
+
 
 def summarize(
     runs: Sequence[Run], speed: Mapping[str, Any] | None, *, base: Mapping[str, Any] | None = None
@@ -47,7 +50,8 @@ def _settings(run: Run, names: Iterable[str]) -> dict[str, Any]:
 def _groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Every combination of the grouping keys and the further axes that was driven, in the order of the sweep."""
     axes = list(dict.fromkeys(name for run in runs for name in run.get("axes") or {}))
-    names = [*GROUPING, *(name for name in axes if name not in GROUPING)]
+    sweeps = [SWEEP] if any(SWEEP in run for run in runs) else []
+    names = [*GROUPING, *sweeps, *(name for name in axes if name not in GROUPING)]
     members: dict[str, list[Run]] = {}
     for run in runs:
         members.setdefault(json.dumps(_settings(run, names), sort_keys=True, default=str), []).append(run)

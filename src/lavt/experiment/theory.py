@@ -9,7 +9,7 @@ computed once a frame from an exponential moving average and held until the next
 from the middle of exposure to the wheel's command, splits into whole frames and a fraction: within one frame the old
 command acts first and the new one after it, so the sampled plant has two input matrices (Astrom and Wittenmark,
 Computer-Controlled Systems, section 3.2). The wait for the next picture, half a frame on average, is the hold of this
-model and must not be added to the delay again.
+model and must not be added to the delay again. A car's dead time of steering comes on top of the total delay.
 
 Without lag, filter, hold and tyres the bound is `DELAY_PER_LOOKAHEAD` x lookahead / speed (Heredia and Ollero, Advanced
 Robotics 21, 2007, analyse that case); it is two to three times too generous for a real car.
@@ -19,12 +19,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from lavt.build.vehicles import car_of
+from lavt.config import RunConfig
+from lavt.control.drive_controller import find_preset
+from lavt.control.pure_pursuit import lookahead_m
 from lavt.domain import FloatArray
 from lavt.perception.lane_detector import SMOOTHING
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
@@ -54,12 +58,34 @@ class LateralLoop:
     smoothing: float = SMOOTHING
     """Weight of the newest picture in the moving average; 1 is none."""
     car: CarParameters = DEFAULT_CAR
+    supposed_wheelbase_m: float | None = None
+    """What the controller takes for the car's wheelbase; None: what it is."""
 
     @property
     def gain(self) -> FloatArray:
         """Pure pursuit on (lateral error of the rear axle, heading error), a row of 2."""
-        lookahead_m = self.lookahead_s * self.speed_mps
-        return -2 * self.car.wheelbase_m / lookahead_m**2 * np.array([1.0, lookahead_m])
+        distance_m = self.lookahead_s * self.speed_mps
+        wheelbase_m = self.supposed_wheelbase_m or self.car.wheelbase_m
+        return -2 * wheelbase_m / distance_m**2 * np.array([1.0, distance_m])
+
+
+def configured_loop(config: RunConfig) -> LateralLoop | None:
+    """Give the loop as a run has it: preset and what replaces its settings, frame rate, car with lags and dead time.
+
+    The lookahead is the one driven at the preset's speed, within the controller's bounds. None where the car or the
+    controller is not of LAVT: nothing is known of them. Raises `UserError` for a preset or car that does not exist.
+    """
+    controller, vehicle = config.controller, config.vehicle
+    if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
+        return None
+    preset = replace(find_preset(controller.preset), **controller.changes)
+    return LateralLoop(
+        lookahead_s=lookahead_m(preset.lookahead_s, preset.speed_mps) / preset.speed_mps,
+        speed_mps=preset.speed_mps,
+        frame_rate_hz=config.camera.rate_hz,
+        car=car_of(vehicle),
+        supposed_wheelbase_m=controller.wheelbase_m,
+    )
 
 
 def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
@@ -105,6 +131,7 @@ class _SampledPlant:
 def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
     a, b = plant(loop)
     period_s = 1 / loop.frame_rate_hz
+    total_delay_s += loop.car.steering_dead_time_s
     frames = int(total_delay_s / period_s)
     fraction_s = min(max(total_delay_s - frames * period_s, 0.0), period_s)
     transition, _ = _advance(a, b, period_s)

@@ -22,6 +22,7 @@ from lavt.experiment.plan import PlannedRun
 from lavt.experiment.provenance import provenance
 from lavt.experiment.record import RecordWriter
 from lavt.experiment.sides import client_config, server_config
+from lavt.runtime.recording import Recorder
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.delay import DelayLaw, DelayLine
 from lavt.transport.link import Injected, Link
@@ -44,7 +45,7 @@ AFTERWARDS_NS = NS_PER_S // 5
 class EndingTap:
     """A recorder that passes everything on and notes when the drive has begun and ended."""
 
-    def __init__(self, writer: RecordWriter) -> None:
+    def __init__(self, writer: Recorder) -> None:
         self.began = False
         self.ending: str | None = None
         self._truth: GroundTruth | None = None

@@ -24,8 +24,8 @@ def road() -> Road:
 
 
 def test_the_six_routes_come_along() -> None:
-    """Three routes and their key parts come with the package."""
-    assert road_names() == sorted(ROUTES)
+    """Three routes, their key parts and a straight road come with the package."""
+    assert road_names() == sorted([*ROUTES, "straight"])
 
 
 @pytest.mark.parametrize("name", ROUTES)

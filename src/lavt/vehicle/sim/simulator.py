@@ -28,6 +28,15 @@ def grid_ns(index: int) -> int:
     return index * NS_PER_S // STEPS_PER_S
 
 
+def start_of(seed: int) -> tuple[float, float, float]:
+    """Give where a run begins against the route's start: metres ahead, metres to the left, heading in rad."""
+    return (
+        float(stream(seed, "start position").uniform(0.0, START_AHEAD_M)),
+        float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M)),
+        float(stream(seed, "start heading").uniform(-START_HEADING_RAD, START_HEADING_RAD)),
+    )
+
+
 class Simulator:
     """A `lavt.vehicle.vehicle.Vehicle`: it stands at the start, brake on, until it is told otherwise.
 
@@ -48,9 +57,7 @@ class Simulator:
     ) -> None:
         self._parameters, self._goes_on = parameters, goes_on
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
-        ahead_m = float(stream(seed, "start position").uniform(0.0, START_AHEAD_M))
-        lateral_m = float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M))
-        turned_rad = float(stream(seed, "start heading").uniform(-START_HEADING_RAD, START_HEADING_RAD))
+        ahead_m, lateral_m, turned_rad = start_of(seed)
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
         self._car = Car(parameters, motion, 1.0 / STEPS_PER_S)

@@ -1,0 +1,74 @@
+"""Measure the total delay at which a swing begins to grow on a straight road, and print it beside the theory's.
+
+    python benchmarks/growth_onset.py [--lookaheads 0.74,1.01,1.3] [--rates 15,30] [--speeds 6,10] [--seeds 1]
+
+Drives are in geometry fidelity, with the latency of the loopback and a constant delay of the video; nothing in them
+reaches a limit while the swing is measured. `docs/boundary.md` holds what this printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from statistics import median
+
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
+from lavt.experiment.boundary import theoretical_ms, with_video_delay
+from lavt.experiment.boundary_search import zero_bracket
+from lavt.experiment.growth import straight_growth
+
+LONGEST_MS = 1000.0
+WITHIN_MS = 0.5
+
+
+def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> RunConfig:
+    """Give the config of one case."""
+    changes = [
+        "fidelity=geometry",
+        f"seed={seed}",
+        f"controller.lookahead_s={lookahead_s}",
+        f"controller.speed_mps={speed_mps}",
+        f"camera.rate_hz={rate_hz}",
+    ]
+    return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
+
+
+def onset_ms(config: RunConfig, theory_ms: float) -> float:
+    """Search the total delay at which the swing neither grows nor dies away."""
+    added_ms = []
+
+    def growth(delay_ms: float) -> float:
+        total_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
+        added_ms.append(total_ms - delay_ms)
+        return growth_per_s
+
+    bracket = zero_bracket(growth, theory_ms, LONGEST_MS, WITHIN_MS)
+    if bracket.low_ms is None or bracket.high_ms is None:
+        raise SystemExit(f"no onset between 0 and {LONGEST_MS} ms")
+    return (bracket.low_ms + bracket.high_ms) / 2 + median(added_ms)
+
+
+def main() -> None:
+    """Print all cases as a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name, default in (("lookaheads", "0.74,1.01,1.3"), ("rates", "15,30"), ("speeds", "6,10")):
+        parser.add_argument(f"--{name}", type=lambda text: [float(each) for each in text.split(",")], default=default)
+    parser.add_argument("--seeds", type=lambda text: [int(each) for each in text.split(",")], default="1")
+    options = parser.parse_args()
+    print("| lookahead | frame rate | speed | theory | measured | difference |")
+    print("|---" * 6 + "|")
+    cases = itertools.product(options.lookaheads, options.rates, options.speeds, options.seeds)
+    for lookahead_s, rate_hz, speed_mps, seed in cases:
+        config = case(lookahead_s, rate_hz, speed_mps, seed)
+        theory_ms = theoretical_ms(config) or 0.0
+        measured_ms = onset_ms(config, theory_ms)
+        print(
+            f"| {lookahead_s:g} s | {rate_hz:g} Hz | {speed_mps:g} m/s | {theory_ms:.1f} ms | {measured_ms:.1f} ms | "
+            f"{measured_ms - theory_ms:+.1f} ms |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""`lavt boundary`: how much total delay a loop bears."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lavt.cli import console
+from lavt.cli.progress import progress
+from lavt.config import BoundaryConfig
+from lavt.config_file import load_config
+from lavt.errors import WorkError
+from lavt.experiment.directory import prepare_directory
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("boundary")(boundary)
+
+
+def boundary(
+    config: Annotated[Path, typer.Argument(help="A boundary config in YAML, such as configs/boundary.yaml.")],
+    changes: console.Set = None,
+    out: console.Out = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Seeds at a time; default: one for each core.")] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Search the delay at which a swing begins to grow, the car leaves its lane, and the drive fails.
+
+    Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
+    """
+    from lavt.experiment.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+
+    asked = load_config(BoundaryConfig, config, changes or [])
+    searches = plan_boundary(asked)
+    out = out or Path("out") / "boundary"
+    prepare_directory(out)
+    with console.interruptible(), progress(f"boundary into {out}", len(searches)) as tell:
+        found, done = search_boundary(asked, searches, out, jobs=jobs, tell=tell)
+    for failure in found["failed"]:
+        console.say(f"failed: {failure['name']}: {failure['why']}")
+    if not done:
+        raise WorkError(f"stopped; what was found is in {out}")
+    if as_json:
+        console.show_json(found)
+    else:
+        for line in lines(found):
+            console.show(line)
+        console.show(f"boundary.json, .csv, .svg and .png are in {out}")
+    if found["failed"]:
+        raise typer.Exit(1)
+
+
+def lines(found: dict[str, Any]) -> list[str]:
+    """Say for each route and preset the medians with their intervals."""
+    from lavt.experiment.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.experiment.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.tabular import number  # noqa: PLC0415 (with them)
+
+    table = [("route", "preset", "seeds", "theory", *CRITERIA)]
+    for group in found["groups"]:
+        cells = []
+        for name in CRITERIA:
+            summary = group[f"{name}_ms"]
+            cells.append(f"{number(summary['p50'], 0)} ({span(summary['interval'])})")
+        table.append(
+            (group["route"] or ALL_ROUTES, group["preset"], str(group["n"]), number(group["theory_ms"], 0), *cells)
+        )
+    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]

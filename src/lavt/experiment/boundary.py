@@ -1,0 +1,231 @@
+"""How much total delay a loop bears: by search, seed after seed, on all cores. docs/boundary.md defines it."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import itertools
+import math
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavt.config import BoundaryConfig, RunConfig
+from lavt.config_file import parse_config
+from lavt.domain import NS_PER_MS
+from lavt.errors import LavtError, UserError, WorkError
+from lavt.experiment.boundary_figure import boundary_figure
+from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
+from lavt.experiment.boundary_summary import CRITERIA, groups_of
+from lavt.experiment.growth import straight_growth
+from lavt.experiment.plan import PlannedRun, plan_run
+from lavt.experiment.report_files import save_figure
+from lavt.experiment.results import write_json
+from lavt.experiment.theory import configured_loop, critical_delay_s
+from lavt.experiment.watched_drive import WatchedDrive, watch_drive
+
+BOUNDARY = "boundary.json"
+FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
+SEARCHED = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
+"""Keys of a boundary config that are not a run's."""
+
+Tell = Callable[[str], None]
+Totals = Callable[[float], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """One seed on one route with one preset: its run without added delay, and where to look."""
+
+    planned: PlannedRun
+    longest_delay_ms: float
+    grid_ms: float
+    within_ms: float
+
+    @property
+    def name(self) -> str:
+        """What is told of it."""
+        return self.planned.name
+
+
+def plan_boundary(config: BoundaryConfig) -> list[Search]:
+    """Plan every route with every preset, repeated; a first seed of each comes before any second one.
+
+    Raises `UserError` for what `plan_run` refuses, for what has no straight road or no virtual time, for a video delay
+    that is given, and where nothing is asked for or something twice.
+    """
+    if config.time != "virtual" or config.vehicle.kind != "simulator":
+        raise UserError(
+            "a boundary is searched in virtual time with the built-in simulator: set time and vehicle.kind so"
+        )
+    if config.network.video.delay_ms is not None:
+        raise UserError("network.video.delay_ms is what is searched for: leave it out")
+    for key, names in (("routes", config.routes), ("presets", config.presets)):
+        if not names or len(set(names)) < len(names):
+            raise UserError(f"{key}: give at least one, and each once")
+    base = config.model_dump(mode="json", exclude=set(SEARCHED))
+    searches = []
+    for repetition, route, preset in itertools.product(range(config.repetitions), config.routes, config.presets):
+        asked = {
+            **base,
+            "vehicle": {**base["vehicle"], "route": route},
+            "controller": {**base["controller"], "preset": preset},
+            "repetition": repetition,
+        }
+        planned = plan_run(parse_config(RunConfig, asked, "the boundary"), name=f"{route} {preset} {repetition:02d}")
+        searches.append(Search(planned, config.longest_delay_ms, config.grid_ms, config.within_ms))
+    return searches
+
+
+def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
+    """Give the config with this constant delay of the video instead of the condition's, to the nanosecond."""
+    delay_ms = round(delay_ms * NS_PER_MS) / NS_PER_MS
+    video = config.network.video.model_copy(update={"delay_ms": delay_ms})
+    return config.model_copy(update={"network": config.network.model_copy(update={"video": video})})
+
+
+def departed(drive: WatchedDrive) -> bool:
+    """Whether the car left its lane: at least one event `lane_invasion`."""
+    return drive.lane_invasions > 0
+
+
+def not_completed(drive: WatchedDrive) -> bool:
+    """Whether the drive ended in any other way than at the route's end."""
+    return drive.ending != "completed"
+
+
+def search(asked: Search) -> dict[str, Any]:
+    """Find the boundaries of one seed, and give its entry of `boundary.json`."""
+    config, identity = asked.planned.config, asked.planned.identity
+
+    @functools.cache
+    def drive(delay_ms: float) -> WatchedDrive:
+        return watch_drive(plan_run(with_video_delay(config, delay_ms), name=asked.name))
+
+    added_ms: list[float] = []
+
+    def growth(delay_ms: float) -> float:
+        measured_ms, growth_per_s = straight_growth(with_video_delay(config, delay_ms))
+        added_ms.append(measured_ms - delay_ms)
+        return growth_per_s
+
+    grid_ms = _grid(asked.longest_delay_ms, asked.grid_ms)
+    first_total_ms = drive(0.0).total_delay_ms
+    if math.isnan(first_total_ms):
+        raise WorkError("nothing is driven even without added delay: look at lavt run with the same config")
+
+    def total_ms(delay_ms: float) -> float:
+        measured_ms = drive(delay_ms).total_delay_ms
+        return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # pictures too old to be obeyed
+
+    theory_ms = theoretical_ms(config)
+    guess_ms = asked.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
+    onset = zero_bracket(functools.cache(growth), guess_ms, asked.longest_delay_ms, asked.within_ms)
+    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), grid_ms, asked.within_ms)
+    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, asked.within_ms)
+    found: dict[str, tuple[Bracket, Totals]] = {
+        "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
+        "departure": (departure, total_ms),
+        "completion": (completion, total_ms),
+    }
+    return {
+        "route": identity["route"],
+        "preset": identity["preset"],
+        "seed": identity["seed"],
+        "repetition": identity["repetition"],
+        **{f"{name}_ms": _middle_ms(bracket, total) for name, (bracket, total) in found.items()},
+        "theory_ms": theory_ms,
+        "searched_ms": [first_total_ms, total_ms(grid_ms[-1])],
+        "below": [name for name, (bracket, _) in found.items() if bracket.low_ms is None],
+        "not_monotone": [name for name, (bracket, _) in found.items() if not bracket.monotone],
+    }
+
+
+def _grid(longest_ms: float, step_ms: float) -> list[float]:
+    """Give delays from 0 on, `step_ms` apart, and the longest."""
+    count = math.ceil(longest_ms / step_ms)
+    return [*(number * step_ms for number in range(count)), longest_ms]
+
+
+def _middle_ms(bracket: Bracket, total: Totals) -> float | None:
+    """Give the total delay half-way between the ends of a bracket; None where the boundary is not within the range."""
+    if bracket.low_ms is None or bracket.high_ms is None:
+        return None
+    return (total(bracket.low_ms) + total(bracket.high_ms)) / 2
+
+
+def theoretical_ms(config: RunConfig) -> float | None:
+    """Give the critical total delay of the loop as configured; None where nothing is known of it, or there is none."""
+    loop = configured_loop(config)
+    critical_s = math.inf if loop is None else critical_delay_s(loop)
+    return critical_s * 1000 if math.isfinite(critical_s) else None
+
+
+def search_all(
+    searches: Sequence[Search], *, jobs: int | None, tell: Tell
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
+    """Search them all, `jobs` at a time (None: one a core).
+
+    Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
+    Ctrl-C, which lets the searches under way end.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    failed: list[dict[str, Any]] = []
+    done = True
+    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
+    ignore = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only this one decides
+    with ProcessPoolExecutor(
+        jobs or os.cpu_count() or 1, mp_context=context, initializer=signal.signal, initargs=ignore
+    ) as executor:
+        futures = {executor.submit(search, each): each for each in searches}
+        try:
+            for future in as_completed(futures):
+                asked = futures[future]
+                try:
+                    found[asked.name] = future.result()
+                    tell(f"{asked.name}: {_sentence(found[asked.name])}")
+                except Exception as error:  # whatever it is, the other searches have nothing to do with it
+                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
+                    failed.append({"name": asked.name, "why": why})
+                    tell(f"{asked.name} failed: {why}")
+        except KeyboardInterrupt:
+            executor.shutdown(wait=True, cancel_futures=True)
+            done = False
+    return [found[each.name] for each in searches if each.name in found], failed, done
+
+
+def _sentence(run: Mapping[str, Any]) -> str:
+    parts = [f"{name} {'-' if run[f'{name}_ms'] is None else format(run[f'{name}_ms'], '.0f')}" for name in CRITERIA]
+    return ", ".join(parts) + " ms"
+
+
+def boundary(
+    config: BoundaryConfig, searches: Sequence[Search], out: Path, *, jobs: int | None, tell: Tell
+) -> tuple[dict[str, Any], bool]:
+    """Search, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also of what was found before Ctrl-C.
+
+    `searches` are those of `config`. Returns what is in `boundary.json`, and whether all was done.
+    """
+    runs, failed, done = search_all(searches, jobs=jobs, tell=tell)
+    entry = {
+        "schema": 1,
+        "config": config.model_dump(mode="json"),
+        "runs": runs,
+        "groups": groups_of(runs),
+        "failed": failed,
+    }
+    write_json(out / BOUNDARY, entry)
+    with (out / "boundary.csv").open("w", newline="", encoding="utf-8") as file:
+        rows = csv.DictWriter(file, FIELDS, extrasaction="ignore")
+        rows.writeheader()
+        rows.writerows(runs)
+    if runs:
+        save_figure(out, "boundary", boundary_figure(entry), "boundaries", "")
+    return entry, done

@@ -1,0 +1,75 @@
+"""What many seeds say together of a boundary: median, quartiles, and an exact interval of the median."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import quantile_test
+
+CRITERIA = ("onset", "departure", "completion")
+
+Run = Mapping[str, Any]
+
+
+def groups_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Summarise the runs of each route with each preset, and of all routes together where there are several."""
+    presets = list(dict.fromkeys(run["preset"] for run in runs))
+    routes: list[str | None] = list(dict.fromkeys(run["route"] for run in runs))
+    if len(routes) > 1:
+        routes.append(None)
+    groups = []
+    for preset in presets:
+        for route in routes:
+            chosen = [run for run in runs if run["preset"] == preset and route in (None, run["route"])]
+            if chosen:
+                groups.append({"route": route, "preset": preset, **_group(chosen)})
+    return groups
+
+
+def _group(runs: Sequence[Run]) -> dict[str, Any]:
+    return {
+        "n": len(runs),
+        "theory_ms": runs[0]["theory_ms"],  # of the loop, which is one for all routes
+        **{f"{name}_ms": summary([ordered_ms(run, name) for run in runs]) for name in CRITERIA},
+        "not_monotone": {name: sum(name in run["not_monotone"] for run in runs) for name in CRITERIA},
+    }
+
+
+def ordered_ms(run: Run, name: str) -> float:
+    """Give a run's boundary, or where it is among others that were found: infinite beyond the range, or below it."""
+    value_ms = run[f"{name}_ms"]
+    if value_ms is not None:
+        return float(value_ms)
+    return -math.inf if name in run["below"] else math.inf
+
+
+def summary(values_ms: Sequence[float]) -> dict[str, Any]:
+    """Give quartiles, median and its interval; values out of the searched range are infinite, and have their rank.
+
+    A quantile is null where it falls among those. The interval is of the two order statistics that hold the median of
+    what the values were drawn from with at least 95 %, whatever their distribution (`scipy.stats.quantile_test`; W. J.
+    Conover, Practical Nonparametric Statistics, section 3.2): null for fewer than six values, and an end is null where
+    it is out of range. `n` is how many values lie in the range.
+    """
+    quartiles = {f"p{share}": _quantile_ms(values_ms, share / 100) for share in (25, 50, 75)}
+    return {**quartiles, "interval": _interval(values_ms), "n": sum(math.isfinite(value) for value in values_ms)}
+
+
+def _quantile_ms(values_ms: Sequence[float], share: float) -> float | None:
+    """Interpolate linearly between neighbours; None where one that counts is out of range."""
+    ordered = sorted(values_ms)
+    place = share * (len(ordered) - 1)
+    first, rest = int(place), place - int(place)
+    value = ordered[first] if rest == 0 else (1 - rest) * ordered[first] + rest * ordered[first + 1]
+    return float(value) if math.isfinite(value) else None
+
+
+def _interval(values_ms: Sequence[float]) -> list[float | None] | None:
+    bounds = quantile_test(np.array(values_ms), q=0, p=0.5).confidence_interval(confidence_level=0.95)
+    ends = [float(bounds.low), float(bounds.high)]
+    if any(math.isnan(end) for end in ends):
+        return None
+    return [end if math.isfinite(end) else None for end in ends]

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from typing import Any
+
+from lavt.experiment.paper import paper
+from lavt.experiment.report_words import differences, equal_totals, headline, what_was_driven
+
+INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
+PAPER = paper()
+
+
+def entry(name: str, rate: float, loop_ms: float | None, p95_m: float | None = 0.1) -> dict[str, Any]:
+    video, control = INJECTED[name]
+    return {
+        "runs": 30,
+        "completed": round(30 * rate),
+        "completion_rate": rate,
+        "completion_interval": [max(rate - 0.1, 0.0), min(rate + 0.1, 1.0)],
+        "p95_m": p95_m,
+        "loop_ms": {"p50": loop_ms},
+        "injected_ms": {"video": video, "control": control},
+    }
+
+
+def conditions(*rates: float) -> dict[str, dict[str, Any]]:
+    return {name: entry(name, rate, 72.0 + sum(INJECTED[name])) for name, rate in zip(INJECTED, rates, strict=False)}
+
+
+def contrast(only_a: int, only_b: int, p: float) -> dict[str, Any]:
+    return {"a": "L3", "b": "L4", "pairs": 30, "only_a": only_a, "only_b": only_b, "p": p, "p_holm": p}
+
+
+def test_the_headline_says_where_completion_falls() -> None:
+    """It names the two conditions with the largest fall, by their loop latency, and from where on half are lost."""
+    said = headline("Virtual time", conditions(1.0, 1.0, 0.8, 0.3, 0.3, 0.0))
+    assert "L2 80 % (222 ms), L3 30 % (297 ms)" in said
+    assert "The largest fall is from 80 % at L2 to 30 % at L3: between 222 and 297 ms in all." in said
+    assert "Under half of the runs are completed from 297 ms on." in said
+
+
+def test_no_fall_is_told_where_there_is_none() -> None:
+    """Where completion stays, the headline says so; of one condition it says nothing of a fall; of none, nothing."""
+    assert "Completion does not fall with latency." in headline("It", conditions(1.0, 1.0, 1.0))
+    assert "fall" not in headline("It", conditions(1.0))
+    assert headline("It", {}) == ""
+    assert headline("It", {"L0": entry("L0", 1.0, None)}) == ""
+
+
+def test_many_routes_and_conditions_are_counted() -> None:
+    """Few names are listed, many are counted, and runs that are not valid are told."""
+    runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": index > 0} for index in range(20)]
+    said = what_was_driven(runs)
+    assert said.startswith("20 runs: 20 in virtual time, on 20 routes under the condition L0. 1 not valid")
+    assert "All of them count" in what_was_driven(runs[1:])
+
+
+def test_equal_total_delay_is_the_same_loop() -> None:
+    """Of conditions of equal total delay and equal loop the report says why they cannot be told apart."""
+    (said,) = equal_totals([contrast(1, 0, 1.0)], conditions(1, 1, 1, 0.3, 0.3, 0), PAPER["contrasts"])
+    assert said.startswith("L3 (225 + 0 ms) and L4 (150 + 75 ms) inject the same total, 225 ms, and so make the same")
+    assert "29 of 30 pairs are alike" in said
+    assert "only what sees one channel alone" in said
+    assert "Nor can the paper's counts be told apart (Fisher, p 0.78)." in said
+
+
+def test_what_the_data_contradict_is_not_said() -> None:
+    """Where equal totals differ significantly, or their loops do, the sentence on the same loop is not there."""
+    of = conditions(1, 1, 1, 0.9, 0.3, 0)
+    (told_apart,) = equal_totals([contrast(18, 0, 0.001)], of, [])
+    assert "they can be told apart" in told_apart
+    assert "same loop" not in told_apart
+    (other_loops,) = equal_totals([contrast(1, 0, 1.0)], {**of, "L4": entry("L4", 0.3, 350.0)}, [])
+    assert "same loop" not in other_loops
+    unequal = [{**contrast(0, 0, 1.0), "a": "L2"}]
+    assert equal_totals(unequal, of, []) == []
+    assert equal_totals([{**contrast(0, 0, 1.0), "p_holm": None}], of, []) == []
+
+
+def test_differences_are_told_where_they_are_true() -> None:
+    """Each reason stands only where the numbers are so, and none where a condition of the paper was not driven."""
+    sharp = differences(conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0), PAPER["conditions"])
+    assert any(
+        "falls more sharply here (100, 100, 100, 30, 30, 0 %) than in the paper (100, 93," in each for each in sharp
+    )
+    assert any(each.startswith("P95 at L0 is 0.10 m here and 2.30 m in the paper.") for each in sharp)
+    assert any("rails and a median barrier" in each for each in sharp)
+    assert any(each.startswith("L1 is completed in full here, and 28 times of 30") for each in sharp)
+    like = {
+        name: entry(name, theirs["completion_rate"], 100.0, theirs["p95_m"])
+        for name, theirs in PAPER["conditions"].items()
+    }
+    told = " ".join(differences(like, PAPER["conditions"]))
+    assert "sharply" not in told
+    assert "rails" not in told
+    assert "completed in full here" not in told
+    assert "gains" in told
+    assert differences(conditions(1.0, 1.0), PAPER["conditions"]) == []
+    steady = " ".join(differences(conditions(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), PAPER["conditions"]))
+    assert "sharply" not in steady
+    assert "rails" not in steady
+    few = {name: {**each, "runs": 5} for name, each in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
+    assert differences(few, PAPER["conditions"]) == []
