@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -57,7 +57,7 @@ def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
     )
 
 
-def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[dict[str, Any]]:
+def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[Mapping[str, Any]]:
     """Drive every value under every condition, and give the results."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     base["controller"]["preset"] = preset
@@ -77,7 +77,7 @@ def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -
     return list(driven.results)
 
 
-def cell(results: Sequence[dict[str, Any]]) -> str:
+def cell(results: Sequence[Mapping[str, Any]]) -> str:
     """Say how many of the drives were completed, and the median of their P95."""
     p95_m = [result["p95_m"] for result in results if result["ending"] == "completed"]
     share = f"{len(p95_m)}/{len(results)}"

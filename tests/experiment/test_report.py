@@ -167,7 +167,8 @@ def test_a_report_made_again_keeps_the_speed(sweep: Path) -> None:
 
 def test_unfinished_runs_are_left_out_and_named(sweep: Path) -> None:
     """A run without a result is named as left out; a directory without any finished run is an error."""
-    assert "did not finish: 4." in page_of(sweep)
+    assert "1 of the runs asked for failed and are in no number of this page" in page_of(sweep)
+    assert "4: it has no result" in page_of(sweep)
     with pytest.raises(WorkError, match=r"no finished run"):
         write_report(sweep / "report")
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -16,7 +17,7 @@ EACH_P95_M, MEAN_P95_M = 0.22, 0.15
 """Without delay the car's own 0.8 m to either line are never in question: what is left to see is the delay."""
 
 
-def at_l0(out: Path, *changes: str) -> list[dict[str, Any]]:
+def at_l0(out: Path, *changes: str) -> list[Mapping[str, Any]]:
     """Drive the paper's sweep without any delay."""
     sweep = ["conditions=[L0]", "network.inherent=loopback", "record.video=false", *changes]
     planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), sweep))
@@ -25,7 +26,7 @@ def at_l0(out: Path, *changes: str) -> list[dict[str, Any]]:
     return list(driven.results)
 
 
-def check(results: list[dict[str, Any]], repetitions: int) -> None:
+def check(results: list[Mapping[str, Any]], repetitions: int) -> None:
     assert sorted(result["route"] for result in results) == sorted([*ROUTES] * repetitions)
     for result in results:
         assert (result["ending"], result["valid"], result["lane_invasions"]) == ("completed", True, 0), result

@@ -36,7 +36,7 @@ def report(
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
-    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
     driven = {directory: _runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
@@ -49,7 +49,9 @@ def report(
     names = _sweep_names(list(driven))
     sweeps = {run: name for directory, name in names.items() for run in driven[directory]}
     make_directory(out)
-    page = write_report(out, run_dirs=runs, base=_base(list(driven), names), sweeps=sweeps, boundaries=boundaries)
+    failed = [each for directory in driven for each in read_failed(directory)]
+    base = _base(list(driven), names)
+    page = write_report(out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed)
     console.show(f"the report is {page}")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lavt.domain import NS_PER_MS, FloatArray
 from lavt.experiment.latency import frames_within
 from lavt.experiment.metrics import driving_interval
-from lavt.experiment.record import read_record
+from lavt.experiment.record import Record, read_record
 from lavt.experiment.table import MISSING, Table
 
 
@@ -39,7 +39,11 @@ class Drive:
 
 def read_drive(directory: Path, result: Mapping[str, Any]) -> Drive:
     """Read what the figures need of the run in `directory`."""
-    record = read_record(directory / "server.mcap", channels=("truth", "event", "route"))
+    return drive_of(read_record(directory / "server.mcap", channels=("truth", "event", "route")), directory, result)
+
+
+def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> Drive:
+    """Take what the figures need out of the server's record of a run."""
     began_ns, ended_ns, _ = driving_interval(record)
     truth = record.table("truth")
     truth_ns = truth.ints("mono_ns")

@@ -42,6 +42,8 @@ from lavt.experiment.results import read_json, write_json
 from lavt.experiment.summary import summarize
 
 TITLE = "LAVT: latency and driving"
+FAILED = "failed.json"
+"""In a sweep's directory: the runs that failed and why; absent or empty where none did."""
 
 
 def write_report(
@@ -53,24 +55,28 @@ def write_report(
     drives: Mapping[Path, Drive] | None = None,
     sweeps: Mapping[Path, str] | None = None,
     boundaries: Sequence[Mapping[str, Any]] = (),
+    failed: Sequence[Mapping[str, str]] = (),
 ) -> Path:
     """Write `summary.json` and `report/` into `sweep_dir`, and return the page's path.
 
     `run_dirs` are the runs to report, by default those under `sweep_dir/runs`. `base` is that of
     `summary.summarize`; `speed`, where it is not given, is kept from the summary that is already there. `drives` are
     those that were read already, by run directory. `sweeps` names, by run directory, the sweep a run is of, where runs
-    of several are reported together. `boundaries` are contents of `boundary.json`. A run whose result cannot be read is
-    left out, and the page says so. Raises `WorkError` where no run is left.
+    of several are reported together. `boundaries` are contents of `boundary.json`. `failed` are runs that
+    failed, as in `FAILED`; they and those whose result cannot be read are left out, and the page says so. Raises
+    `WorkError` where no run is left.
     """
     if run_dirs is None:
         run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
-    results, left_out = _read_results(run_dirs, sweeps or {})
+    results, unfinished = _read_results(run_dirs, sweeps or {})
+    known = {each["run"] for each in failed}
+    left_out = [*failed, *({"run": name, "because": "it has no result"} for name in unfinished if name not in known)]
     if not results:
         raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
     summary_path = sweep_dir / "summary.json"
     if speed is None and summary_path.is_file():
         speed = read_json(summary_path).get("speed")
-    summary = summarize([result for _, result in results], speed, base=base)
+    summary = {**summarize([result for _, result in results], speed, base=base), "failed": left_out}
     write_json(summary_path, summary)
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)
@@ -86,7 +92,7 @@ def write_report(
 def _sections(
     report: Report,
     sets: DriveSets,
-    left_out: Sequence[str],
+    left_out: Sequence[Mapping[str, str]],
     boundaries: Sequence[Mapping[str, Any]],
 ) -> list[page.Section]:
     """Make the page's sections in their order."""
@@ -109,6 +115,11 @@ def _sections(
         ("Clocks of two machines", clock_parts(report)),
         ("Versions and machine", machine_parts(report, sets)),
     ]
+
+
+def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
+    """Read which runs of a sweep failed, and why."""
+    return list(read_json(sweep_dir / FAILED)) if (sweep_dir / FAILED).is_file() else []
 
 
 def _read_results(

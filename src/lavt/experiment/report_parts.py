@@ -92,7 +92,7 @@ class Report:
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
-def head(report: Report, left_out: Sequence[str]) -> Parts:
+def head(report: Report, left_out: Sequence[Mapping[str, str]]) -> Parts:
     """Say in plain words what was driven and what came out."""
     runs, speed = report.summary["runs"], report.summary["speed"]
     parts = [page.paragraph(what_was_driven(runs))]
@@ -110,7 +110,8 @@ def head(report: Report, left_out: Sequence[str]) -> Parts:
         text = f"{speed['simulated_s']:.0f} s were simulated in {speed['wall_s']:.0f} s with {speed['jobs']} jobs: "
         parts.append(page.paragraph(f"{text}{factor:.1f} times as fast as real time.", note=True))
     if left_out:
-        parts.append(page.paragraph("Left out, because they did not finish: " + ", ".join(left_out) + ".", note=True))
+        parts.append(page.paragraph(f"{len(left_out)} of the runs asked for failed and are in no number of this page:"))
+        parts.append(page.bullets([f"{each['run']}: {each['because']}" for each in left_out]))
     return parts
 
 

@@ -11,6 +11,7 @@ import yaml
 
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
+from lavt.experiment.drives import Drive, drive_of
 from lavt.experiment.injection import recorded_reasons
 from lavt.experiment.netem_run import NETEM, netem_reasons
 from lavt.experiment.plan import PlannedRun
@@ -27,6 +28,11 @@ NETWORK = "network"
 
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     """Drive, compute the result, and leave everything in `out`; raises `WorkError` where nobody got to drive."""
+    return dict(drive_once(planned, out, progress=progress).result)
+
+
+def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> Drive:
+    """Do what `run_once` does, and give with the result what a report's figures need: the records were read anyway."""
     cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
     check_directory(out)
     digest = None
@@ -41,7 +47,7 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
         prepare_directory(out)
         _write_config(planned, out)
         drive_real(planned, out, progress=progress)
-    return compute_result(out, planned.identity, digest)
+    return _compute(out, planned.identity, digest)
 
 
 def config_text(planned: PlannedRun) -> str:
@@ -55,6 +61,10 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
     """Compute `result.json` from what the run left in `out`: its records and what the relay or netem said."""
+    return dict(_compute(out, identity, digest).result)
+
+
+def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Drive:
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
     reasons = []
     if identity["injection"] == "relay":
@@ -67,4 +77,4 @@ def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -
         reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
-    return result
+    return drive_of(server, out, result)

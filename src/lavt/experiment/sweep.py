@@ -6,7 +6,7 @@ import functools
 import itertools
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,14 +21,13 @@ from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
 from lavt.experiment.cluster import cluster
 from lavt.experiment.directory import prepare_directory
+from lavt.experiment.drives import Drive
 from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.report import write_report
+from lavt.experiment.report import FAILED, write_report
 from lavt.experiment.results import read_json, write_json
 from lavt.experiment.run import CONFIG, RESULT, config_text
 from lavt.experiment.workers import Workers, processes
 
-FAILED = "failed.json"
-"""In a sweep's directory: the runs that failed, and why; empty where none did."""
 SWEEP = "sweep.yaml"
 """The whole config of a sweep, in its directory."""
 
@@ -37,9 +36,10 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """Results of a sweep's runs, and the names of those that failed with the reason."""
+    """Results of a sweep's runs, the drives that were driven now, and which failed, with the reason."""
 
-    results: Sequence[dict[str, Any]]
+    results: Sequence[Mapping[str, Any]]
+    drives: Sequence[Drive]
     failed: Sequence[tuple[str, str]]
 
 
@@ -64,8 +64,9 @@ def run_all(
         with cluster(cluster_at, jobs) as workers:
             jobs = workers.jobs
             work.drive(workers, todo)
-    simulated = [result for result in work.results if result["time"] == "virtual"]
-    driven = Driven([*before, *work.results], work.failed)
+    results = [drive.result for drive in work.drives]
+    simulated = [result for result in results if result["time"] == "virtual"]
+    driven = Driven([*before, *results], work.drives, work.failed)
     if not simulated:
         return driven, None
     speed = {
@@ -85,7 +86,7 @@ class _Work:
     """What has become of the runs so far."""
 
     def __init__(self, runs_dir: Path, tell: Tell) -> None:
-        self.results: list[dict[str, Any]] = []
+        self.drives: list[Drive] = []
         self.failed: list[tuple[str, str]] = []
         self.runs_dir = runs_dir
         self._tell = tell
@@ -98,15 +99,15 @@ class _Work:
             for future in as_completed(futures):
                 planned = futures[future]
                 try:
-                    result = workers.collect(future.result(), self.runs_dir / planned.name)
+                    drive = workers.collect(future.result(), self.runs_dir / planned.name)
                 except BrokenExecutor:
                     broken.append(planned)
                 except Exception as error:  # whatever it is, the other runs have nothing to do with it
                     why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
                     self.fail(planned, why)
                 else:
-                    self.results.append(result)
-                    self._tell(f"{planned.name}: {result['ending']}")
+                    self.drives.append(drive)
+                    self._tell(f"{planned.name}: {drive.result['ending']}")
         except KeyboardInterrupt:
             workers.executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
             raise
@@ -166,10 +167,12 @@ def sweep(
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
     driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell, cluster_at=cluster_at)
-    write_json(out / FAILED, [{"run": name, "because": why} for name, why in driven.failed])
+    failed = [{"run": name, "because": why} for name, why in driven.failed]
+    write_json(out / FAILED, failed)
     if not driven.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
-    return write_report(out, speed=speed, base=base_of(config, planned)), driven
+    drives = {drive.directory: drive for drive in driven.drives}
+    return write_report(out, speed=speed, base=base_of(config, planned), drives=drives, failed=failed), driven
 
 
 def base_of(config: SweepConfig, planned: Sequence[PlannedRun]) -> dict[str, Any]:

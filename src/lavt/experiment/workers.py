@@ -13,14 +13,15 @@ import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from lavt.experiment.directory import prepare_directory
+from lavt.experiment.drives import Drive
 from lavt.experiment.plan import PlannedRun
-from lavt.experiment.run import RESULT, run_once
+from lavt.experiment.run import RESULT, drive_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +36,15 @@ class Workers:
         """Have a run driven; `collect` takes what comes of it."""
         if self.far:
             return self.executor.submit(run_elsewhere, planned)
-        return self.executor.submit(run_once, planned, directory)
+        return self.executor.submit(drive_once, planned, directory)
 
-    def collect(self, driven: Any, directory: Path) -> dict[str, Any]:
-        """Give the result of a run whose files are then in `directory`."""
-        if not self.far:
-            return dict(driven)
-        result, files = driven
-        put_files(files, directory)
-        return dict(result)
+    def collect(self, done: Any, directory: Path) -> Drive:
+        """Give a run whose files are then in `directory`."""
+        drive: Drive = done
+        if self.far:
+            drive, files = done
+            put_files(files, directory)
+        return replace(drive, directory=directory)
 
 
 @contextmanager
@@ -67,12 +68,12 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def run_elsewhere(planned: PlannedRun) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Drive a run into a directory that is gone afterwards; give its result, and its files by name."""
+def run_elsewhere(planned: PlannedRun) -> tuple[Drive, dict[str, bytes]]:
+    """Drive a run into a directory that is gone afterwards; give what came of it, and its files by name."""
     with TemporaryDirectory(prefix="lavt-") as scratch:
         directory = Path(scratch) / "run"
-        result = run_once(planned, directory)
-        return result, {path.name: path.read_bytes() for path in directory.iterdir()}
+        drive = drive_once(planned, directory)
+        return drive, {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
 def put_files(files: Mapping[str, bytes], directory: Path) -> None:
