@@ -34,6 +34,7 @@ SCHEMAS: dict[str, type[Section]] = {
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
     "paper.yaml": SweepConfig,
+    "paper_designed.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
     "server.yaml": ServerConfig,
     "sweep.yaml": SweepConfig,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import typing
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -78,8 +79,9 @@ def parse_config(kind: type[Config], data: Mapping[str, Any], where: str) -> Con
         raise UserError(f"{where}: " + "; ".join(_sentence(kind, problem) for problem in error.errors())) from error
 
 
-def conditions() -> dict[str, Condition]:
-    """Read all conditions of `netem/conditions.yaml`."""
+@functools.cache
+def conditions() -> Mapping[str, Condition]:
+    """Read all conditions of `netem/conditions.yaml`, once: a sweep asks for each of its runs."""
     path = shipped("netem/conditions.yaml")
     return {name: parse_config(Condition, entry, f"{path}: {name}") for name, entry in read_yaml(path).items()}
 

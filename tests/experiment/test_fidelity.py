@@ -111,3 +111,26 @@ def test_geometry_needs_a_known_road(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("lavt.build.vehicles.VEHICLES", {"simulator": None, "boat": None})
     with pytest.raises(UserError, match=r"choose vehicle.kind simulator instead of 'boat'"):
         build_loop(planned("vehicle.kind=boat", "fidelity=geometry"), tmp_path / "run")
+
+
+ORDERED = ("L0", "L1", "L2", "L3", "L4", "L5")
+
+
+def badness(fidelity: str, condition: str) -> tuple[bool, float]:
+    """How badly a drive went: one that was not completed is worse the earlier it ended, else its P95 decides."""
+    with TemporaryDirectory() as folder:
+        changes = (f"fidelity={fidelity}", f"network.condition={condition}", "network.inherent=paper_wifi5", "seed=3")
+        entry = run_once(planned(*changes), Path(folder) / "run")
+    return entry["ending"] != "completed", entry["p95_m"] if entry["ending"] == "completed" else -entry["distance_m"]
+
+
+def test_pixels_and_geometry_order_the_conditions_alike() -> None:
+    """From L0 to L5 drives get worse with total delay, with pixels as without them; L3 and L4, of equal delay, tie."""
+    orders = {}
+    for fidelity in ("pixels", "geometry"):
+        bad = {name: badness(fidelity, name) for name in ORDERED}
+        assert bad["L0"] < bad["L1"] < bad["L2"] < min(bad["L3"], bad["L4"]) <= max(bad["L3"], bad["L4"]) < bad["L5"], (
+            bad
+        )
+        orders[fidelity] = {name: failed for name, (failed, _) in bad.items()}
+    assert orders["pixels"] == orders["geometry"]

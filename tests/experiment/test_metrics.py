@@ -10,8 +10,9 @@ import pytest
 from lavt.experiment.latency import picture_age, rtp_timestamp
 from lavt.experiment.metrics import Measured, measure
 from lavt.experiment.record import read_record
+from lavt.experiment.steering import steering_reversals
 from lavt.experiment.table import Table, table_of
-from lavt.experiment.tracking import cross_track, sampled_by_distance, steering_reversals
+from lavt.experiment.tracking import cross_track, heading, p95_by_10m, per_km, route_length_m, sampled_by_distance
 
 MakeRun = Callable[..., Path]
 MICROSECOND_MS = 1e-3
@@ -165,6 +166,48 @@ def test_going_back_counts_the_first_passage() -> None:
     rows = [(0.0, 0.0), (1.0, 0.0), (0.5, 9.0), (0.9, 9.0), (2.0, 0.0)]
     samples = sampled_by_distance(table([{"progress_m": p, "cross_track_m": c} for p, c in rows]), "cross_track_m")
     assert samples.tolist() == [0.0] * 9
+
+
+def test_p95_up_to_every_ten_metres() -> None:
+    """An error of 1 m over 10 m and then of 3 m: 1 m up to 10 m, 3 m up to 20 m; the last 5 m are no whole ten."""
+    rows = [{"progress_m": 5.0 + index * 0.25, "cross_track_m": -1.0 if index <= 40 else 3.0} for index in range(101)]
+    assert p95_by_10m(table(rows)) == [1.0, 3.0]
+    assert p95_by_10m(table(rows[:41])) == [1.0]
+    assert p95_by_10m(table(rows[:40])) == []
+    assert p95_by_10m(table([])) == []
+
+
+def test_the_last_p95_is_that_of_the_whole_drive() -> None:
+    """Where a drive ends at a whole 10 m, the last of `p95_by_10m` is `p95_m`."""
+    rows = [{"progress_m": index * 0.25, "cross_track_m": np.sin(index)} for index in range(121)]
+    assert p95_by_10m(table(rows))[-1] == cross_track(table(rows))["p95_m"]
+
+
+def test_heading_by_hand() -> None:
+    """Of 0.1 rad left over half the way and 0.3 rad right over the other: mean 0.2, rms 0.2236, p95 0.3 rad."""
+    rows = [{"progress_m": index * 0.25, "heading_error_rad": 0.1 if index < 50 else -0.3} for index in range(100)]
+    statistics = heading(table(rows))
+    assert statistics["heading_mae_rad"] == pytest.approx(0.2)
+    assert statistics["heading_rms_rad"] == pytest.approx(np.sqrt(0.05))
+    assert statistics["heading_p95_rad"] == pytest.approx(0.3)
+    assert set(heading(table([])).values()) == {None}
+
+
+def test_rates_by_distance() -> None:
+    """Two events in 500 m are 4 a kilometre; where nothing was driven, or nobody knows, there is no rate."""
+    assert per_km(2, 500.0) == 4.0
+    assert per_km(0, 500.0) == 0.0
+    assert per_km(0, 0.0) is None
+    assert per_km(1, None) is None
+
+
+def test_the_route_says_how_long_it_is(make_run: MakeRun, tmp_path: Path) -> None:
+    """The length is that of the recorded route; without one it is null."""
+    entry = measured(make_run, tmp_path, seconds=6.0).entry
+    assert entry["route_length_m"] == 100.0
+    assert entry["lane_invasions_per_km"] == pytest.approx(1 / 0.048)
+    assert len(entry["p95_by_10m"]) == 4
+    assert route_length_m(table([])) is None
 
 
 @pytest.mark.parametrize(

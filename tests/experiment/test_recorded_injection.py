@@ -29,7 +29,7 @@ def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
     if drove:
         events = (("drive_began", BEGAN_S, ""), ("ending", ENDED_S, "completed"))
         tables["event"] = table([{"mono_ns": s * 10**9, "kind": kind, "detail": detail} for kind, s, detail in events])
-    return Record(Path("none"), True, tables, {})
+    return Record(Path("none"), True, tables, {}, ENDED_S * 10**9)
 
 
 def reasons(video: Sequence[Sample], control: Sequence[Sample], asked_ms: Mapping[str, float] = ASKED_MS) -> list[str]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -151,3 +152,76 @@ def test_ctrl_c_ends_a_sweep_and_keeps_what_is_finished(tmp_path: Path) -> None:
     assert "stopped; what was finished is kept" in said
     assert "Traceback" not in said
     assert list(out.glob("runs/*/result.json"))
+
+
+def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
+    config = load_config(
+        SweepConfig, shipped("configs/sweep.yaml"), ["fidelity=geometry", "conditions=[L0, L3, L5]", *changes]
+    )
+    return config, plan_sweep(config)
+
+
+def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
+    """The same runs have the same digests on a repeat, with one process, with two, and on Dask's workers."""
+    pytest.importorskip("distributed")
+    _, planned = geometry()
+    ways = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
+    digests = {}
+    for name, (jobs, cluster_at) in ways.items():
+        driven, _ = run_all(planned, tmp_path / name, jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+        assert driven.failed == []
+        digests[name] = {result["run"]: result["digest"] for result in driven.results}
+    assert len(set(digests["one"].values())) == len(planned)
+    assert digests["one"] == digests["two"] == digests["again"] == digests["dask"]
+    files = {path.relative_to(tmp_path / "dask") for path in (tmp_path / "dask").rglob("*")}
+    assert files == {path.relative_to(tmp_path / "two") for path in (tmp_path / "two").rglob("*")}
+
+
+def test_without_a_scheduler_there_is_a_sentence(tmp_path: Path) -> None:
+    """An address at which no Dask scheduler answers is an error of the user's, before anything is driven."""
+    pytest.importorskip("distributed")
+    _, planned = geometry()
+    with pytest.raises(UserError, match="no Dask scheduler answers at"):
+        run_all(planned, tmp_path, jobs=None, tell=lambda _: None, cluster_at="tcp://127.0.0.1:1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def kill_a_worker(left: list[int]) -> None:
+    """Kill the first process of this one's that is left to be killed, `left[0]` times."""
+    children = multiprocessing.active_children()
+    if left[0] and children:
+        left[0] -= 1
+        os.kill(int(children[0].pid or 0), signal.SIGKILL)
+
+
+@pytest.mark.realtime
+def test_a_process_that_dies_costs_no_run(tmp_path: Path) -> None:
+    """When a process is killed from outside, what it was at is driven again, and all runs are there in the end."""
+    _, planned = geometry()
+    left = [1]
+    driven, _ = run_all(planned, tmp_path, jobs=2, tell=lambda _: kill_a_worker(left))
+    assert left == [0]
+    assert driven.failed == []
+    assert sorted(result["run"] for result in driven.results) == sorted(each.name for each in planned)
+
+
+@pytest.mark.realtime
+def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
+    """A sweep killed (SIGKILL) in its middle and resumed gives the summary of one that nobody disturbed."""
+    sets = [part for change in ("fidelity=geometry", "conditions=[L0, L3, L5]") for part in ("--set", change)]
+    command = [sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--out"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run([*command, str(whole)], check=True, capture_output=True)
+    started = subprocess.Popen([*command, str(killed)], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    for _ in range(600):
+        if list(killed.glob("runs/*/result.json")):
+            break
+        pause(50 * NS_PER_MS)
+    started.kill()
+    started.wait()
+    assert 0 < len(list(killed.glob("runs/*/result.json"))) < 6
+    subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
+    summaries = [json.loads((out / "summary.json").read_text()) for out in (whole, killed)]
+    for summary in summaries:
+        del summary["speed"]
+    assert summaries[0] == summaries[1]

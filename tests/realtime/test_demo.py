@@ -13,11 +13,16 @@ RUN_KEYS = {
     "block", "order", "repetition", "seed", "digest", "ending", "valid", "invalid_because", "distance_m", "duration_s",
     "mae_m", "rms_m", "p95_m", "max_m", "heading_rms_rad", "steering_rms_rad", "steering_reversals_per_s", "collisions",
     "lane_invasions", "loop_ms", "picture_age_ms", "tau_v_ms", "tau_c_ms", "frames_sent", "frames_decoded",
-    "frames_unreadable",
+    "frames_unreadable", "route_length_m", "heading_mae_rad", "heading_p95_rad", "steering_rate_rms_radps",
+    "steering_reversals_per_km", "oscillation_hz", "collisions_per_km", "lane_invasions_per_km", "p95_by_10m",
+    "age_at_actuation_ms", "hops_ms",
 }  # fmt: skip
 CONDITION_KEYS = {
     "runs", "completed", "completion_rate", "completion_interval", "collisions_per_run", "lane_invasions_per_run",
-    "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms",
+    "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms", "completion_such_roads", "endings",
+    "routes", "p95_common_m", "p95_common_interval", "p95_worst_rank_m", "collisions_per_km", "lane_invasions_per_km",
+    "mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz", "picture_age_ms",
+    "age_at_actuation_ms", "hops_ms", "survival",
 }  # fmt: skip
 VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
 
@@ -33,7 +38,7 @@ def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
 
 def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
     """Every run, condition and group in summary.json has the keys that others rely on."""
-    assert set(demo.summary) == {"schema", "speed", "runs", "conditions", "real", "groups"}
+    assert set(demo.summary) == {"schema", "speed", "runs", "conditions", "contrasts", "real", "groups", "paper"}
     assert all(run.keys() >= RUN_KEYS for run in demo.summary["runs"])
     conditions = [*demo.summary["conditions"].values(), *demo.summary["real"].values()]
     assert all(set(condition) == CONDITION_KEYS for condition in conditions)

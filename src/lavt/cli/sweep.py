@@ -11,6 +11,7 @@ from lavt.cli import console
 from lavt.cli.progress import progress
 from lavt.config import SweepConfig
 from lavt.config_file import load_config
+from lavt.errors import UserError
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.results import read_json
 
@@ -26,21 +27,31 @@ def sweep(
     out: console.Out = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Runs at a time; default: one for each core.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where a sweep into --out was stopped.")] = False,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS|local", help="Have Dask's workers drive: those of a scheduler, or local ones."),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Drive routes under conditions, repeated, and report.
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
-    from lavt.experiment.sweep import open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     asked = load_config(SweepConfig, config, changes or [])
     planned = plan_sweep(asked)
+    if cluster and any(each.config.time == "real" for each in planned):
+        raise UserError("--cluster is for virtual time: real time is driven on this machine, set time: virtual")
     out = out or Path("out") / "sweep"
+    if cluster:
+        check_cluster(cluster)
     open_sweep(out, resume=resume)
-    with console.interruptible(), progress(f"sweep into {out}", len(planned)) as tell:
-        page, driven = drive_sweep(asked, planned, out, jobs=jobs, tell=tell)
+    missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
+    with console.interruptible(), progress(f"sweep into {out}", missing) as tell:
+        page, driven = drive_sweep(asked, planned, out, jobs=jobs, tell=tell, cluster_at=cluster)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
     if as_json:

@@ -85,7 +85,7 @@ def loop_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
                     names.setdefault((axes, about), (place, []))[1].append(name)
         for (axes, _), (place, together) in names.items():
             axes.annotate(", ".join(together), place, **_beside(kind))
-    _tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion, Wilson interval")
+    _tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion, exact interval")
     completion.set_ylim(-5, 105)
     _tidy(
         error, "loop latency, median (ms)", "cross-track error, p95 (m)", "Error of completed runs, bootstrap interval"

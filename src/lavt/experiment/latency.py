@@ -156,6 +156,15 @@ def picture_age(frames: Table, admissions: Table, began_ns: int, ended_ns: int) 
     return PictureAge(mean_ms, _percentile_of_ramps(youngest_ms, oldest_ms, 0.95))
 
 
+def ages_at_actuation_ns(frames: Table, admissions: Table, began_ns: int, ended_ns: int) -> IntArray:
+    """How old its picture was when each obeyed command was applied, whether or not an earlier one was made from it."""
+    commands = obeyed(admissions)
+    applied_ns = commands.ints("applied_mono_ns")
+    stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
+    known = (stamped_ns != MISSING) & (applied_ns >= began_ns) & (applied_ns <= ended_ns)
+    return np.asarray(applied_ns[known] - stamped_ns[known], np.int64)
+
+
 def _percentile_of_ramps(low: FloatArray, high: FloatArray, share: float) -> float:
     """Value below which a quantity that runs from `low` to `high` at slope 1, again and again, is for `share` of time.
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.clocks import Clocks, clocks
+from lavt.experiment.hops import hop_percentiles
 from lavt.experiment.latency import (
+    ages_at_actuation_ns,
     closure_ns,
     control_latency_ns,
     decoded_pictures,
@@ -22,8 +24,9 @@ from lavt.experiment.latency import (
     video_latency_ns,
 )
 from lavt.experiment.record import Record
+from lavt.experiment.steering import steering
 from lavt.experiment.table import MISSING, Table
-from lavt.experiment.tracking import cross_track, distance_m, reversals_per_s, root_mean_square, sampled_by_distance
+from lavt.experiment.tracking import cross_track, distance_m, heading, p95_by_10m, per_km, route_length_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +48,8 @@ def driving_interval(server: Record) -> tuple[int, int, str | None]:
     Without an event `drive_began` nothing was driven: the interval is empty. Without an event `ending` (a crash) it
     reaches to the last message of the record, and the ending is None.
     """
-    last_ns = max((int(table.mono_ns.max()) for table in server.tables.values() if len(table)), default=0)
     began_ns: int | None = None
-    ended_ns, ending = last_ns, None
+    ended_ns, ending = server.last_ns, None
     for kind, mono_ns, detail in _events(server.table("event")):
         if kind == "drive_began" and began_ns is None:
             began_ns = mono_ns
@@ -81,14 +83,18 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
     truth_ns = truth.ints("mono_ns")
     truth = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
     kinds = [kind for kind, mono_ns, _ in _events(server.table("event")) if began_ns <= mono_ns <= ended_ns]
+    driven_m, collisions, invasions = distance_m(truth), kinds.count("collision"), kinds.count("lane_invasion")
     return {
-        "distance_m": distance_m(truth),
+        "route_length_m": route_length_m(server.table("route")),
+        "distance_m": driven_m,
         **cross_track(truth),
-        "heading_rms_rad": root_mean_square(sampled_by_distance(truth, "heading_error_rad")),
-        "steering_rms_rad": root_mean_square(sampled_by_distance(truth, "steering_rad")),
-        "steering_reversals_per_s": reversals_per_s(truth),
-        "collisions": kinds.count("collision"),
-        "lane_invasions": kinds.count("lane_invasion"),
+        "p95_by_10m": p95_by_10m(truth),
+        **heading(truth),
+        **steering(truth),
+        "collisions": collisions,
+        "lane_invasions": invasions,
+        "collisions_per_km": per_km(collisions, driven_m),
+        "lane_invasions_per_km": per_km(invasions, driven_m),
     }
 
 
@@ -111,8 +117,10 @@ def _latencies(
     entry = {
         "loop_ms": percentiles_ms(paired.loop_ns),
         "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
+        "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, admissions, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
+        "hops_ms": hop_percentiles(server, client, frames, tau_c_ns, on_one_scale.offset),
         "frames_sent": len(frames),
         "frames_decoded": len(pictures),
         "frames_unreadable": int(np.sum(~pictures.flags("readable"))),

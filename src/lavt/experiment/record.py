@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import base64
 import json
-import struct
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
+from pydantic_core import from_json
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment.mcap_file import McapFile
+from lavt.experiment.mcap_reader import Messages, read_mcap
 from lavt.experiment.payload_json import json_schema, writer_of
 from lavt.experiment.table import EMPTY, Table, table_of
 
@@ -31,9 +29,6 @@ CHUNK_BYTES = 64 * 1024
 
 KEPT_MESSAGES = 64
 """And so many before them, a tenth of a second of a drive."""
-
-_LARGEST_BYTES = 256 * 1024 * 1024
-"""A longer entry is damage: a flipped bit in its length must not fill the memory."""
 
 VIDEO = "video"
 """The channel of access units; its payload has `stamp_ns` and `data`."""
@@ -149,17 +144,40 @@ def _video_json(payload: Any) -> bytes:
     ).encode()
 
 
+class _Tables(Mapping[str, Table]):
+    """Tables of a record's channels, each made when it is first asked for: half of them nobody looks at."""
+
+    def __init__(self, messages: Mapping[str, Messages]) -> None:
+        self._messages = messages
+        self._made: dict[str, Table] = {}
+
+    def __getitem__(self, channel: str) -> Table:
+        if channel not in self._made:
+            messages = self._messages[channel]
+            rows = from_json(b"[" + b",".join(messages.data) + b"]")
+            self._made[channel] = table_of(rows, messages.publish_ns, messages.log_ns)
+        return self._made[channel]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._messages)
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+
 @dataclass(frozen=True, slots=True)
 class Record:
     """One side's record, read back.
 
-    `complete` is False for a file that was never finished, or is damaged: then it holds what came before.
+    `complete` is False for a file that was never finished, or is damaged: then it holds what came before. `last_ns` is
+    when the last message was recorded, on the host's monotonic clock; 0 of nothing.
     """
 
     path: Path
     complete: bool
     tables: Mapping[str, Table]
     annotations: Mapping[str, Mapping[str, str]]
+    last_ns: int
 
     def table(self, channel: str) -> Table:
         """Give the messages of a channel; no rows where nothing was recorded."""
@@ -168,39 +186,11 @@ class Record:
     def video(self) -> list[tuple[int, bytes]]:
         """Read the access units and the stamp (ns) of each from the file; they are too large to be kept."""
         units = []
-        for item in _readable_records(self.path, _Outcome(), topics={"/" + VIDEO}):
-            if isinstance(item, tuple):
-                fields = json.loads(item[1].data)
-                stamp_ns = fields["timestamp"]["sec"] * NS_PER_S + fields["timestamp"]["nsec"]
-                units.append((stamp_ns, base64.b64decode(fields["data"])))
+        for data in read_mcap(self.path, lambda topic: topic == "/" + VIDEO).topics.get("/" + VIDEO, Messages()).data:
+            fields = from_json(data)
+            stamp_ns = fields["timestamp"]["sec"] * NS_PER_S + fields["timestamp"]["nsec"]
+            units.append((stamp_ns, base64.b64decode(fields["data"])))
         return units
-
-
-class _Outcome:
-    """Whether reading came to the proper end of the file."""
-
-    complete = False
-
-
-def _readable_records(
-    path: Path, outcome: _Outcome, topics: Container[str] | None
-) -> Iterator[tuple[str, Message] | Metadata]:
-    """Messages of `topics` (None: all) and metadata in file order, up to the end or to the first damage."""
-    topic_of: dict[int, str] = {}
-    with path.open("rb") as stream:
-        try:
-            for item in StreamReader(stream, validate_crcs=True, record_size_limit=_LARGEST_BYTES).records:
-                if isinstance(item, Channel):
-                    topic_of[item.id] = item.topic
-                elif isinstance(item, Message):
-                    topic = topic_of[item.channel_id]
-                    if topics is None or topic in topics:
-                        yield topic, item
-                elif isinstance(item, Metadata):
-                    yield item
-        except (McapError, struct.error, ValueError, KeyError, RuntimeError):
-            return  # a cut or damaged end: what came before is whole, each chunk has its own checksum
-        outcome.complete = True
 
 
 def read_record(path: Path, channels: Container[str] | None = None) -> Record:
@@ -210,21 +200,12 @@ def read_record(path: Path, channels: Container[str] | None = None) -> Record:
     """
     if not path.is_file():
         raise WorkError(f"there is no record at {path}")
-    outcome = _Outcome()
-    rows: dict[str, list[dict[str, Any]]] = {}
-    times: dict[str, tuple[list[int], list[int]]] = {}
-    annotations: dict[str, dict[str, str]] = {}
-    for item in _readable_records(path, outcome, topics=None):
-        if isinstance(item, Metadata):
-            annotations[item.name] = dict(item.metadata)
-            continue
-        topic, message = item
+
+    def wanted(topic: str) -> bool:
         channel = topic.removeprefix("/")
-        if channel == VIDEO or (channels is not None and channel not in channels):
-            continue
-        rows.setdefault(channel, []).append(json.loads(message.data))
-        mono_ns, wall_ns = times.setdefault(channel, ([], []))
-        mono_ns.append(message.publish_time)
-        wall_ns.append(message.log_time)
-    tables = {channel: table_of(rows[channel], *times[channel]) for channel in rows}
-    return Record(path=path, complete=outcome.complete, tables=tables, annotations=annotations)
+        return channel != VIDEO and (channels is None or channel in channels)
+
+    content = read_mcap(path, wanted)
+    messages = {topic.removeprefix("/"): each for topic, each in content.topics.items() if each.data}
+    last_ns = max((max(each.publish_ns) for each in messages.values()), default=0)
+    return Record(path, content.complete, _Tables(messages), content.metadata, last_ns)

@@ -1,33 +1,59 @@
-"""Intervals: how far a number from few runs can be trusted."""
+"""Intervals and corrections: how far a number from few runs can be trusted. `docs/metrics.md` says what they mean."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import binomtest, bootstrap
 
 from lavt.streams import stream
 
 RESAMPLES = 10_000
 
 
-def wilson_interval(successes: int, trials: int) -> list[float] | None:
-    """Wilson score interval of a proportion, 95 %; None without trials."""
+def exact_interval(successes: int, trials: int) -> list[float] | None:
+    """Clopper-Pearson interval of a proportion, 95 %; None without trials.
+
+    It holds for the mean of the trials' probabilities, whatever each of them is (Hoeffding, Annals of Mathematical
+    Statistics 27, 1956, theorem 4): trials on different routes may be pooled.
+    """
     if trials == 0:
         return None
-    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="wilson")
-    return [float(interval.low), float(interval.high)]
+    return list(_clopper_pearson(successes, trials))
+
+
+@cache  # a sweep asks for few different ones, many times each
+def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
+    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
+    return float(interval.low), float(interval.high)
 
 
 def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
-    """Percentile bootstrap interval of the mean over runs, 95 %; None for fewer than two.
+    """Percentile bootstrap interval of the mean, 95 %; None for fewer than two values.
 
-    The resampling has a fixed seed: the same runs give the same interval.
+    The resampling has a fixed seed: the same values give the same interval.
     """
     if len(values) < 2:
         return None
-    chosen = stream(0, "bootstrap interval").integers(0, len(values), size=(RESAMPLES, len(values)))
-    means = np.asarray(values, np.float64)[chosen].mean(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return [float(low), float(high)]
+    interval = bootstrap(
+        (np.asarray(values, np.float64),),
+        np.mean,
+        n_resamples=RESAMPLES,
+        confidence_level=0.95,
+        method="percentile",
+        random_state=stream(0, "bootstrap interval"),
+    ).confidence_interval
+    return [float(interval.low), float(interval.high)]
+
+
+def holm(p_values: Sequence[float | None]) -> list[float | None]:
+    """Correct p values of tests planned together by Holm's method; None, where nothing was tested, stays None."""
+    tested = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
+    corrected: list[float | None] = [None] * len(p_values)
+    largest = 0.0
+    for rank, (p, index) in enumerate(tested):
+        largest = max(largest, min(1.0, (len(tested) - rank) * p))
+        corrected[index] = largest
+    return corrected

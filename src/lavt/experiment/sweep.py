@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import functools
 import itertools
-import multiprocessing
 import os
-import signal
+import shutil
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,16 @@ from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
+from lavt.experiment.cluster import cluster
 from lavt.experiment.directory import prepare_directory
 from lavt.experiment.plan import PlannedRun, plan_sweep
 from lavt.experiment.report import write_report
-from lavt.experiment.results import read_json
-from lavt.experiment.run import CONFIG, RESULT, config_text, run_once
+from lavt.experiment.results import read_json, write_json
+from lavt.experiment.run import CONFIG, RESULT, config_text
+from lavt.experiment.workers import Workers, processes
 
+FAILED = "failed.json"
+"""In a sweep's directory: the runs that failed, and why; empty where none did."""
 SWEEP = "sweep.yaml"
 """The whole config of a sweep, in its directory."""
 
@@ -41,54 +44,96 @@ class Driven:
 
 
 def run_all(
-    planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell
+    planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell, cluster_at: str | None = None
 ) -> tuple[Driven, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one a core), those in real time one by one.
 
-    Returns the results, those of runs that were driven before among them, and the entry `speed` of the summary: of the
-    virtual runs that were driven now, None where there were none.
+    With `cluster_at` they are driven by Dask's workers there. Returns the results, those of runs that were driven
+    before among them, and the entry `speed` of the summary: of the virtual runs that were driven now, None where there
+    were none.
     """
-    jobs = jobs or os.cpu_count() or 1
     clock = MachineClock()
     start_ns = clock.now().mono_ns
-    results: list[dict[str, Any]] = []
-    failed: list[tuple[str, str]] = []
-    todo = []
-    for each in planned:
-        finished = runs_dir / each.name / RESULT
-        if finished.is_file():
-            results.append(read_json(finished))
-        else:
-            todo.append(each)
-    before = len(results)
-    jobs = 1 if any(each.config.time == "real" for each in todo) else jobs
-    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
-    ignore = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only this one decides
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=signal.signal, initargs=ignore) as executor:
-        futures = {executor.submit(run_once, each, runs_dir / each.name): each for each in todo}
-        try:
-            for future in as_completed(futures):
-                name = futures[future].name
-                try:
-                    result = future.result()
-                    results.append(result)
-                    tell(f"{name}: {result['ending']}")
-                except Exception as error:  # whatever it is, the other runs have nothing to do with it
-                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
-                    failed.append((name, why))
-                    tell(f"{name} failed: {why}")
-        except KeyboardInterrupt:
-            executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
-            raise
-    simulated = [result for result in results[before:] if result["time"] == "virtual"]
+    before = [read_json(runs_dir / each.name / RESULT) for each in planned if is_finished(runs_dir / each.name)]
+    todo = [each for each in planned if not is_finished(runs_dir / each.name)]
+    work = _Work(runs_dir, tell)
+    if cluster_at is None:
+        jobs = 1 if any(each.config.time == "real" for each in todo) else jobs or os.cpu_count() or 1
+        _drive_in_processes(work, todo, jobs)
+    elif todo:
+        with cluster(cluster_at, jobs) as workers:
+            jobs = workers.jobs
+            work.drive(workers, todo)
+    simulated = [result for result in work.results if result["time"] == "virtual"]
+    driven = Driven([*before, *work.results], work.failed)
     if not simulated:
-        return Driven(results, failed), None
+        return driven, None
     speed = {
         "simulated_s": sum(result["duration_s"] or 0.0 for result in simulated),
         "wall_s": (clock.now().mono_ns - start_ns) / NS_PER_S,
         "jobs": jobs,
     }
-    return Driven(results, failed), speed
+    return driven, speed
+
+
+def is_finished(directory: Path) -> bool:
+    """Whether a run was driven to its end, however that was."""
+    return (directory / RESULT).is_file()
+
+
+class _Work:
+    """What has become of the runs so far."""
+
+    def __init__(self, runs_dir: Path, tell: Tell) -> None:
+        self.results: list[dict[str, Any]] = []
+        self.failed: list[tuple[str, str]] = []
+        self.runs_dir = runs_dir
+        self._tell = tell
+
+    def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
+        """Have runs driven; give those that were not, because a worker's process died."""
+        futures = {workers.submit(each, self.runs_dir / each.name): each for each in todo}
+        broken = []
+        try:
+            for future in as_completed(futures):
+                planned = futures[future]
+                try:
+                    result = workers.collect(future.result(), self.runs_dir / planned.name)
+                except BrokenExecutor:
+                    broken.append(planned)
+                except Exception as error:  # whatever it is, the other runs have nothing to do with it
+                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
+                    self.fail(planned, why)
+                else:
+                    self.results.append(result)
+                    self._tell(f"{planned.name}: {result['ending']}")
+        except KeyboardInterrupt:
+            workers.executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
+            raise
+        return broken
+
+    def fail(self, planned: PlannedRun, why: str) -> None:
+        """Note that a run failed."""
+        self.failed.append((planned.name, why))
+        self._tell(f"{planned.name} failed: {why}")
+
+
+def _drive_in_processes(work: _Work, todo: Sequence[PlannedRun], jobs: int) -> None:
+    """Drive, also when a process dies, which takes the pool with it: what it was at is driven again, alone."""
+    while todo:
+        with processes(jobs) as workers:
+            broken = work.drive(workers, todo)
+        begun = [each for each in broken if (work.runs_dir / each.name).exists()]
+        _remove_unfinished(broken, work.runs_dir)
+        for each in begun:
+            with processes(1) as alone:
+                if work.drive(alone, [each]):
+                    work.fail(each, "the process that drove it died, twice")
+        todo = [each for each in broken if each not in begun]
+        if todo and not begun:
+            for each in todo:
+                work.fail(each, "the processes that were to drive it died before they began")
+            return
 
 
 def open_sweep(out: Path, *, resume: bool) -> None:
@@ -100,20 +145,28 @@ def open_sweep(out: Path, *, resume: bool) -> None:
 
 
 def sweep(
-    config: SweepConfig, planned: Sequence[PlannedRun], out: Path, *, jobs: int | None, tell: Tell
+    config: SweepConfig,
+    planned: Sequence[PlannedRun],
+    out: Path,
+    *,
+    jobs: int | None,
+    tell: Tell,
+    cluster_at: str | None = None,
 ) -> tuple[Path, Driven]:
     """Drive what is missing of a sweep into `out`, and write its config, summary and report.
 
-    `planned` are the runs of `config`. Returns the report's page, and what was driven.
+    `planned` are the runs of `config`; `cluster_at` is that of `run_all`. Returns the report's page, and what was
+    driven. Runs that failed are in `out`/failed.json, and in summary and report.
     """
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     for each in planned:
-        if (runs_dir / each.name / RESULT).is_file():
+        if is_finished(runs_dir / each.name):
             _check_config(each, runs_dir / each.name)
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
-    driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell)
+    driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell, cluster_at=cluster_at)
+    write_json(out / FAILED, [{"run": name, "because": why} for name, why in driven.failed])
     if not driven.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
     return write_report(out, speed=speed, base=base_of(config, planned)), driven
@@ -153,7 +206,5 @@ def _remove_unfinished(planned: Sequence[PlannedRun], runs_dir: Path) -> None:
     """A run that was killed left a directory without a result: it is driven again, from an empty one."""
     for each in planned:
         directory = runs_dir / each.name
-        if directory.is_dir() and not (directory / RESULT).is_file():
-            for file in directory.iterdir():
-                file.unlink()
-            directory.rmdir()
+        if directory.is_dir() and not is_finished(directory):
+            shutil.rmtree(directory)

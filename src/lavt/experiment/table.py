@@ -101,19 +101,21 @@ EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
     """Make columns of `rows`; a field that a row lacks is null there."""
-    names = dict.fromkeys(name for row in rows for name in row)
+    names = dict.fromkeys(name for fields in {tuple(row): None for row in rows} for name in fields)
     columns = {name: _column([row.get(name) for row in rows]) for name in names}
     return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
-    kinds = {type(value) for value in values} - {type(None)}
-    if kinds == {bool} and None not in values:
+    kinds = set(map(type, values))
+    nothing = type(None) in kinds
+    kinds.discard(type(None))
+    if kinds == {bool} and not nothing:
         return np.array(values, np.bool_)
-    if kinds == {int} and all(value is None or abs(value) <= -(MISSING + 1) for value in values):
-        return np.array([MISSING if value is None else value for value in values], np.int64)
+    if kinds == {int} and max(abs(value) for value in values if value is not None) <= -(MISSING + 1):
+        return np.array([MISSING if value is None else value for value in values] if nothing else values, np.int64)
     if kinds <= {int, float} and kinds != {int}:  # whole numbers too large for 64 bits stay what they are
-        return np.array([np.nan if value is None else value for value in values], np.float64)
+        return np.array(values, np.float64)
     column = np.empty(len(values), object)
     column[:] = values
     return column

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lavt.domain import NS_PER_S, FloatArray
+from lavt.domain import FloatArray
 from lavt.experiment.table import Table
 
 STEP_M = 0.25
 """Errors are sampled by distance, so that a car that creeps or waits does not count more than one that drives."""
 
-REVERSAL_DEADBAND_RAD = 0.01
-"""Smallest turn back of the road wheels that counts as a steering reversal (0.57 degrees)."""
+PLACES_M = 10
+"""Of every so many metres driven, the error up to there is kept: runs that ended early are compared by it."""
 
 
 def sampled_by_distance(truth: Table, name: str) -> FloatArray:
@@ -44,6 +44,26 @@ def cross_track(truth: Table) -> dict[str, float | None]:
     }
 
 
+def p95_by_10m(truth: Table) -> list[float]:
+    """95th percentile of the distance from the lane's centre, from the start to 10 m, 20 m, .. of progress.
+
+    Whole tens only: nothing where less than 10 m were driven.
+    """
+    error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
+    a_place = round(PLACES_M / STEP_M)
+    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(a_place, len(error_m), a_place)]
+
+
+def heading(truth: Table) -> dict[str, float | None]:
+    """Mean, root mean square and 95th percentile of the angle between the car and the lane, in radians."""
+    error_rad = np.abs(sampled_by_distance(truth, "heading_error_rad"))
+    return {
+        "heading_mae_rad": float(error_rad.mean()) if len(error_rad) else None,
+        "heading_rms_rad": root_mean_square(error_rad),
+        "heading_p95_rad": float(np.percentile(error_rad, 95)) if len(error_rad) else None,
+    }
+
+
 def root_mean_square(values: FloatArray) -> float | None:
     """Root of the mean square; None of nothing."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
@@ -56,25 +76,12 @@ def distance_m(truth: Table) -> float | None:
     return float(progress_m.max() - progress_m[0]) if len(progress_m) else None
 
 
-def steering_reversals(steering_rad: FloatArray) -> int:
-    """How often the steering turned back by more than `REVERSAL_DEADBAND_RAD` from its last extreme."""
-    count, direction = 0, 0
-    extreme = lowest = highest = steering_rad[0] if len(steering_rad) else 0.0
-    for angle in steering_rad.tolist():
-        if direction == 0:  # not yet known: the first turn sets it and is no reversal
-            lowest, highest = min(lowest, angle), max(highest, angle)
-            if highest - lowest > REVERSAL_DEADBAND_RAD:
-                direction, extreme = (1 if angle == highest else -1), angle
-        elif (angle - extreme) * direction > 0:
-            extreme = angle
-        elif (extreme - angle) * direction > REVERSAL_DEADBAND_RAD:
-            count, direction, extreme = count + 1, -direction, angle
-    return count
+def per_km(count: int, driven_m: float | None) -> float | None:
+    """Give how often something happened per kilometre driven; None where nothing was driven."""
+    return count / (driven_m / 1000) if driven_m else None
 
 
-def reversals_per_s(truth: Table) -> float | None:
-    """Steering reversals per second of the recorded truth."""
-    mono_ns = truth.ints("mono_ns")
-    if len(mono_ns) < 2 or mono_ns[-1] <= mono_ns[0]:
-        return None
-    return steering_reversals(truth.floats("steering_rad")) / (float(mono_ns[-1] - mono_ns[0]) / NS_PER_S)
+def route_length_m(route: Table) -> float | None:
+    """How far it is from the route's start to its goal, as the server recorded it; None where it did not."""
+    lengths_m = route.floats("length_m")
+    return float(lengths_m[0]) if len(lengths_m) and np.isfinite(lengths_m[0]) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import hashlib
 from collections.abc import Callable
@@ -77,8 +78,9 @@ class VirtualLoop:
     digest: Any
 
 
+@functools.cache
 def read_costs() -> Costs:
-    """Read what the loop costs."""
+    """Read what the loop costs, once."""
     return load_config(Costs, shipped("configs/costs.yaml"))
 
 

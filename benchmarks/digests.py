@@ -1,0 +1,58 @@
+"""Drive the paper's campaign several times, each time by other workers, and compare the digests of every run.
+
+    python benchmarks/digests.py [--fidelity geometry] [--repetitions 5] [--jobs 2]
+
+180 runs at fidelity geometry are the default; `--fidelity video --repetitions 1` are 36 with pixels and H.264. Each is
+driven by as many processes as `--jobs` says, once more by as many, by one, and by Dask's workers on this machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from lavt.clock import MachineClock
+from lavt.config import SweepConfig
+from lavt.config_file import load_config, shipped
+from lavt.domain import NS_PER_S
+from lavt.experiment.plan import PlannedRun, plan_sweep
+from lavt.experiment.sweep import run_all
+
+
+def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:
+    """Drive everything, and give the digest of each run."""
+    with TemporaryDirectory() as directory:
+        driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+    if driven.failed:
+        raise SystemExit(f"failed: {driven.failed}")
+    return {result["run"]: result["digest"] for result in driven.results}
+
+
+def main() -> None:
+    """Print for each way of driving how many digests differ from those of the first, and how long it took."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fidelity", default="geometry", choices=["video", "pixels", "geometry"])
+    parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    changes = [f"fidelity={options.fidelity}", f"repetitions={options.repetitions}"]
+    planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), changes))
+    ways = {
+        f"{options.jobs} jobs": (options.jobs, None),
+        f"{options.jobs} jobs, again": (options.jobs, None),
+        "1 job": (1, None),
+        f"Dask, {options.jobs} workers": (options.jobs, "local"),
+    }
+    clock, first = MachineClock(), None
+    for name, (jobs, cluster_at) in ways.items():
+        begin_ns = clock.now().mono_ns
+        found = digests(planned, jobs, cluster_at)
+        first = first or found
+        different = sum(first[run] != digest for run, digest in found.items())
+        took_s = (clock.now().mono_ns - begin_ns) / NS_PER_S
+        print(f"{name}: {len(found)} runs, {different} digests differ, {took_s:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Who drives the runs of a sweep: processes of this machine, or Dask's workers on many.
+
+Either is a `concurrent.futures` executor (`cluster.py` has Dask's). Processes write a run's directory where it belongs;
+workers elsewhere, which need not see this machine's files, drive into a directory of their own and send it back.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from lavt.experiment.directory import prepare_directory
+from lavt.experiment.plan import PlannedRun
+from lavt.experiment.run import RESULT, run_once
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """An executor with room for `jobs` runs at a time; `far` ones send back what they have written."""
+
+    executor: Executor
+    jobs: int
+    far: bool
+
+    def submit(self, planned: PlannedRun, directory: Path) -> Future[Any]:
+        """Have a run driven; `collect` takes what comes of it."""
+        if self.far:
+            return self.executor.submit(run_elsewhere, planned)
+        return self.executor.submit(run_once, planned, directory)
+
+    def collect(self, driven: Any, directory: Path) -> dict[str, Any]:
+        """Give the result of a run whose files are then in `directory`."""
+        if not self.far:
+            return dict(driven)
+        result, files = driven
+        put_files(files, directory)
+        return dict(result)
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Workers]:
+    """Give processes of this machine, which end with this one, whatever ends it."""
+    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process) as executor:
+        yield Workers(executor, jobs, far=False)
+
+
+def _begin_process() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only the parent decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End when the parent is gone, so that nobody writes into a sweep that is resumed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def run_elsewhere(planned: PlannedRun) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Drive a run into a directory that is gone afterwards; give its result, and its files by name."""
+    with TemporaryDirectory(prefix="lavt-") as scratch:
+        directory = Path(scratch) / "run"
+        result = run_once(planned, directory)
+        return result, {path.name: path.read_bytes() for path in directory.iterdir()}
+
+
+def put_files(files: Mapping[str, bytes], directory: Path) -> None:
+    """Write a run's files, the result last: what says that a run is finished must not be there before the rest."""
+    prepare_directory(directory)
+    for name in sorted(files, key=lambda name: name == RESULT):
+        unfinished = directory / f"{name}.part"
+        unfinished.write_bytes(files[name])
+        unfinished.replace(directory / name)

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+
+from lavt.cli.progress import left_words, progress
+from lavt.domain import NS_PER_S, Now
+
+
+class Steps:
+    """A clock that is 30 s later at each look."""
+
+    def __init__(self) -> None:
+        self.looks = 0
+
+    def now(self) -> Now:
+        """Look."""
+        self.looks += 1
+        return Now(self.looks * 30 * NS_PER_S, 0)
+
+
+def test_each_line_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> None:
+    """Where no terminal is, each piece that is done is a line with the number done and the time left at this pace."""
+    with progress("driving", 5, clock=Steps()) as tell:
+        tell("one: completed")
+        tell("two: collision")
+    assert capsys.readouterr().err.splitlines() == [
+        "driving: 5 runs",
+        "1 of 5, 2 min left: one: completed",
+        "2 of 5, 2 min left: two: collision",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("left_s", "words"), [(0, "0 s left"), (59.4, "59 s left"), (600, "10 min left"), (7200, "2 h left")]
+)
+def test_the_time_left_is_said_in_round_figures(left_s: float, words: str) -> None:
+    """Seconds below a minute, minutes below two hours, then hours."""
+    assert left_words(left_s) == words
