@@ -318,13 +318,14 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     found, failed, done = search_all(plan_boundary(small("repetitions=3")), jobs=1, tell=told.append)
     assert (len(found), done) == (2, True)
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
-    assert "a_key paper_calibrated 01 failed: the vehicle was never armed" in told
+    assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
 
 
-def test_what_was_found_before_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Ctrl-C after the second seed: nothing more is begun, and what was found is in boundary.json and the pictures."""
+def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Ctrl-C after the second seed: what was under way is taken too, nothing more, and the files hold it."""
     monkeypatch.setattr(boundary_module, "search", lambda asked: run_entry("a_key", int(asked.name[-2:])))
     monkeypatch.setattr(boundary_module, "ProcessPoolExecutor", _InThisProcess)
+    monkeypatch.setattr(_InThisProcess, "begins", 3)
     told: list[str] = []
 
     def tell(line: str) -> None:
@@ -334,18 +335,20 @@ def test_what_was_found_before_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch
 
     asked = small("repetitions=5")
     found, done = boundary_module.boundary(asked, plan_boundary(asked), tmp_path, jobs=1, tell=tell)
-    assert (len(told), done) == (2, False)
-    assert len(found["runs"]) == 2
+    assert (len(told), done) == (3, False)
+    assert [run["repetition"] for run in found["runs"]] == [0, 1, 2]
     assert json.loads((tmp_path / "boundary.json").read_text()) == found
-    assert (tmp_path / "boundary.csv").read_text().count("\n") == 3
+    assert (tmp_path / "boundary.csv").read_text().count("\n") == 4
     assert (tmp_path / "boundary.png").stat().st_size > 1000
 
 
 class _InThisProcess:
-    """An executor that needs no processes."""
+    """An executor that needs no processes; of what is submitted it only begins some."""
+
+    begins = 100
 
     def __init__(self, *_: Any, **__: Any) -> None:
-        pass
+        self.futures: list[Any] = []
 
     def __enter__(self) -> _InThisProcess:
         return self
@@ -354,16 +357,19 @@ class _InThisProcess:
         pass
 
     def shutdown(self, **_: Any) -> None:
-        pass
+        for future in self.futures:
+            future.cancel()
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         from concurrent.futures import Future
 
         future: Future[Any] = Future()
-        try:
-            future.set_result(function(*arguments))
-        except WorkError as error:
-            future.set_exception(error)
+        self.futures.append(future)
+        if len(self.futures) <= self.begins:
+            try:
+                future.set_result(function(*arguments))
+            except WorkError as error:
+                future.set_exception(error)
         return future
 
 

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -174,7 +174,7 @@ def search_all(
     """Search them all, `jobs` at a time (None: one a core).
 
     Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
-    Ctrl-C, which lets the searches under way end.
+    Ctrl-C, which lets the searches under way end, and takes what they found.
     """
     found: dict[str, dict[str, Any]] = {}
     failed: list[dict[str, Any]] = []
@@ -185,19 +185,25 @@ def search_all(
         jobs or os.cpu_count() or 1, mp_context=context, initializer=signal.signal, initargs=ignore
     ) as executor:
         futures = {executor.submit(search, each): each for each in searches}
+
+        def take(future: Future[dict[str, Any]]) -> None:
+            asked = futures.pop(future)
+            try:
+                found[asked.name] = future.result()
+            except Exception as error:  # whatever it is, the other searches have nothing to do with it
+                why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
+                failed.append({"name": asked.name, "why": why})
+            said = _sentence(found[asked.name]) if asked.name in found else f"failed: {failed[-1]['why']}"
+            tell(f"{asked.name}: {said}")
+
         try:
-            for future in as_completed(futures):
-                asked = futures[future]
-                try:
-                    found[asked.name] = future.result()
-                    tell(f"{asked.name}: {_sentence(found[asked.name])}")
-                except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
-                    failed.append({"name": asked.name, "why": why})
-                    tell(f"{asked.name} failed: {why}")
+            for future in as_completed(list(futures)):
+                take(future)
         except KeyboardInterrupt:
             executor.shutdown(wait=True, cancel_futures=True)
             done = False
+            for future in [each for each in futures if not each.cancelled()]:
+                take(future)
     return [found[each.name] for each in searches if each.name in found], failed, done
 
 
