@@ -328,7 +328,20 @@ def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
-COMMANDS = ["demo", "run", "sweep", "report", "server", "client", "stop", "router", "relay", "clock", "join"]
+COMMANDS = [
+    "demo",
+    "run",
+    "sweep",
+    "boundary",
+    "report",
+    "server",
+    "client",
+    "stop",
+    "router",
+    "relay",
+    "clock",
+    "join",
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
