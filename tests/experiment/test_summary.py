@@ -128,13 +128,16 @@ def test_means_and_latencies_are_over_the_runs_that_know_them() -> None:
             age_at_actuation_ms=ages,
             picture_age_ms={"mean": 90, "p95": 99},
         ),
-        run(mae_m=2.0, oscillation_hz=None, hops_ms=[{**hops[0], "p50": 4.0}]),
+        run(
+            mae_m=2.0, oscillation_hz=None, hops_ms=[{**hops[0], "p50": 4.0}], age_at_actuation_ms={**ages, "p50": 4.0}
+        ),
+        run(mae_m=1.5, age_at_actuation_ms={**ages, "p50": 9.0}),
         run(mae_m=9.0, oscillation_hz=9.0, valid=False),
     ]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["mae_m"], condition["oscillation_hz"], condition["rms_m"]) == (1.5, 0.4, None)
     assert condition["hops_ms"] == [{"node": "camera", "hop": "encode", "p50": 3.0}]
-    assert condition["age_at_actuation_ms"] == ages
+    assert condition["age_at_actuation_ms"] == {**ages, "p50": 4.0, "n": 30}
     assert condition["picture_age_ms"] == {"mean": 90.0, "p95": 99.0}
 
 
@@ -179,3 +182,11 @@ def test_a_summary_of_nothing() -> None:
     summary = summarize([], None)
     assert (summary["conditions"], summary["contrasts"], summary["groups"]) == ({}, [], [])
     assert list(summary["paper"]["conditions"]) == ["L0", "L1", "L2", "L3", "L4", "L5"]
+
+
+def test_the_bound_of_a_condition_is_the_largest() -> None:
+    """Latencies of a condition have the largest bound of its runs, and none where a run has none."""
+    other = run()["tau_v_ms"]
+    runs = [run(), run(tau_v_ms={**other, "bound": 0.8}), run(tau_c_ms={**other, "bound": None})]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)

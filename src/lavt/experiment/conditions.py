@@ -116,7 +116,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _per_km(runs: Sequence[Run], name: str) -> float | None:
     """All events over all kilometres: a run that ended after a few metres does not outweigh one that drove far."""
-    driven = [run for run in runs if run["distance_m"]]
+    driven = [run for run in runs if run.get("distance_m")]
     return sum(run[name] for run in driven) / (sum(run["distance_m"] for run in driven) / 1000) if driven else None
 
 

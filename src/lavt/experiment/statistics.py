@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap
@@ -20,8 +21,13 @@ def exact_interval(successes: int, trials: int) -> list[float] | None:
     """
     if trials == 0:
         return None
+    return list(_clopper_pearson(successes, trials))
+
+
+@cache  # a sweep asks for few different ones, many times each
+def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
-    return [float(interval.low), float(interval.high)]
+    return float(interval.low), float(interval.high)
 
 
 def bootstrap_interval(values: Sequence[float]) -> list[float] | None:

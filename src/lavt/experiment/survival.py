@@ -17,7 +17,7 @@ def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     distance driven; a completed run is censored at the route's length, where the steps end. Runs of unknown distance
     are left out; None where none is left.
     """
-    runs = [run for run in runs if run["distance_m"] is not None]
+    runs = [run for run in runs if run.get("distance_m") is not None]
     if not runs:
         return None
     ended = [run for run in runs if run["ending"] != "completed"]
