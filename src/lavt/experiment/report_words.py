@@ -209,10 +209,160 @@ def _first_step(conditions: Conditions, paper: Conditions) -> str:
 def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say of each preset of a boundary, over all routes where there are several, what theory and the drives say."""
     over_all = [group for group in groups if group["route"] is None] or groups
+    return [_boundary_sentence(group) for group in over_all]
+
+
+def _boundary_sentence(group: Mapping[str, Any]) -> str:
+    onset, departure, completion = (_delay(group[f"{name}_ms"]["p50"]) for name in ("onset", "departure", "completion"))
+    seeds = f"{group['n']} seed{'s' if group['n'] > 1 else ''}"
+    return (
+        f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from {_delay(group['theory_ms'])} of total "
+        f"delay; over {seeds} it does so in the median from {onset}, the car first leaves its lane at {departure}, and "
+        f"the route is no longer completed at {completion}."
+    )
+
+
+def _where_it_falls(known: Sequence[tuple[str, float, float]]) -> list[str]:
+    falls = [(before[2] - after[2], before, after) for before, after in pairwise(known)]
+    if not falls or max(falls)[0] <= 0:
+        return ["Completion does not fall with latency."] if len(known) > 1 else []
+    _, before, after = max(falls, key=lambda fall: fall[0])
+    parts = [
+        f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}: "
+        f"between {before[1]:.0f} and {after[1]:.0f} ms in all."
+    ]
+    below = [loop_ms for _, loop_ms, rate in known if rate < 0.5]
+    if below:
+        parts.append(f"Under half of the runs are completed from {min(below):.0f} ms on.")
+    return parts
+
+
+def equal_totals(contrasts: Sequence[Contrast], conditions: Conditions, paper: Sequence[Contrast]) -> list[str]:
+    """Say of each contrast of conditions with equal total injected delay whether and why they are not told apart."""
+    theirs = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
+    said = []
+    for contrast in contrasts:
+        a, b = contrast["a"], contrast["b"]
+        injected = [_injected(conditions[name]) for name in (a, b) if name in conditions]
+        if len(injected) < 2 or any(None in each.values() for each in injected) or contrast["p_holm"] is None:
+            continue
+        if len({sum(each.values()) for each in injected}) == 1:
+            said.append(_equal_total(contrast, conditions, injected, theirs.get((a, b))))
+    return said
+
+
+def _injected(entry: Mapping[str, Any]) -> dict[str, float]:
+    return {flow: entry["injected_ms"][flow] for flow in ("video", "control")}
+
+
+def _equal_total(
+    contrast: Contrast, conditions: Conditions, injected: Sequence[Mapping[str, float]], theirs: Contrast | None
+) -> str:
+    a, b = contrast["a"], contrast["b"]
+    ways = [
+        f"{name} ({each['video']:.0f} + {each['control']:.0f} ms)" for name, each in zip((a, b), injected, strict=True)
+    ]
+    begin = f"{ways[0]} and {ways[1]} inject the same total, {sum(injected[0].values()):.0f} ms"
+    only = contrast["only_a"] + contrast["only_b"]
+    pairs = f"{contrast['pairs'] - only} of {contrast['pairs']} pairs are alike in their completion"
+    loops_ms = [conditions[name]["loop_ms"]["p50"] for name in (a, b)]
+    if contrast["p_holm"] <= DISTINGUISHED_P:
+        return (
+            f"{begin}, and yet they can be told apart (p {contrast['p_holm']:.2g} after Holm; {pairs}): something that "
+            "sees one channel only matters here."
+        )
+    if None in loops_ms or abs(loops_ms[0] - loops_ms[1]) > SAME_LOOP_MS:
+        return f"{begin}; they cannot be told apart ({pairs}), though their loops differ."
+    why = (
+        f"{begin}, and so make the same loop: {loops_ms[0]:.1f} and {loops_ms[1]:.1f} ms were measured. They cannot be "
+        f"told apart ({pairs}), and this is why: with pure delays and paired seeds only what sees one channel alone "
+        "can make a difference: feedback of the speed, a limit on the picture's age, a controller that knows its delay."
+    )
+    if theirs and theirs["p"] > DISTINGUISHED_P:
+        why += f" Nor can the paper's counts be told apart (Fisher, p {theirs['p']:.2f})."
+    return why
+
+
+def differences(conditions: Conditions, paper: Conditions) -> list[str]:
+    """Say where these results differ from the paper's, and why; nothing where one of its conditions lacks."""
+    if not paper or any(name not in conditions or conditions[name]["runs"] < LEAST_RUNS for name in paper):
+        return []
+    said = [
+        _sharper(conditions, paper),
+        _reference(conditions, paper),
+        _rails(conditions, paper),
+        _first_step(conditions, paper),
+        "What “completed” means: here a collision, leaving the road, a safe stop or the time limit ends a run. The "
+        "paper counts collisions in conditions that are completed in full, and does not say what ends a run.",
+        "Where completion falls is a property of the controller's gains, which the paper does not publish: "
+        "`paper_calibrated` was set by hand to fall where the paper's falls, and other gains on the same testbed fall "
+        "elsewhere or not at all. So the fall is no proof of anything about latency alone.",
+    ]
+    return [sentence for sentence in said if sentence]
+
+
+def _spread(conditions: Conditions) -> int:
+    return sum(0.05 < (entry["completion_rate"] or 0.0) < 0.95 for entry in conditions.values())
+
+
+def _sharper(conditions: Conditions, paper: Conditions) -> str:
+    shared = {name: conditions[name] for name in paper}
+    lowest = min(entry["completion_rate"] for entry in shared.values())
+    if lowest > 0.5 or _spread(shared) >= _spread(paper):
+        return ""
+    ours, theirs = (
+        ", ".join(f"{of[name]['completion_rate'] * 100:.0f}" for name in paper) for of in (conditions, paper)
+    )
+    return (
+        f"Completion falls more sharply here ({ours} %) than in the paper ({theirs} %): the routes are on one kind of "
+        "road, driven at one speed, and share one stability margin. What spreads the paper's runs is not in its text."
+    )
+
+
+def _reference(conditions: Conditions, paper: Conditions) -> str:
+    name = min(paper, key=lambda each: sum(_injected(paper[each]).values()))
+    ours_m, theirs_m = conditions[name]["p95_m"], paper[name]["p95_m"]
+    if ours_m is None or theirs_m < 5 * ours_m:
+        return ""
+    return (
+        f"P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the "
+        "middle is out of the lane, but the paper counts "
+        f"{paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its reference, one of its own "
+        "drives, is probably not the middle of the lane that was driven. Ours is that middle."
+    )
+
+
+def _rails(conditions: Conditions, paper: Conditions) -> str:
+    ours = [conditions[name]["p95_m"] for name in paper if conditions[name]["p95_m"] is not None]
+    theirs_m = max(paper[name]["p95_m"] for name in paper)
+    if not ours or max(ours) >= theirs_m or all(conditions[name]["completion_rate"] == 1.0 for name in paper):
+        return ""
+    return (
+        f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our "
+        "roads have rails and a median barrier, and whoever reaches one has collided and does not complete. They bound "
+        "the error of a completed run."
+    )
+
+
+def _first_step(conditions: Conditions, paper: Conditions) -> str:
+    name = next((each for each in paper if sum(_injected(paper[each]).values()) > 0), None)
+    if name is None or not (paper[name]["completion_rate"] < 1.0 == conditions[name]["completion_rate"]):
+        return ""
+    its, ours = paper[name], conditions[name]["completion_interval"]
+    overlap = " The 95 % intervals overlap." if ours and ours[0] <= its["completion_interval"][1] else ""
+    return (
+        f"{name} is completed in full here, and {its['completed']} times of {its['runs']} in the paper, which does "
+        f"not say what stopped the others; nothing that is modelled here would.{overlap}"
+    )
+
+
+def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say of each preset of a boundary, over all routes where there are several, what theory and the drives say."""
+    over_all = [group for group in groups if group["route"] is None] or groups
     return [
         f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from "
-        f"{_delay(group['theory_ms'])} of total delay; in the median of {group['n']} seeds it does so from "
-        f"{_delay(group['onset_ms']['p50'])}, the car first leaves its lane at {_delay(group['departure_ms']['p50'])}, "
+        f"{_delay(group['theory_ms'])} of total delay; over {group['n']} seed{'s' if group['n'] > 1 else ''} it does so in "
+        f"the median from {_delay(group['onset_ms']['p50'])}, the car first leaves its lane at {_delay(group['departure_ms']['p50'])}, "
         f"and the route is no longer completed at {_delay(group['completion_ms']['p50'])}."
         for group in over_all
     ]
