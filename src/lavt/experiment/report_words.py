@@ -217,8 +217,8 @@ def _boundary_sentence(group: Mapping[str, Any]) -> str:
     seeds = f"{group['n']} seed{'s' if group['n'] > 1 else ''}"
     return (
         f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from {_delay(group['theory_ms'])} of "
-        f"total delay; over {seeds} it does so in the median from {onset}, the car first leaves its lane at {departure}, "
-        f"and the route is no longer completed at {completion}."
+        f"total delay; over {seeds} it does so in the median from {onset}, the car first leaves its lane at "
+        f"{departure}, and the route is no longer completed at {completion}."
     )
 
 
