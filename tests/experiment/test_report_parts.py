@@ -74,7 +74,7 @@ def campaign(**changes: Any) -> list[dict[str, Any]]:
         run_of(condition, route, repetition, **changes)
         for route in ("a", "b_key")
         for condition in INJECTED
-        for repetition in range(2)
+        for repetition in range(3)
     ]
 
 
@@ -106,7 +106,7 @@ def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
     assert "13.15" in parts["degradation"] + parts["differences"]
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
-    assert text_of(row[1]).split() == ["4", "0", "0", "1", "1", "0.78", "1"]
+    assert text_of(row[1]).split() == ["6", "0", "0", "1", "1", "0.78", "1"]
     assert "L3 (225 + 0 ms) and L4 (150 + 75 ms) inject the same total" in parts["contrasts"]
 
 
@@ -154,7 +154,7 @@ def test_two_presets_are_told_apart_everywhere(tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "tables").glob("contrasts*.csv")} == {
         "contrasts.csv", "contrasts_preset_designed.csv",
     }  # fmt: skip
-    assert parts["runs"].count('<td class="text">other</td>') == 24
+    assert parts["runs"].count('<td class="text">other</td>') == 36
     assert "designed" in parts["groups"]
 
 

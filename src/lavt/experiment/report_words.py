@@ -209,13 +209,17 @@ def _first_step(conditions: Conditions, paper: Conditions) -> str:
 def boundary_sentences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say of each preset of a boundary, over all routes where there are several, what theory and the drives say."""
     over_all = [group for group in groups if group["route"] is None] or groups
-    return [
-        f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from "
-        f"{_delay(group['theory_ms'])} of total delay; in the median of {group['n']} seeds it does so from "
-        f"{_delay(group['onset_ms']['p50'])}, the car first leaves its lane at {_delay(group['departure_ms']['p50'])}, "
-        f"and the route is no longer completed at {_delay(group['completion_ms']['p50'])}."
-        for group in over_all
-    ]
+    return [_boundary_sentence(group) for group in over_all]
+
+
+def _boundary_sentence(group: Mapping[str, Any]) -> str:
+    onset, departure, completion = (_delay(group[f"{name}_ms"]["p50"]) for name in ("onset", "departure", "completion"))
+    seeds = f"{group['n']} seed{'s' if group['n'] > 1 else ''}"
+    return (
+        f"{group['preset']}, {_where(group['route'])}: by theory a swing grows from {_delay(group['theory_ms'])} of "
+        f"total delay; over {seeds} it does so in the median from {onset}, the car first leaves its lane at "
+        f"{departure}, and the route is no longer completed at {completion}."
+    )
 
 
 def _where(route: str | None) -> str:
