@@ -80,6 +80,7 @@ class CameraNode:
         self._keyframe_wanted = False
         self._keyframe_ns = 0
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
+        self._highest_stamp_ns = 0
         self.chains: Mapping[str, Sequence[Hop]] = {
             WAKE: (
                 ("capture", self._capture),
@@ -133,8 +134,12 @@ class CameraNode:
     def _stamp(self, checked: tuple[CapturedFrame, int], now: Now) -> Stamped:
         frame, pixel_crc = checked
         stamp_ns = now.wall_ns
-        while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
-            stamp_ns += 1
+        if stamp_ns > self._highest_stamp_ns:
+            self._highest_stamp_ns = stamp_ns
+        else:  # a clock that stands still or was stepped back must not write one twice
+            while stamp_ns in self._stamps:
+                stamp_ns += 1
+            self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)
         self._stamps.append(stamp_ns)
         return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(frame.picture, stamp_ns))
 
