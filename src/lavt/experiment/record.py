@@ -131,6 +131,7 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
+        to_bytes: Callable[[Any], bytes]
         if channel == VIDEO:
             to_bytes = _video_json
         elif channel in IN_BOTH and payload_type is not dict:

@@ -76,6 +76,7 @@ class CameraNode:
         self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
         self._send_to = tuple(send_to)
         self._next_frame = 0
+        self._wake_ns = self._opens.due_ns(0) + self._there_after_ns
         self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
         self._keyframe_wanted = False
         self._keyframe_ns = 0
@@ -109,14 +110,14 @@ class CameraNode:
 
     def next_wake_ns(self) -> int:
         """When the next picture is there."""
-        return self._opens.due_ns(self._next_frame) + self._there_after_ns
+        return self._wake_ns
 
     def _capture(self, _message: Message, now: Now) -> CapturedFrame | None:
         number = self._next_frame
-        while self._opens.due_ns(number + 1) + self._there_after_ns <= now.mono_ns:
+        while (next_ns := self._opens.due_ns(number + 1) + self._there_after_ns) <= now.mono_ns:
             number += 1
         self._counts["frames_skipped"] += number - self._next_frame
-        self._next_frame = number + 1
+        self._next_frame, self._wake_ns = number + 1, next_ns
         due_ns = self._opens.due_ns(number)
         frame = self._expose(number, due_ns, self._poses)
         if frame is None:

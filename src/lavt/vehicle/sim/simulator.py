@@ -62,6 +62,8 @@ class Simulator:
         self._steering: deque[tuple[int, float]] = deque()
         self._pedals: deque[tuple[int, float, float]] = deque()
         self._wrecked = False
+        self._told: VehicleState | None = None
+        """The state at the newest point of the grid, once it was asked for."""
 
     @property
     def capabilities(self) -> Capabilities:
@@ -84,6 +86,7 @@ class Simulator:
         events: list[VehicleEvent] = []
         car, judge, steering, pedals = self._car, self._judge, self._steering, self._pedals
         at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
+        self._told = None
         while next_ns <= to_ns:
             if (steering and steering[0][0] <= at_ns) or (pedals and pedals[0][0] <= at_ns):
                 self._obey(at_ns)
@@ -117,12 +120,16 @@ class Simulator:
             _, steering_rad = self._steering.popleft()
         while self._pedals and self._pedals[0][0] <= at_ns:
             _, throttle, brake = self._pedals.popleft()
-        self._actuation = Actuation(steering_rad, throttle, brake)
+        before = self._actuation
+        if steering_rad != before.steering_rad or throttle != before.throttle or brake != before.brake:
+            self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
         """Tell speed and road wheel angle at the newest point of the grid."""
-        motion = self._car.motion
-        return VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        if self._told is None:
+            motion = self._car.motion
+            self._told = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        return self._told
 
     def ground_truth(self) -> GroundTruth:
         """Tell the truth at the newest point of the grid."""
