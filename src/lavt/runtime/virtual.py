@@ -16,20 +16,12 @@ from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import UNRECORDED, WIRE, Recorder
+from lavt.runtime.recording import UNRECORDED, WIRE, Recorder, record
 from lavt.transport.channels import CHANNELS
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.delay import DelayLine
 
 NS_PER_PPB = 1_000_000_000
-
-
-def _as_it_is(payload: object) -> object:
-    return payload
-
-
-_RECORDED = {channel: WIRE.get(channel, _as_it_is) for channel in CHANNELS if channel not in UNRECORDED}
-"""How the messages of each recorded channel are written down: looked up once, not for every message."""
 
 
 @dataclass
@@ -48,7 +40,8 @@ class HostClock:
 
     def at(self, true_ns: int) -> Now:
         """Read both clocks at a true time."""
-        gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB if self.drift_ppb else true_ns
+        drift_ppb = self.drift_ppb
+        gone_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
         wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
         if self.steps:
             wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
@@ -184,8 +177,8 @@ class VirtualRuntime:
         """Let a message arrive on a side, now; what came over the network is written down."""
         host = self.hosts[side]
         arrived = host.now(self.true_ns)
-        if channel in _RECORDED and CHANNELS[channel].carrier != "local":
-            host.recorder.write(channel, _RECORDED[channel](payload), arrived)
+        if CHANNELS[channel].carrier != "local":
+            record(host.recorder, channel, payload, arrived)
         self._put(host, Message(channel, payload, arrived, peer))
 
     def _put(self, host: VirtualHost, message: Message) -> None:
@@ -247,8 +240,10 @@ class VirtualRuntime:
         write = host.recorder.write
         for send in sends:
             channel = send.channel
-            if channel in _RECORDED:
-                write(channel, _RECORDED[channel](send.payload), now)
+            if channel in WIRE:  # as in `record`, without a call for each message
+                write(channel, WIRE[channel](send.payload), now)
+            elif channel not in UNRECORDED:
+                write(channel, send.payload, now)
             carrier = CHANNELS[channel].carrier
             if carrier == "record":
                 continue
