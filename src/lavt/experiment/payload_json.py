@@ -18,9 +18,6 @@ import numpy as np
 from pydantic import TypeAdapter
 from pydantic.errors import PydanticUserError
 
-_WAITING_FOR_THE_OTHER = 1024
-"""Messages at most whose JSON is kept for the other side's record: some 10 s of commands."""
-
 Json = Any
 """What `json` reads and writes: dict, list, str, int, float, bool, None."""
 
@@ -87,29 +84,6 @@ def writer_of(payload_type: type) -> Callable[[Any], bytes]:
     """Give the function that makes JSON of payloads of a type."""
     which: Any = payload_type
     return _serializer(which) or _by_hand
-
-
-@functools.cache
-def writer_for_both(payload_type: type) -> Callable[[Any], bytes]:
-    """Like `writer_of`, where one and the same object goes into both records of a run in virtual time: made once.
-
-    What is in one record only, since the network lost it, is forgotten from time to time.
-    """
-    to_bytes = writer_of(payload_type)
-    made: dict[int, tuple[Any, bytes]] = {}
-    """By the payload's id; the payload is kept with its JSON, so that no other can get its id."""
-
-    def write(payload: Any) -> bytes:
-        before = made.pop(id(payload), None)
-        if before is not None:
-            return before[1]
-        if len(made) >= _WAITING_FOR_THE_OTHER:
-            made.clear()
-        text = to_bytes(payload)
-        made[id(payload)] = payload, text
-        return text
-
-    return write
 
 
 def _by_hand(payload: Any) -> bytes:

@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.errors import WorkError
 from lavt.experiment.mcap_file import McapFile
 from lavt.experiment.mcap_reader import Messages, read_mcap
-from lavt.experiment.payload_json import json_schema, writer_for_both, writer_of
+from lavt.experiment.payload_json import json_schema, writer_of
 from lavt.experiment.table import EMPTY, Table, table_of
 
 CHUNK_BYTES = 64 * 1024
@@ -29,9 +29,6 @@ CHUNK_BYTES = 64 * 1024
 
 KEPT_MESSAGES = 64
 """And so many before them, a tenth of a second of a drive."""
-
-IN_BOTH = frozenset(("control", "state"))
-"""Channels of which both records hold the same messages, read from the same bytes."""
 
 VIDEO = "video"
 """The channel of access units; its payload has `stamp_ns` and `data`."""
@@ -91,20 +88,18 @@ class RecordWriter:
 
         Raises `TypeError` for values that JSON has no words for, when it comes to them.
         """
-        kept = self._kept
-        kept.append((channel, payload, now))
-        if len(kept) >= KEPT_MESSAGES:
+        self._kept.append((channel, payload, now))
+        if len(self._kept) >= KEPT_MESSAGES:
             self._write_kept()
 
     def _write_kept(self) -> None:
         kept, self._kept = self._kept, []
         entries = []
-        channels, left_out = self._channels, self._left_out
         for channel, payload, now in kept:
-            if channel in left_out:
+            if channel in self._left_out:
                 continue
             kind = type(payload)
-            channel_id, to_bytes = channels[channel].get(kind) or self._register(channel, kind)
+            channel_id, to_bytes = self._channels[channel].get(kind) or self._register(channel, kind)
             entries.append((channel_id, now.wall_ns, now.mono_ns, to_bytes(payload)))
         written = self._mcap.add_messages(entries)
         if self._digest is not None:
@@ -131,14 +126,7 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
-        to_bytes: Callable[[Any], bytes]
-        if channel == VIDEO:
-            to_bytes = _video_json
-        elif channel in IN_BOTH and payload_type is not dict:
-            to_bytes = writer_for_both(payload_type)
-        else:
-            to_bytes = writer_of(payload_type)
-        self._channels[channel][payload_type] = channel_id, to_bytes
+        self._channels[channel][payload_type] = channel_id, _video_json if channel == VIDEO else writer_of(payload_type)
         if self._digest is not None:
             self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())
         return self._channels[channel][payload_type]
