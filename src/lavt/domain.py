@@ -6,7 +6,7 @@ origin on the ground under the middle of the rear axle. `mono_ns` is a host's mo
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,8 @@ PATH_STEP_M = 2.0
 PATH_POINTS = 10
 
 
-class Now(NamedTuple):
+@value
+class Now:
     """One reading of a host's two clocks."""
 
     mono_ns: int

@@ -7,9 +7,10 @@ comes out at the end, and wakes the node when it asked. The same node objects ru
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from lavt.domain import Now
+from lavt.value import value
 
 Peer = Any
 """Opaque: whoever sent a message and may be answered (an address, a query). Only links look inside."""
@@ -18,7 +19,8 @@ WAKE = "wake"
 """The channel on which a node is woken; its payload is None."""
 
 
-class Message(NamedTuple):
+@value
+class Message:
     """What a node gets: a payload on a channel, when it arrived on this host, and from whom."""
 
     channel: str
@@ -27,7 +29,8 @@ class Message(NamedTuple):
     peer: Peer = None
 
 
-class Send(NamedTuple):
+@value
+class Send:
     """What a node wants sent: a payload on a channel, to the channel's receivers or to one peer.
 
     On a channel that crosses the network the payload is bytes, elsewhere an object that nobody changes.

@@ -3,10 +3,11 @@ import math
 import pytest
 
 from lavt.control.pure_pursuit import (
-    Place,
+    SEEN_FROM,
     curvature_per_m,
     goal_m,
     lookahead_m,
+    moved,
     pursued_path,
     pursuit_curvature_per_m,
     steering_rad,
@@ -62,8 +63,8 @@ def test_the_circle_leads_to_the_goal() -> None:
     bent = lane(0.5, 0.1, 0.01)
     curvature = pursuit_curvature_per_m(bent, 8.0)
     half_angle_rad = math.asin(curvature * 8.0 / 2)
-    place = Place().moved(2 * half_angle_rad / curvature, curvature)
-    assert (place.x_m, place.y_m) == pytest.approx(goal_m(bent, 8.0), abs=1e-3)
+    x_m, y_m, _ = moved(SEEN_FROM, 2 * half_angle_rad / curvature, curvature)
+    assert (x_m, y_m) == pytest.approx(goal_m(bent, 8.0), abs=1e-3)
 
 
 def test_steering_and_curvature_are_inverse() -> None:
@@ -82,12 +83,13 @@ def test_the_path_of_a_car_on_a_bend_is_the_bend() -> None:
 def test_the_path_leads_back_to_the_lane() -> None:
     """A car 1 m beside its lane and turned away drives the path it gives to within 0.3 m of the centre, along it."""
     beside = lane(c0=-1.0, c1=-0.1)
-    place, curvature = Place(), pursuit_curvature_per_m(beside, 6.0)
+    place, curvature = SEEN_FROM, pursuit_curvature_per_m(beside, 6.0)
     for following in pursued_path(beside, 6.0, limit_per_m=1.0):
-        place = place.moved(PATH_STEP_M, curvature)
+        place = moved(place, PATH_STEP_M, curvature)
         curvature = following
-    assert place.y_m == pytest.approx(-1.0 - 0.1 * place.x_m, abs=0.3)
-    assert place.heading_rad == pytest.approx(math.atan(-0.1), abs=0.05)
+    x_m, y_m, heading_rad = place
+    assert y_m == pytest.approx(-1.0 - 0.1 * x_m, abs=0.3)
+    assert heading_rad == pytest.approx(math.atan(-0.1), abs=0.05)
 
 
 def test_the_path_keeps_to_the_limit() -> None:
@@ -98,5 +100,4 @@ def test_the_path_keeps_to_the_limit() -> None:
 
 def test_an_arc_is_driven_round() -> None:
     """A quarter of a circle of 10 m ends 10 m ahead and 10 m to the left, turned by 90 degrees."""
-    place = Place().moved(math.pi / 2 * 10, 0.1)
-    assert (place.x_m, place.y_m, place.heading_rad) == pytest.approx((10.0, 10.0, math.pi / 2))
+    assert moved(SEEN_FROM, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))

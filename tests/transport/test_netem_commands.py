@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -520,7 +520,7 @@ class Ahead(MachineClock):
     def now(self) -> Now:
         """Tell the time."""
         now = super().now()
-        return now._replace(mono_ns=now.mono_ns + self.ahead_ns)
+        return replace(now, mono_ns=now.mono_ns + self.ahead_ns)
 
 
 def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

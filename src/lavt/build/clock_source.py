@@ -24,7 +24,7 @@ def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], Cl
         now = clock.now()
         correction_s, bound_s = (config.correction_ms or 0.0) / MS_PER_S, (config.bound_ms or 0.0) / MS_PER_S
         return ClockReport(
-            *now, kernel_identity(), "external", correction_s, bound_s, addresses=host_addresses()
+            now.mono_ns, now.wall_ns, kernel_identity(), "external", correction_s, bound_s, addresses=host_addresses()
         )  # fmt: skip
 
     def left_to_the_probe() -> ClockReport:

@@ -13,6 +13,7 @@ from lavt.control.pure_pursuit import (
     curvature_per_m,
     limited,
     lookahead_m,
+    moved,
     pursued_path,
     pursuit_curvature_per_m,
     steering_rad,
@@ -90,7 +91,7 @@ class LaneKeeper:
             self._lane, self._place = lane, SEEN_FROM
         else:
             # The lane stays where it is and the car goes on: by how much, speed and own steering tell.
-            self._place = self._place.moved(speed_mps * step_s, self._curvature_per_m)
+            self._place = moved(self._place, speed_mps * step_s, self._curvature_per_m)
         limit_per_m = self._curvature_limit_per_m(speed_mps)
         distance_m = lookahead_m(self._preset.lookahead_s, speed_mps)
         self._curvature_per_m = limited(pursuit_curvature_per_m(self._lane, distance_m, self._place), limit_per_m)

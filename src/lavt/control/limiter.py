@@ -43,13 +43,14 @@ class Limiter:
             step_rad = 0.0
         changed = []
         steering_rad = asked.steering_rad
-        for name, bound_rad in (
-            ("steering angle", self._max_steering_rad),
-            ("lateral acceleration", self._lateral_limit_rad(vehicle.speed_mps)),
-        ):
-            if not -bound_rad <= steering_rad <= bound_rad:
-                changed.append(name)
-                steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
+        bound_rad = self._max_steering_rad
+        if not -bound_rad <= steering_rad <= bound_rad:
+            changed.append("steering angle")
+            steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
+        bound_rad = self._lateral_limit_rad(vehicle.speed_mps)
+        if not -bound_rad <= steering_rad <= bound_rad:
+            changed.append("lateral acceleration")
+            steering_rad = min(max(steering_rad, -bound_rad), bound_rad)
         reached_rad = steering_rad
         if not before_rad - step_rad <= steering_rad <= before_rad + step_rad:
             reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)

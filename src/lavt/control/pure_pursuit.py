@@ -8,7 +8,6 @@ Tracking Algorithm, CMU-RI-TR-92-01).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
 
@@ -18,25 +17,21 @@ CLOSE_M2 = 1e-6
 """So far the goal's squared distance may be off the lookahead's: 0.1 micrometres at the nearest."""
 
 
-class Place(NamedTuple):
-    """Where the rear axle is and where the car points to, in the frame the lane is given in."""
+Place = tuple[float, float, float]
+"""Where the rear axle is (x and y, m) and where the car points to (rad), in the frame the lane is given in."""
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    heading_rad: float = 0.0
-
-    def moved(self, distance_m: float, curvature_per_m: float) -> Place:
-        """Go `distance_m` along a circle."""
-        x_m, y_m, heading_rad = self
-        turned_rad = distance_m * curvature_per_m
-        # The chord of the arc: its length, and its direction half-way between the two headings.
-        chord_m = distance_m if -1e-9 < turned_rad < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
-        along_rad = heading_rad + turned_rad / 2
-        return Place(x_m + chord_m * math.cos(along_rad), y_m + chord_m * math.sin(along_rad), heading_rad + turned_rad)
-
-
-SEEN_FROM = Place()
+SEEN_FROM: Place = (0.0, 0.0, 0.0)
 """Where the picture was taken."""
+
+
+def moved(place: Place, distance_m: float, curvature_per_m: float) -> Place:
+    """Go `distance_m` along a circle."""
+    x_m, y_m, heading_rad = place
+    turned_rad = distance_m * curvature_per_m
+    # The chord of the arc: its length, and its direction half-way between the two headings.
+    chord_m = distance_m if -1e-9 < turned_rad < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
+    along_rad = heading_rad + turned_rad / 2
+    return x_m + chord_m * math.cos(along_rad), y_m + chord_m * math.sin(along_rad), heading_rad + turned_rad
 
 
 def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
@@ -93,7 +88,7 @@ def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place
     curvatures = []
     bend_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
     for _ in range(PATH_POINTS):
-        place = place.moved(PATH_STEP_M, bend_per_m)
+        place = moved(place, PATH_STEP_M, bend_per_m)
         bend_per_m = pursuit_curvature_per_m(lane, distance_m, place)
         if not -limit_per_m <= bend_per_m <= limit_per_m:
             bend_per_m = limited(bend_per_m, limit_per_m)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
+from collections.abc import Mapping
 from importlib.metadata import version
 
 import lavt
@@ -11,7 +13,8 @@ import lavt
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
-def provenance() -> dict[str, dict[str, str]]:
+@functools.cache  # every run asks, and nothing of it changes
+def provenance() -> Mapping[str, Mapping[str, str]]:
     """Give the versions of what computes and the machine that it computes on."""
     return {
         "versions": {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}},

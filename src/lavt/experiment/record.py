@@ -100,7 +100,7 @@ class RecordWriter:
                 continue
             kind = type(payload)
             channel_id, to_bytes = self._channels[channel].get(kind) or self._register(channel, kind)
-            entries.append((channel_id, now[1], now[0], to_bytes(payload)))
+            entries.append((channel_id, now.wall_ns, now.mono_ns, to_bytes(payload)))
         written = self._mcap.add_messages(entries)
         if self._digest is not None:
             self._digest.update(self._side.encode() + written)

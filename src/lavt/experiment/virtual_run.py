@@ -49,7 +49,7 @@ class EndingTap:
         self.began = False
         self.ending: str | None = None
         self._truth: GroundTruth | None = None
-        self._writer = writer
+        self._write = writer.write
 
     def status(self) -> dict[str, Any]:
         """Tell what a person wants to see of a drive while it goes on."""
@@ -64,7 +64,7 @@ class EndingTap:
             self.began |= payload.kind == "drive_began"
             if payload.kind == "ending":
                 self.ending = payload.detail
-        self._writer.write(topic, payload, now)
+        self._write(topic, payload, now)
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,10 +76,12 @@ class CameraNode:
         self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
         self._send_to = tuple(send_to)
         self._next_frame = 0
+        self._wake_ns = self._opens.due_ns(0) + self._there_after_ns
         self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
         self._keyframe_wanted = False
         self._keyframe_ns = 0
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
+        self._highest_stamp_ns = 0
         self.chains: Mapping[str, Sequence[Hop]] = {
             WAKE: (
                 ("capture", self._capture),
@@ -108,14 +110,14 @@ class CameraNode:
 
     def next_wake_ns(self) -> int:
         """When the next picture is there."""
-        return self._opens.due_ns(self._next_frame) + self._there_after_ns
+        return self._wake_ns
 
     def _capture(self, _message: Message, now: Now) -> CapturedFrame | None:
         number = self._next_frame
-        while self._opens.due_ns(number + 1) + self._there_after_ns <= now.mono_ns:
+        while (next_ns := self._opens.due_ns(number + 1) + self._there_after_ns) <= now.mono_ns:
             number += 1
         self._counts["frames_skipped"] += number - self._next_frame
-        self._next_frame = number + 1
+        self._next_frame, self._wake_ns = number + 1, next_ns
         due_ns = self._opens.due_ns(number)
         frame = self._expose(number, due_ns, self._poses)
         if frame is None:
@@ -133,8 +135,12 @@ class CameraNode:
     def _stamp(self, checked: tuple[CapturedFrame, int], now: Now) -> Stamped:
         frame, pixel_crc = checked
         stamp_ns = now.wall_ns
-        while stamp_ns in self._stamps:  # a clock that stands still or was stepped back must not write one twice
-            stamp_ns += 1
+        if stamp_ns > self._highest_stamp_ns:
+            self._highest_stamp_ns = stamp_ns
+        else:  # a clock that stands still or was stepped back must not write one twice
+            while stamp_ns in self._stamps:
+                stamp_ns += 1
+            self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)
         self._stamps.append(stamp_ns)
         return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(frame.picture, stamp_ns))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 from lavt.domain import Now
 from lavt.node import Hop, Message, Send
@@ -24,7 +23,8 @@ class Timeline:
     hops: tuple[tuple[str, int], ...]
 
 
-class Walked(NamedTuple):
+@value
+class Walked:
     """What came of a message: what to send, when the node was done, and the timeline where there is a stamp."""
 
     sends: list[Send]

@@ -16,7 +16,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import Recorder, record
+from lavt.runtime.recording import UNRECORDED, WIRE, Recorder, record
 from lavt.transport.channels import CHANNELS
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.delay import DelayLine
@@ -40,7 +40,8 @@ class HostClock:
 
     def at(self, true_ns: int) -> Now:
         """Read both clocks at a true time."""
-        gone_ns = true_ns + true_ns * self.drift_ppb // NS_PER_PPB if self.drift_ppb else true_ns
+        drift_ppb = self.drift_ppb
+        gone_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
         wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
         if self.steps:
             wall_ns += sum(change_ns for at_ns, change_ns in self.steps if at_ns <= true_ns)
@@ -86,6 +87,12 @@ class VirtualHost:
 
     def __post_init__(self) -> None:
         self.running = {node.name: _Running(self, node) for node in self.nodes}
+        self.receivers = {
+            channel: tuple(self.running[name] for name in row.receivers)
+            for channel, row in CHANNELS.items()
+            if self.running.keys() >= set(row.receivers)
+        }
+        """For each channel the nodes of this host that listen to it."""
         self._read_ns = -1
         self._read = Now(0, 0)
 
@@ -103,15 +110,12 @@ class _Running:
         self.host = host
         self.node = node
         self.inbox = Inbox()
-        self.spent_ns = {
-            channel: tuple(
-                accumulate(
-                    host.costs_ns.get((node.name, name), 0) for name in (f"wait_{channel}", *(hop[0] for hop in hops))
-                )
-            )
+        self.chains = {
+            channel: (hops, _spent_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in hops))))
             for channel, hops in node.chains.items()
         }
-        """For each chain how long after its begin the first hop begins, and how long after it each hop is done."""
+        """Each chain, and how long after its begin the first hop begins and each hop is done."""
+        self.next_wake_ns = node.next_wake_ns
         self.free_ns = 0
         self.poke_ns: int | None = None
         self.poked_ns: set[int] = set()
@@ -119,21 +123,17 @@ class _Running:
         self.wake_mono_ns: int | None = None
         self.wake_ns: int | None = None
         """When the node wants to be woken, on its host's monotonic clock and in true time."""
-        self.note_wake()
+        self.note_wake(node.next_wake_ns())
 
-    def note_wake(self) -> None:
-        """Ask the node when it wants to be woken; nothing but a walk through its hops changes that."""
-        wake_mono_ns = self.node.next_wake_ns()
-        if wake_mono_ns != self.wake_mono_ns:
-            self.wake_mono_ns = wake_mono_ns
-            self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
+    def note_wake(self, wake_mono_ns: int | None) -> None:
+        """Note when the node wants to be woken."""
+        self.wake_mono_ns = wake_mono_ns
+        self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
 
-    def times(self, channel: str, now: Now, true_ns: int) -> Iterator[Now]:
-        """When the first hop of a chain begins that is begun `now`, and when each hop is done."""
-        spent_ns = self.spent_ns[channel]
-        if not spent_ns[-1]:
-            return repeat(now)
-        return map(self.host.clock.at, [true_ns + each_ns for each_ns in spent_ns])
+
+def _spent_ns(costs_ns: Mapping[tuple[str, str], int], node: str, steps: Sequence[str]) -> tuple[int, ...]:
+    """Tell after how long each step of a node is done, one after the other."""
+    return tuple(accumulate(costs_ns.get((node, step), 0) for step in steps))
 
 
 class VirtualRuntime:
@@ -187,10 +187,10 @@ class VirtualRuntime:
 
     def _put(self, host: VirtualHost, message: Message) -> None:
         true_ns = self.true_ns
-        for receiver in CHANNELS[message.channel].receivers:
-            running = host.running[receiver]
+        for running in host.receivers[message.channel]:
             running.inbox.put(message)
-            self._poke(running, max(running.free_ns, true_ns))
+            free_ns = running.free_ns
+            self._poke(running, max(true_ns, free_ns))
 
     def _poke(self, running: _Running, true_ns: int) -> None:
         """Look at a node at `true_ns`, unless it is looked at before anyway."""
@@ -206,46 +206,56 @@ class VirtualRuntime:
         if running.poke_ns != true_ns:
             return  # it was looked at earlier, and has asked anew
         running.poke_ns = None
-        if running.wake_ns is not None and running.wake_ns <= true_ns:
+        wake_ns = running.wake_ns
+        if wake_ns is not None and wake_ns <= true_ns:
             now = running.host.now(true_ns)
             self._walk(running, Message(WAKE, None, now), now)
         elif (message := running.inbox.take()) is not None:
             self._walk(running, message, running.host.now(true_ns))
-        elif running.wake_ns is not None:
-            self._poke(running, running.wake_ns)
+        elif wake_ns is not None:
+            self._poke(running, wake_ns)
 
     def _walk(self, running: _Running, message: Message, now: Now) -> None:
-        host, node, channel = running.host, running.node, message.channel
-        times = running.times(channel, now, self.true_ns)
-        walked = walk(node.name, node.chains[channel], message, next(times), times)
-        spent_ns = running.spent_ns[channel][walked.called]
-        running.free_ns = self.true_ns + spent_ns
+        host, true_ns = running.host, self.true_ns
+        hops, spent_ns = running.chains[message.channel]
+        times: Iterator[Now] = repeat(now)
+        if spent_ns[-1]:
+            times = map(host.clock.at, map(true_ns.__add__, spent_ns))
+        walked = walk(running.node.name, hops, message, next(times), times)
+        took_ns = spent_ns[walked.called]
+        running.free_ns = free_ns = true_ns + took_ns
         if walked.timeline is not None:
             host.recorder.write("timeline", walked.timeline, walked.end)
         if walked.sends:
-            if spent_ns:
-                self.at(running.free_ns, self._send_all, host, walked.sends, walked.end)
+            if took_ns:
+                self.at(free_ns, self._send_all, host, walked.sends, walked.end)
             else:
                 self._send_all(host, walked.sends, walked.end)
-        self._rest(running)
-
-    def _rest(self, running: _Running) -> None:
-        """Look at a node again when it is free and has something to do."""
-        running.note_wake()
+        # When the node wants to be woken, nothing but a walk through its hops changes.
+        wake_mono_ns = running.next_wake_ns()
+        if wake_mono_ns != running.wake_mono_ns:
+            running.note_wake(wake_mono_ns)
         if running.inbox.waiting:
-            self._poke(running, running.free_ns)
-        elif running.wake_ns is not None:
-            self._poke(running, max(running.free_ns, running.wake_ns))
+            self._poke(running, free_ns)
+        elif (wake_ns := running.wake_ns) is not None:
+            self._poke(running, max(wake_ns, free_ns))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send], now: Now) -> None:
+        write = host.recorder.write
         for send in sends:
-            record(host.recorder, send.channel, send.payload, now)
-            carrier = CHANNELS[send.channel].carrier
+            channel = send.channel
+            if channel in WIRE:  # as in `record`, without a call for each message
+                write(channel, WIRE[channel](send.payload), now)
+            elif channel not in UNRECORDED:
+                write(channel, send.payload, now)
+            carrier = CHANNELS[channel].carrier
+            if carrier == "record":
+                continue
             if carrier == "local":
-                self._put(host, Message(send.channel, send.payload, now))
+                self._put(host, Message(channel, send.payload, now))
             elif carrier == "clock":
                 self.deliver(host.side, "clock_report", host.clock_source(self.true_ns))
-            elif carrier != "record":
+            else:
                 self._carry(host, send)
 
     def _carry(self, host: VirtualHost, send: Send) -> None:

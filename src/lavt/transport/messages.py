@@ -27,6 +27,7 @@ LONGEST_DELAY_MS = 10_000.0
 """That can be asked of a server: it is busy with clearing it for as long."""
 
 Check = Callable[[Any], bool]
+_NUMBERS = frozenset((int, float))
 
 
 def _integer(low: int, high: int) -> Check:
@@ -34,7 +35,7 @@ def _integer(low: int, high: int) -> Check:
 
 
 def _number(low: float, high: float) -> Check:
-    return lambda value: type(value) in (int, float) and low <= value <= high  # which what is not a number is not
+    return lambda value: type(value) in _NUMBERS and low <= value <= high  # which what is not a number is not
 
 
 def _text(longest: int) -> Check:
@@ -53,9 +54,9 @@ def _name(value: object) -> bool:
 def _curvatures(value: object) -> bool:
     """Check all at once: the sum of what holds one that is no number, or infinite, is not finite."""
     return (
-        isinstance(value, list)
+        type(value) is tuple
         and len(value) == PATH_POINTS
-        and set(map(type, value)) <= {int, float}
+        and _NUMBERS.issuperset(map(type, value))
         and min(value) >= -1.0
         and max(value) <= 1.0
         and math.isfinite(sum(value))
@@ -126,6 +127,8 @@ CHECKS: dict[type, dict[str, Check]] = {
     NetemReply: {"granted": lambda value: type(value) is bool, "because": _text(400)},
 }
 
+_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
+_IN_ORDER: dict[type, tuple[Check, ...]] = {kind: tuple(checks.values()) for kind, checks in CHECKS.items()}
 _FIELDS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*(field.name for field in fields(kind))) for kind in CHECKS
 }
@@ -151,16 +154,16 @@ def _decoded(kind: type[Any], data: bytes) -> Any:
     if len(data) > MAX_MESSAGE_BYTES:
         raise BadMessage(f"{len(data)} bytes are more than a message may have ({MAX_MESSAGE_BYTES})")
     try:
-        values = msgpack.unpackb(data, use_list=True, raw=False, strict_map_key=True)
+        values = msgpack.unpackb(data, use_list=False, raw=False, strict_map_key=True)
     except Exception as error:  # the parser has half a dozen kinds of error, and bytes from outside may cause any
         raise BadMessage("not msgpack") from error
-    checks = CHECKS[kind]
-    if not isinstance(values, list) or len(values) != 1 + len(checks):
+    checks = _IN_ORDER[kind]
+    if type(values) is not tuple or len(values) != 1 + len(checks):
         raise BadMessage(f"not the shape of a {kind.__name__}")
     version, *given = values
     if type(version) is not int or version != VERSION:
         raise BadMessage("a message of another version")
-    for name, value in zip(checks, given, strict=True):
-        if not checks[name](value):
-            raise BadMessage(f"{kind.__name__}.{name} is out of range")
-    return kind(*(tuple(value) if type(value) is list else value for value in given))
+    for index, check in enumerate(checks):
+        if not check(given[index]):
+            raise BadMessage(f"{kind.__name__}.{_NAMES[kind][index]} is out of range")
+    return kind(*given)

@@ -60,6 +60,7 @@ class Judge:
         self._happened: set[EventKind] = set()
         self._near_s_m = near_s_m
         self._touched_ns: int | None = None
+        self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
         self._quiet = _Quiet(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
         """Where the body touches a rail at the moment judged last."""
@@ -134,10 +135,12 @@ class Judge:
     def _contacts(self, corners: Sequence[Place]) -> tuple[tuple[Contact, ...], Rail | None]:
         """Find the corners that are in a rail, and the rail; a body that is wholly behind a rail does not touch it."""
         found, hit = [], None
-        for rail in self._road.rails:
-            side = math.copysign(1.0, rail.offset_m)
+        highest_m, lowest_m = max([each[1] for each in corners]), min([each[1] for each in corners])
+        for rail, side in self._rails:
+            if (highest_m < rail.offset_m) if side > 0.0 else (lowest_m > rail.offset_m):
+                continue  # before the rail with every corner, as nearly always
             depths_m = [side * (lateral_m - rail.offset_m) for _, lateral_m, _ in corners]
-            if max(depths_m) < 0.0 or min(depths_m) >= 0.0:
+            if min(depths_m) >= 0.0:
                 continue
             for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
                 if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
@@ -197,12 +200,13 @@ class _Quiet:
         self._from = (motion.x_m, motion.y_m, motion.heading_rad)
         road_rad = places[0][2]
         self._across = (-math.sin(road_rad), math.cos(road_rad))
-        self._spread_rad = max(abs(heading_rad - road_rad) for _, _, heading_rad in places)
-        self._room_m = min(_distance_m(self._offsets_m, lateral_m) for _, lateral_m, _ in places)
+        self._spread_rad = max([abs(heading_rad - road_rad) for _, _, heading_rad in places])
+        offsets_m = self._offsets_m
+        self._room_m = min([_distance_m(offsets_m, lateral_m) for _, lateral_m, _ in places])
         right_m, left_m = self._inside_m
         inside = all(right_m < lateral_m < left_m for _, lateral_m, _ in places)
         stations_m = self._stations_m if inside else self._all_stations_m
-        along_m = min(_distance_m(stations_m, s_m) for s_m, _, _ in places)
+        along_m = min([_distance_m(stations_m, s_m) for s_m, _, _ in places])
         self._stretch_m = min(along_m * self._slowest, LONGEST_UNSEEN_M)
 
     def holds(self, motion: CarMotion) -> bool:

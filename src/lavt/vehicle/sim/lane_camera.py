@@ -58,8 +58,8 @@ class LaneCamera:
         self._ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
         stations_m = np.arange(road.length_m / STATION_M + 2 * self._ahead) * STATION_M
         lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
-        self._stations: list[list[list[float]]] = np.stack(lines, axis=1).tolist()
-        """World x and y of the lane's centre, of its left line and of its right one."""
+        self._stations: list[list[float]] = np.concatenate(lines, axis=1).tolist()
+        """World x and y of the lane's centre, of its left line and of its right one: six numbers each."""
         self._near_s_m = 0.0
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
@@ -88,18 +88,26 @@ class LaneCamera:
         left_slope, right_slope = self._left_slope, self._right_slope
         lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
         centre, lines_seen = [], 0
-        for line in self._stations[first : first + self._ahead]:
+        # The two lines are written out: a loop over them would take half of the time here.
+        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._stations[first : first + self._ahead]:
             seen = 0
-            for world_x, world_y in line[1:]:
-                dx, dy = world_x - x_m, world_y - y_m
-                ahead_m = dx * cosine + dy * sine
-                if near_m <= ahead_m <= far_m:
-                    left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
-                    in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
-                    seen += in_view and -wide_m <= left_m <= wide_m
+            dx, dy = left_x - x_m, left_y - y_m
+            ahead_m = dx * cosine + dy * sine
+            if near_m <= ahead_m <= far_m:
+                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
+                if in_view and -wide_m <= left_m <= wide_m:
+                    seen = 1
+            dx, dy = right_x - x_m, right_y - y_m
+            ahead_m = dx * cosine + dy * sine
+            if near_m <= ahead_m <= far_m:
+                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
+                if in_view and -wide_m <= left_m <= wide_m:
+                    seen += 1
             if seen:
                 lines_seen += seen
-                dx, dy = line[0][0] - x_m, line[0][1] - y_m
+                dx, dy = centre_x - x_m, centre_y - y_m
                 centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
         if len(centre) < POINTS_AT_LEAST:
             return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)

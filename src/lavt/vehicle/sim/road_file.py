@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import itertools
 import math
 from collections.abc import Iterable, Mapping
@@ -175,6 +176,7 @@ class RoadFile(_Keys):
         return tuple(Rail(**dict(each)) for each in self.rail_keys)
 
 
+@functools.lru_cache(maxsize=32)  # a sweep drives the same roads again and again, and YAML takes 7 ms
 def read_road_file(text: str, source: str) -> RoadFile | PartFile:
     """Read a road's file; `UserError` that names `source` and what is wrong."""
     try:

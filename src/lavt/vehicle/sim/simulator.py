@@ -56,6 +56,8 @@ class Simulator:
         limit_s: float | None = None,
     ) -> None:
         self._parameters, self._goes_on = parameters, goes_on
+        self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
+        self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
         ahead_m, lateral_m, turned_rad = start_of(seed)
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
@@ -67,6 +69,8 @@ class Simulator:
         self._steering: deque[tuple[int, float]] = deque()
         self._pedals: deque[tuple[int, float, float]] = deque()
         self._wrecked = False
+        self._told: VehicleState | None = None
+        """The state at the newest point of the grid, once it was asked for."""
 
     @property
     def capabilities(self) -> Capabilities:
@@ -87,21 +91,24 @@ class Simulator:
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
         events: list[VehicleEvent] = []
+        car, judge, steering, pedals = self._car, self._judge, self._steering, self._pedals
         at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
+        self._told = None
         while next_ns <= to_ns:
-            self._obey(at_ns)
+            if (steering and steering[0][0] <= at_ns) or (pedals and pedals[0][0] <= at_ns):
+                self._obey(at_ns)
             self._index += 1
             at_ns, next_ns = next_ns, grid_ns(self._index + 1)
             if self._wrecked:
                 continue
-            self._car.step(self._actuation)
-            happened = self._judge.judge(self._car.motion, at_ns)
+            car.step(self._actuation)
+            happened = judge.judge(car.motion, at_ns)
             if self._goes_on:
-                for contact in self._judge.contacts:
-                    self._car.slide(contact)
+                for contact in judge.contacts:
+                    car.slide(contact)
             elif happened and any(event.kind == "collision" for event in happened):
                 self._wrecked = True
-                self._car.stop_dead()
+                car.stop_dead()
             events += happened
         return events
 
@@ -110,41 +117,40 @@ class Simulator:
 
         Call it with growing times.
         """
-        steering_ns = now_ns + round(self._parameters.steering_dead_time_s * NS_PER_S)
-        pedals_ns = now_ns + round(self._parameters.pedal_dead_time_s * NS_PER_S)
-        self._steering.append((steering_ns, actuation.steering_rad))
-        self._pedals.append((pedals_ns, actuation.throttle, actuation.brake))
+        self._steering.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
+        self._pedals.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
 
     def _obey(self, at_ns: int) -> None:
         """Take over what has become due."""
-        steering_due = self._steering and self._steering[0][0] <= at_ns
-        if not steering_due and not (self._pedals and self._pedals[0][0] <= at_ns):
-            return
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
         while self._steering and self._steering[0][0] <= at_ns:
             _, steering_rad = self._steering.popleft()
         while self._pedals and self._pedals[0][0] <= at_ns:
             _, throttle, brake = self._pedals.popleft()
-        self._actuation = Actuation(steering_rad, throttle, brake)
+        before = self._actuation
+        if steering_rad != before.steering_rad or throttle != before.throttle or brake != before.brake:
+            self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
         """Tell speed and road wheel angle at the newest point of the grid."""
-        motion = self._car.motion
-        return VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        if self._told is None:
+            motion = self._car.motion
+            self._told = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        return self._told
 
     def ground_truth(self) -> GroundTruth:
         """Tell the truth at the newest point of the grid."""
         motion, track = self._car.motion, self._judge.track(self._car.motion)
         return GroundTruth(
-            mono_ns=grid_ns(self._index),
-            x_m=motion.x_m,
-            y_m=motion.y_m,
-            heading_rad=motion.heading_rad,
-            speed_mps=motion.speed_mps,
-            steering_rad=motion.steering_rad,
-            cross_track_m=track.cross_track_m,
-            heading_error_rad=track.heading_error_rad,
-            progress_m=track.progress_m,
+            grid_ns(self._index),
+            motion.x_m,
+            motion.y_m,
+            motion.heading_rad,
+            motion.speed_mps,
+            motion.steering_rad,
+            track.cross_track_m,
+            track.heading_error_rad,
+            track.progress_m,
         )
 
     def pose(self) -> Pose:
