@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 from lavt.domain import NS_PER_MS
-from lavt.streams import stream
+from lavt.streams import IndexedStream
 from lavt.transport.link import Link
 
 
@@ -47,7 +47,12 @@ class DelayLaw:
 @lru_cache(maxsize=256)
 def _lognormal_ms(seed: int, name: str, index: int, law: Lognormal) -> float:
     """The packets of one frame ask for the same index one after the other, hence the cache."""
-    return law.median_ms * float(stream(seed, name, index).lognormal(0.0, law.sigma))
+    return law.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, law.sigma))
+
+
+@lru_cache(maxsize=4)
+def _jitter(seed: int, name: str) -> IndexedStream:
+    return IndexedStream(seed, name)
 
 
 class DelayLine:
