@@ -206,8 +206,14 @@ class RunConfig(Section):
 
     @property
     def left_out(self) -> frozenset[str]:
-        """Channels that stay out of the record; what stands for H.264 at another fidelity is no video."""
-        return self.record.left_out if self.fidelity == "video" else frozenset({"video"})
+        """Channels that stay out of the record.
+
+        What stands for H.264 at another fidelity is no video. Geometry is for sweeps of thousands of runs: there what
+        other channels say as well is left out, commands (`admission`), states (`truth`) and packets (`frame`,
+        `picture`).
+        """
+        further = {"video": self.record.left_out, "pixels": {"video"}, "geometry": {"video", "control", "state", "rtp"}}
+        return frozenset(further[self.fidelity])
 
 
 class SweepConfig(RunConfig):

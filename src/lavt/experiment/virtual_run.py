@@ -128,11 +128,12 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     hosts = [
         VirtualHost(
             "server", server_clock, server.all, tap, costs_ns,
-            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
+            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s), left_out=left_out,
         ),
         VirtualHost(
             "client", client_clock, client.all, writers[1], costs_ns,
             modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s), CLIENT_ADDRESS,
+            left_out=left_out,
         ),
     ]  # fmt: skip
     injected = injected_network(

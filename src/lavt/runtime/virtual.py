@@ -83,9 +83,12 @@ class VirtualHost:
     clock_source: Callable[[int], ClockReport]
     peer: Peer = None
     """How this host looks from the other side."""
+    left_out: frozenset[str] = frozenset()
+    """Channels that are not recorded."""
     running: dict[str, _Running] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.unrecorded = UNRECORDED | self.left_out
         self.running = {node.name: _Running(self, node) for node in self.nodes}
         self.receivers = {
             channel: tuple(self.running[name] for name in row.receivers)
@@ -181,7 +184,7 @@ class VirtualRuntime:
         """Let a message arrive on a side, now; what came over the network is written down."""
         host = self.hosts[side]
         arrived = host.now(self.true_ns)
-        if CHANNELS[channel].carrier != "local":
+        if CHANNELS[channel].carrier != "local" and channel not in host.unrecorded:
             record(host.recorder, channel, payload, arrived)
         self._put(host, Message(channel, payload, arrived, peer))
 
@@ -241,13 +244,11 @@ class VirtualRuntime:
             self._poke(running, max(wake_ns, free_ns))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send], now: Now) -> None:
-        write = host.recorder.write
+        write, unrecorded = host.recorder.write, host.unrecorded
         for send in sends:
             channel = send.channel
-            if channel in WIRE:  # as in `record`, without a call for each message
-                write(channel, WIRE[channel](send.payload), now)
-            elif channel not in UNRECORDED:
-                write(channel, send.payload, now)
+            if channel not in unrecorded:  # as in `record`, without a call for each message
+                write(channel, WIRE[channel](send.payload) if channel in WIRE else send.payload, now)
             carrier = CHANNELS[channel].carrier
             if carrier == "record":
                 continue
