@@ -186,7 +186,7 @@ class Renderer:
         cv2.subtract(picture, self._noise[1][part], picture)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=1)  # up to a gigabyte, for 600 m driven
 def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
     """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
     light = LIGHTS[light_name]
