@@ -16,11 +16,15 @@ from lavt.experiment.record import Record, read_record
 from lavt.experiment.table import MISSING, Table
 
 
+DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
+"""What figures show of the truth."""
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
     """One run: where it is, its `result.json`, the truth of the driving interval, and the route's centre line.
 
-    `reference_m` is (points, 2); `truth` has no rows where there was no simulator.
+    `reference_m` is (points, 2); `truth` has the columns `DRAWN`, and no rows where there was no simulator.
     """
 
     directory: Path
@@ -49,7 +53,9 @@ def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> Driv
     truth_ns = truth.ints("mono_ns")
     routes = record.table("route").objects("points")
     reference_m = np.array(routes[0] if routes and routes[0] else np.zeros((0, 2)), np.float64)
-    driven = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    within = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    columns = {name: within.columns[name] for name in DRAWN if name in within.columns}
+    driven = Table(within.mono_ns, within.wall_ns, columns)
     return Drive(directory, result, driven, reference_m, began_ns, record.annotations)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,8 +82,9 @@ class Table:
 
     def where(self, chosen: BoolArray) -> Table:
         """Choose the rows for which `chosen` is true."""
-        columns = {name: column[chosen] for name, column in self.columns.items()}
-        return Table(self.mono_ns[chosen], self.wall_ns[chosen], columns)
+        return Table(
+            self.mono_ns[chosen], self.wall_ns[chosen], _Columns(self.columns, lambda name: self.columns[name][chosen])
+        )
 
 
 def _is_null(value: Any) -> bool:
@@ -108,20 +109,21 @@ EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
 def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
     """Make columns of `rows`; a field that a row lacks is null there."""
     names = dict.fromkeys(name for fields in {tuple(row): None for row in rows} for name in fields)
-    return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), _Columns(names, rows))
+    columns = _Columns(names, lambda name: _column([row.get(name) for row in rows]))
+    return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
 
 
 class _Columns(Mapping[str, NDArray[Any]]):
-    """Columns of rows, each made when it is first asked for: of most channels a few are ever looked at."""
+    """Columns that are each made when they are first asked for: of most channels a few are ever looked at."""
 
-    def __init__(self, names: Iterable[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    def __init__(self, names: Iterable[str], make: Callable[[str], NDArray[Any]]) -> None:
         self._made: dict[str, NDArray[Any] | None] = dict.fromkeys(names)
-        self._rows = rows
+        self._make = make
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         column = self._made[name]
         if column is None:
-            column = self._made[name] = _column([row.get(name) for row in self._rows])
+            column = self._made[name] = self._make(name)
         return column
 
     def __iter__(self) -> Iterator[str]:
