@@ -15,7 +15,6 @@ from lavt.experiment.metrics import driving_interval
 from lavt.experiment.record import Record, read_record
 from lavt.experiment.table import MISSING, Table
 
-
 DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
 """What figures show of the truth."""
 
