@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from lavt.experiment.boundary_summary import groups_of, summary
 from lavt.experiment.growth import growth_per_s
 from lavt.experiment.tabular import html_of
 from lavt.experiment.watched_drive import watched
+from lavt.experiment.workers import Workers
 from lavt.nodes.reports import Admission, Event, FrameWritten
 
 GRID_MS = [0.0, 100.0, 200.0, 300.0]
@@ -313,7 +315,7 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
         return run_entry("a_key", 0)
 
     monkeypatch.setattr(boundary_module, "search", fake)
-    monkeypatch.setattr(boundary_module, "ProcessPoolExecutor", _InThisProcess)
+    monkeypatch.setattr(boundary_module, "processes", in_this_process)
     told: list[str] = []
     found, failed, done = search_all(plan_boundary(small("repetitions=3")), jobs=1, tell=told.append)
     assert (len(found), done) == (2, True)
@@ -324,7 +326,7 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
 def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Ctrl-C after the second seed: what was under way is taken too, nothing more, and the files hold it."""
     monkeypatch.setattr(boundary_module, "search", lambda asked: run_entry("a_key", int(asked.name[-2:])))
-    monkeypatch.setattr(boundary_module, "ProcessPoolExecutor", _InThisProcess)
+    monkeypatch.setattr(boundary_module, "processes", in_this_process)
     monkeypatch.setattr(_InThisProcess, "begins", 3)
     told: list[str] = []
 
@@ -347,14 +349,8 @@ class _InThisProcess:
 
     begins = 100
 
-    def __init__(self, *_: Any, **__: Any) -> None:
+    def __init__(self) -> None:
         self.futures: list[Any] = []
-
-    def __enter__(self) -> _InThisProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def shutdown(self, **_: Any) -> None:
         for future in self.futures:
@@ -371,6 +367,12 @@ class _InThisProcess:
             except WorkError as error:
                 future.set_exception(error)
         return future
+
+
+@contextmanager
+def in_this_process(jobs: int) -> Iterator[Workers]:
+    executor: Any = _InThisProcess()
+    yield Workers(executor, jobs, far=False)
 
 
 def test_paths_of_roads_can_be_routes(tmp_path: Path) -> None:

@@ -6,11 +6,9 @@ import csv
 import functools
 import itertools
 import math
-import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +28,7 @@ from lavt.experiment.report_files import save_figure
 from lavt.experiment.results import write_json
 from lavt.experiment.theory import configured_loop, critical_delay_s
 from lavt.experiment.watched_drive import WatchedDrive, watch_drive
+from lavt.experiment.workers import processes
 
 BOUNDARY = "boundary.json"
 FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
@@ -179,12 +178,8 @@ def search_all(
     found: dict[str, dict[str, Any]] = {}
     failed: list[dict[str, Any]] = []
     done = True
-    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
-    ignore = (signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only this one decides
-    with ProcessPoolExecutor(
-        jobs or os.cpu_count() or 1, mp_context=context, initializer=signal.signal, initargs=ignore
-    ) as executor:
-        futures = {executor.submit(search, each): each for each in searches}
+    with processes(jobs or os.cpu_count() or 1) as workers:
+        futures = {workers.executor.submit(search, each): each for each in searches}
 
         def take(future: Future[dict[str, Any]]) -> None:
             asked = futures.pop(future)
@@ -200,7 +195,7 @@ def search_all(
             for future in as_completed(list(futures)):
                 take(future)
         except KeyboardInterrupt:
-            executor.shutdown(wait=True, cancel_futures=True)
+            workers.executor.shutdown(wait=True, cancel_futures=True)
             done = False
             for future in [each for each in futures if not each.cancelled()]:
                 take(future)
