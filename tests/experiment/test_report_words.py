@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from lavt.experiment import report_words
 from lavt.experiment.paper import paper
 from lavt.experiment.report_words import differences, equal_totals, headline, what_was_driven
 
@@ -100,3 +101,24 @@ def test_differences_are_told_where_they_are_true() -> None:
     assert "rails" not in steady
     few = {name: {**each, "runs": 5} for name, each in conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0).items()}
     assert differences(few, PAPER["conditions"]) == []
+
+
+def test_conditions_of_one_loop_stand_in_the_order_of_their_names() -> None:
+    """Two conditions half a millisecond apart are one place: what is said to hold from there on holds for both."""
+    rates = {"L2": (222.5, 0.9), "L3": (297.6, 0.53), "L4": (297.4, 0.47), "L5": (397.3, 0.1)}
+    conditions = {
+        name: {"loop_ms": {"p50": loop_ms}, "completion_rate": rate, "p95_m": None}
+        for name, (loop_ms, rate) in rates.items()
+    }
+    said = headline("Virtual time", conditions)
+    assert "L3 53 % (298 ms), L4 47 % (297 ms), L5 10 % (397 ms)" in said
+    assert "Under half of the runs are completed from 297 ms on." in said
+
+
+def test_what_chance_does_not_explain_is_named() -> None:
+    """A condition whose interval does not overlap with the paper's is named, with both shares; else all overlap."""
+    theirs = {"L2": {"completion_interval": [0.31, 0.69], "completion_rate": 0.5}}
+    ours: Any = {"L2": {"completion_interval": [0.73, 0.98], "completion_rate": 0.9}}
+    assert "more at L2 (90 % against 50 %)" in report_words._apart(ours, theirs)
+    ours["L2"]["completion_interval"] = [0.6, 0.9]
+    assert report_words._apart(ours, theirs) == "All 95 % intervals of completion overlap with the paper's."
