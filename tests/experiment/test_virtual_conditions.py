@@ -54,7 +54,7 @@ def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> Non
 
 
 def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
-    """The record of who sends says how many packets were lost, and so many less have come (pixels record all of them)."""
+    """The record of who sends says how many packets were lost, and so many less have come; pixels record all."""
     driven(tmp_path / "run", "fidelity=pixels", "vehicle.scenery=none", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
