@@ -38,7 +38,17 @@ def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
 
 def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
     """Every run, condition and group in summary.json has the keys that others rely on."""
-    assert set(demo.summary) == {"schema", "speed", "runs", "conditions", "contrasts", "real", "groups", "paper"}
+    assert set(demo.summary) == {
+        "schema",
+        "speed",
+        "runs",
+        "conditions",
+        "contrasts",
+        "real",
+        "groups",
+        "paper",
+        "failed",
+    }
     assert all(run.keys() >= RUN_KEYS for run in demo.summary["runs"])
     conditions = [*demo.summary["conditions"].values(), *demo.summary["real"].values()]
     assert all(set(condition) == CONDITION_KEYS for condition in conditions)
