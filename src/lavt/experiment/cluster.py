@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -28,7 +29,13 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
         with (
-            dask.LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None, protocol="tcp") as started,
+            dask.LocalCluster(
+                n_workers=jobs,
+                threads_per_worker=1,
+                dashboard_address=None,
+                protocol="tcp",
+                silence_logs=logging.CRITICAL,
+            ) as started,
             dask.Client(started) as client,
         ):
             yield _of_client(client, address)
