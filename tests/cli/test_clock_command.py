@@ -58,8 +58,14 @@ def test_the_source_is_asked_before_and_after_the_probing(
     """What chrony says last counts, and by how much it differs from what it said first is in the bound."""
     (tmp_path / "chronyc").write_text(
         "#!/bin/sh\n"
-        'if [ -e "$0.was_asked" ]; then correction=0.001; else correction=0.0; touch "$0.was_asked"; fi\n'
-        "echo 0A090001,10.9.0.1,9,1795292431.9,$correction,0.0,0.0,0.0,0.0,4.0,0.0002,0.00005,1.1,Normal\n"
+        "correction=0.0\n"
+        "while read -r command; do\n"
+        '  case "$command" in\n'
+        "    tracking) echo 0A090001,10.9.0.1,9,1795292431.9,$correction,0,0,0,0,4.0,0.0002,0.00005,1.1,Normal;;\n"
+        "    ntpdata) echo 501 Not authorised;;\n"
+        "    *) echo Unrecognized command; correction=0.001;;\n"
+        "  esac\n"
+        "done\n"
     )
     (tmp_path / "chronyc").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")

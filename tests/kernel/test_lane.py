@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 
 import pytest
 from tests.kernel.lane import clocks, ntp_server
@@ -11,8 +12,9 @@ from tests.kernel.lane.driving import Drive
 from tests.kernel.lane.machine import Machine, MachineError
 from tests.kernel.lane.netem import netem_on_all
 
-from lavt.clock import pause
+from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.transport.chrony import NOT_RUNNING, Chronyc, read_chrony
 
 TrueOffset = Callable[[], int]
 NTP_PORT = 11123
@@ -138,3 +140,20 @@ def test_a_road_is_driven_over_both_machines(
     assert driven.measured.closure_p95_ms <= 1
     assert driven.measured.clocks.bound_ms is not None
     assert 0 < driven.result["tau_c_ms"]["p50"] < 50, "an offset of 250 ms would show"
+
+
+def test_one_client_of_chrony_outlives_the_daemon(server_machine: Machine) -> None:
+    """What drives use to ask chrony says when the daemon is gone and, when it runs again, what it says."""
+    chronyd = start_chronyd(server_machine, *SERVING)
+    with closing(Chronyc()) as chronyc:
+        statuses = [status_of(chronyc)]
+        chronyd.stop()
+        statuses.append(status_of(chronyc))
+        start_chronyd(server_machine, *SERVING)
+        statuses.append(status_of(chronyc))
+    assert statuses == ["its own clock is the reference", NOT_RUNNING, "its own clock is the reference"]
+
+
+def status_of(chronyc: Chronyc) -> str | None:
+    report = read_chrony(MachineClock(), chronyc.run)
+    return None if report is None else report.status

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -9,10 +12,10 @@ from hypothesis import strategies as st
 
 from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_S, Now
-from lavt.transport.chrony import ABSENT, NOT_RUNNING, NOT_SYNCHRONISED, parse_chrony, read_chrony
+from lavt.transport.chrony import ABSENT, NOT_RUNNING, NOT_SYNCHRONISED, Chronyc, parse_chrony, read_chrony
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.ptp import read_ptp
-from lavt.transport.shell import NOT_FOUND, Ended, Run
+from lavt.transport.shell import Ended, Run
 
 TRACKING = (
     "0A090001,10.9.0.1,9,1795292431.937353491,0.249678716,-0.000000352,0.000014692,-0.310,0.014,3.735,"
@@ -170,9 +173,27 @@ def test_any_answer(answer: str) -> None:
         assert each is None or 0 <= each < math.inf
 
 
-def test_no_chrony() -> None:
+def test_one_client_of_chrony_stays_and_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One process answers every question, each with all that it said until it found a command that it does not know."""
+    (tmp_path / "chronyc").write_text(
+        "#!/bin/sh\n"
+        "while read -r command; do\n"
+        '  case "$command" in lavt) echo "Unrecognized command" >&2;; *) echo "$command, $$";; esac\n'
+        "done\n"
+    )
+    (tmp_path / "chronyc").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    with closing(Chronyc()) as chronyc:
+        answers = [chronyc.run(("tracking", "ntpdata"), 10) for _ in range(2)]
+    assert answers[0] is not None
+    process = answers[0].output.split()[1]
+    assert answers == [Ended(0, f"tracking, {process}\nntpdata, {process}\n")] * 2
+
+
+def test_no_chrony(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where chrony is not installed, the report says so and has no correction."""
-    report = read_chrony(MachineClock(), answering(Ended(NOT_FOUND, "")))
+    monkeypatch.setenv("PATH", "")
+    report = read_chrony(MachineClock(), Chronyc().run)
     assert report is not None
     assert (report.source, report.status, report.correction_s, report.bound_s) == ("chrony", ABSENT, None, None)
 

@@ -6,18 +6,23 @@ from collections.abc import Callable
 
 from lavt.clock import Clock
 from lavt.config import ClockConfig
-from lavt.transport.chrony import read_chrony
+from lavt.transport.chrony import Chronyc, read_chrony
 from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, unknown_clock
 from lavt.transport.ptp import read_ptp
-from lavt.transport.shell import Run
+from lavt.transport.shell import Interpreter, Run, Shell
 
 MS_PER_S = 1000.0
+
+
+def interpreter(config: ClockConfig) -> Interpreter:
+    """Give what runs the commands of the source that the config names; to be closed."""
+    return Chronyc() if config.source == "chrony" else Shell()
 
 
 def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
     """Give the function that asks the source which the config names; it gives None where no answer came in time.
 
-    `run` runs the source's program.
+    `run` is that of the source's `interpreter`.
     """
 
     def external() -> ClockReport:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lavt.build.clock_source import clock_source
+from lavt.build.clock_source import clock_source, interpreter
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
@@ -21,7 +21,6 @@ from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.clock_probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
-from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink, look_up
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS
@@ -57,8 +56,8 @@ def clock(
     config = parse_config(ClockConfig, asked, "lavt clock")
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
-    with closing(Shell()) as shell:
-        ask = clock_source(config, machine, shell.run)
+    with closing(interpreter(config)) as asked_by:
+        ask = clock_source(config, machine, asked_by.run)
         report = _answer(ask, source)
         if address is None:
             finding = check_host(report)

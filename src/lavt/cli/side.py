@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import yaml
 
-from lavt.build.clock_source import clock_source
+from lavt.build.clock_source import clock_source, interpreter
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -27,7 +27,6 @@ from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.injector import Injector
 from lavt.transport.netem import Port
 from lavt.transport.netem_control import Netem
-from lavt.transport.shell import Shell
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
@@ -58,7 +57,7 @@ class Side:
         self._writer: RecordWriter | None = None
         self._queue: QueuedRecorder | None = None
         self._udp: dict[str, UdpLink] = {}
-        self._shell = Shell()
+        self._interpreter = interpreter(config.clock)
         if out is not None:
             check_directory(out)
         queues = _queues(config)
@@ -94,7 +93,7 @@ class Side:
             self.tap = LiveTap(self._writer)
         self._queue = QueuedRecorder(self.tap)
         self.runtime = RealRuntime(
-            self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock, self._shell.run)
+            self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock, self._interpreter.run)
         )
         self._zenoh.start()
         self.runtime.start({**self._udp, "zenoh": self._zenoh, "netem": self._injector})
@@ -128,7 +127,7 @@ class Side:
         if self.runtime is not None:
             self.runtime.stop()
         self._injector.close()
-        self._shell.close()
+        self._interpreter.close()
         for each in self._udp.values():
             each.close()
         self._zenoh.close()
