@@ -38,3 +38,8 @@ class BadPacket(PeerError):
 
 class VehicleError(LavtError):
     """The vehicle or its camera does not do what it should."""
+
+
+def in_words(error: Exception) -> str:
+    """Say an error in one sentence: an unforeseen one with its kind, as its own text may say little."""
+    return str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"

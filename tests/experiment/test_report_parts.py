@@ -85,7 +85,7 @@ def report_of(summary: dict[str, Any], directory: Path) -> Report:
 
 def all_parts(report: Report) -> dict[str, str]:
     parts = {
-        "head": head(report, []), "conditions": conditions_parts(report), "contrasts": contrast_parts(report),
+        "head": head(report), "conditions": conditions_parts(report), "contrasts": contrast_parts(report),
         "differences": difference_parts(report), "injected": injected_parts(report),
         "degradation": degradation_parts(report), "survival": survival_parts(report), "hops": hop_parts(report, {}),
         "groups": group_parts(report), "axes": axis_parts(report), "routes": route_parts(report),
@@ -108,6 +108,24 @@ def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
     assert row is not None
     assert text_of(row[1]).split() == ["6", "0", "0", "1", "1", "0.78", "1"]
     assert "L3 (225 + 0 ms) and L4 (150 + 75 ms) inject the same total" in parts["contrasts"]
+
+
+def test_survival_curves_are_there_as_numbers(tmp_path: Path) -> None:
+    """Below the figures of survival are files of every step with its 95 % interval, for what draws it otherwise."""
+    report = report_of(summarize(campaign(), None), tmp_path)
+    assert 'href="tables/survival_virtual.csv"' in "".join(survival_parts(report))
+    first, *rows = (tmp_path / "tables" / "survival_virtual.csv").read_text().splitlines()
+    assert first == "route,condition,distance m,still driving,95 % interval low,95 % interval high,ended so far"
+    curves = [curve for entry in report.kinds["virtual"].values() for curve in entry["survival"].values()]
+    assert len(rows) == sum(len(curve["distance_m"]) for curve in curves) > 0
+
+
+def test_runs_that_failed_are_told_at_the_top(tmp_path: Path) -> None:
+    """The summary of a report names the runs that failed and why, and how many they are."""
+    failed = [{"run": "a_L0_00", "because": "the disk is full"}]
+    said = text_of("".join(head(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
+    assert "1 of the runs asked for failed and are in no number of this page: a_L0_00: the disk is full" in said
+    assert "failed" not in text_of("".join(head(report_of(summarize(campaign(), None), tmp_path))))
 
 
 def test_conditions_of_ones_own_have_no_paper_beside_them(tmp_path: Path) -> None:

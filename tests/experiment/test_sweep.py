@@ -6,6 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +16,17 @@ from typing import Any
 import pytest
 import yaml
 
+import lavt.experiment.sweep
 from lavt.clock import pause
 from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.plan import PlannedRun, plan_run, plan_sweep
-from lavt.experiment.run import run_once
+from lavt.experiment.results import read_json
+from lavt.experiment.run import RESULT, run_once
 from lavt.experiment.sweep import base_of, open_sweep, recorded_base, run_all, sweep
+from lavt.experiment.workers import Workers
 
 CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
@@ -203,6 +209,30 @@ def test_a_process_that_dies_costs_no_run(tmp_path: Path) -> None:
     assert left == [0]
     assert driven.failed == []
     assert sorted(result["run"] for result in driven.results) == sorted(each.name for each in planned)
+
+
+class DiesAfterwards(Executor):
+    """Drives here, and says what is said of a process that died before it could tell: a real one hardly ever does."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Drive, and break."""
+        fn(*args, **kwargs)
+        future: Future[Any] = Future()
+        future.set_exception(BrokenExecutor())
+        return future
+
+
+def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that had its result when its process died counts as it is, and is not driven again."""
+    workers = Workers(DiesAfterwards(), 1, far=False)
+    monkeypatch.setattr(lavt.experiment.sweep, "processes", lambda _jobs: nullcontext(workers))
+    _, planned = geometry()
+    driven, _ = run_all(planned[:1], tmp_path, jobs=1, tell=lambda _: None)
+    assert driven.failed == []
+    assert (
+        [drive.result for drive in driven.drives] == driven.results == [read_json(tmp_path / planned[0].name / RESULT)]
+    )
+    assert len(driven.drives[0].truth) > 0
 
 
 @pytest.mark.realtime

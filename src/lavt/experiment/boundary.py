@@ -18,7 +18,7 @@ import numpy as np
 from lavt.config import BoundaryConfig, RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS
-from lavt.errors import LavtError, UserError, WorkError
+from lavt.errors import UserError, WorkError, in_words
 from lavt.experiment.boundary_figure import boundary_figure
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import CRITERIA, groups_of
@@ -186,8 +186,7 @@ def search_all(
             try:
                 found[asked.name] = future.result()
             except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
-                failed.append({"name": asked.name, "why": why})
+                failed.append({"name": asked.name, "why": in_words(error)})
             said = _sentence(found[asked.name]) if asked.name in found else f"failed: {failed[-1]['why']}"
             tell(f"{asked.name}: {said}")
 

@@ -81,7 +81,8 @@ def _of_client(client: Any, address: str) -> Workers:
         raise UserError(f"a Dask worker has no LAVT ({error}): install the same version there as here") from error
     for worker, there in versions.items():
         different = {name: (here, there.get(name)) for name, here in versions_here().items() if here != there.get(name)}
-        for name, (here, other) in different.items():
+        if different:
+            name, (here, other) = next(iter(different.items()))
             raise UserError(f"the Dask worker {worker} has {name} {other}, not {here} as here: install the same there")
     return Workers(client.get_executor(), len(threads), far=True)
 

@@ -76,28 +76,23 @@ def write_report(
     summary_path = sweep_dir / "summary.json"
     if speed is None and summary_path.is_file():
         speed = read_json(summary_path).get("speed")
-    summary = {**summarize([result for _, result in results], speed, base=base), "failed": left_out}
+    summary = summarize([result for _, result in results], speed, base=base, failed=left_out)
     write_json(summary_path, summary)
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)
     report = Report(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context({"text.parse_math": False}):  # a name with a dollar is no formula
-        sections = _sections(report, sets, left_out, boundaries)
+        sections = _sections(report, sets, boundaries)
     index = report_dir / "index.html"
     index.write_text(page.page(TITLE, sections), encoding="utf-8")
     return index
 
 
-def _sections(
-    report: Report,
-    sets: DriveSets,
-    left_out: Sequence[Mapping[str, str]],
-    boundaries: Sequence[Mapping[str, Any]],
-) -> list[page.Section]:
+def _sections(report: Report, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]) -> list[page.Section]:
     """Make the page's sections in their order."""
     return [
-        ("Summary", head(report, left_out)),
+        ("Summary", head(report)),
         ("Conditions", conditions_parts(report)),
         ("Planned contrasts", contrast_parts(report)),
         ("Where this differs from the paper, and why", difference_parts(report)),

@@ -12,7 +12,7 @@ from lavt.experiment.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.figure_style import Colours, Conditions
 from lavt.experiment.figures_latency import degradation_figure, hops_figure, injected_figure, presets_figure
 from lavt.experiment.figures_runs import axis_figure, incidence_figure, routes_with_survival, survival_figure
-from lavt.experiment.report_files import save_figure, save_table
+from lavt.experiment.report_files import link_table, save_figure, save_table
 from lavt.experiment.report_groups import Group, axes_of, differing, in_order, short, title_of
 from lavt.experiment.report_tables import (
     clock_table,
@@ -27,6 +27,7 @@ from lavt.experiment.report_tables import (
     route_overview,
     route_table,
     run_table,
+    survival_table,
 )
 from lavt.experiment.report_words import differences, equal_totals, headline, what_was_driven
 
@@ -92,9 +93,9 @@ class Report:
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
-def head(report: Report, left_out: Sequence[Mapping[str, str]]) -> Parts:
+def head(report: Report) -> Parts:
     """Say in plain words what was driven and what came out."""
-    runs, speed = report.summary["runs"], report.summary["speed"]
+    runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
     parts = [page.paragraph(what_was_driven(runs))]
     names = differing(report.groups)
     compared = report.groups if 1 < len(report.groups) <= COMPARED_GROUPS else []
@@ -109,9 +110,9 @@ def head(report: Report, left_out: Sequence[Mapping[str, str]]) -> Parts:
         factor = speed["simulated_s"] / speed["wall_s"]
         text = f"{speed['simulated_s']:.0f} s were simulated in {speed['wall_s']:.0f} s with {speed['jobs']} jobs: "
         parts.append(page.paragraph(f"{text}{factor:.1f} times as fast as real time.", note=True))
-    if left_out:
-        parts.append(page.paragraph(f"{len(left_out)} of the runs asked for failed and are in no number of this page:"))
-        parts.append(page.bullets([f"{each['run']}: {each['because']}" for each in left_out]))
+    if failed:
+        parts.append(page.paragraph(f"{len(failed)} of the runs asked for failed and are in no number of this page:"))
+        parts.append(page.bullets([f"{each['run']}: {each['because']}" for each in failed]))
     return parts
 
 
@@ -207,7 +208,7 @@ def survival_parts(report: Report) -> Parts:
             "survival": (
                 survival_figure,
                 "Runs that are still driving after each distance (Kaplan-Meier): any ending but completed "
-                "counts, and a completed run leaves at the route's end. The table has the 95 % intervals.",
+                "counts, and a completed run leaves at the route's end. The files have the 95 % intervals.",
             ),
             "incidence": (incidence_figure, "Cumulative incidence: the share of the runs that has ended in each way."),
         }
@@ -219,6 +220,7 @@ def survival_parts(report: Report) -> Parts:
                     report.directory, f"{name}_{kind}", figure, alternative, f"{caption} {kind.capitalize()} time."
                 )
             )
+        parts.append(link_table(report.directory, f"survival_{kind}", survival_table(conditions)))
     return parts
 
 

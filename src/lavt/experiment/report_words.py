@@ -39,7 +39,7 @@ def _known(conditions: Conditions) -> list[tuple[str, float, float]]:
     return sorted(known, key=lambda each: (max(place for place in places if place <= each[1]), each[0]))
 
 
-def what_was_driven(runs: Sequence[Mapping[str, Any]], left_out: int = 0) -> str:
+def what_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
     """Say how many runs on how many routes under which conditions there are, and how many of them count."""
     counted = ", ".join(
         f"{many} in {kind} time" for kind in ("virtual", "real") if (many := sum(run["time"] == kind for run in runs))
@@ -49,8 +49,7 @@ def what_was_driven(runs: Sequence[Mapping[str, Any]], left_out: int = 0) -> str
     invalid = sum(not run["valid"] for run in runs)
     verdict = f"{invalid} not valid, for reasons given below, and in no statistic" if invalid else "All of them count"
     where = f"{_some('route', routes)} under {_some('condition', names)}"
-    missing = f" {left_out} more did not finish and are left out." if left_out else ""
-    return f"{len(runs)} runs: {counted}, on {where}. {verdict}.{missing}"
+    return f"{len(runs)} runs: {counted}, on {where}. {verdict}."
 
 
 def _some(word: str, names: Sequence[str]) -> str:

@@ -20,12 +20,17 @@ SWEEP = "sweep"
 
 
 def summarize(
-    runs: Sequence[Run], speed: Mapping[str, Any] | None, *, base: Mapping[str, Any] | None = None
+    runs: Sequence[Run],
+    speed: Mapping[str, Any] | None,
+    *,
+    base: Mapping[str, Any] | None = None,
+    failed: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
     """Make the whole of `summary.json` of a sweep's runs.
 
     `base` names keys of a run (or of its `axes`) and the value each has in the sweep's base config; `conditions` holds
-    the virtual runs that have them all. Without it every virtual run belongs to the base config.
+    the virtual runs that have them all. Without it every virtual run belongs to the base config. `failed` says which
+    runs have no result (`run`), and why (`because`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
     wanted = dict(base or {})
@@ -34,6 +39,7 @@ def summarize(
         "schema": SCHEMA,
         "speed": dict(speed) if speed else {"simulated_s": None, "wall_s": None, "jobs": None},
         "runs": [dict(run) for run in runs],
+        "failed": [dict(each) for each in failed],
         "conditions": by_condition(of_base),
         "contrasts": paired_contrasts(of_base),
         "real": by_condition(run for run in runs if run["time"] == "real"),

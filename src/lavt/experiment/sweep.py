@@ -18,10 +18,10 @@ from lavt.clock import MachineClock
 from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
-from lavt.errors import LavtError, UserError, WorkError
+from lavt.errors import UserError, WorkError, in_words
 from lavt.experiment.cluster import cluster
 from lavt.experiment.directory import prepare_directory
-from lavt.experiment.drives import Drive
+from lavt.experiment.drives import Drive, read_drive
 from lavt.experiment.plan import PlannedRun, plan_sweep
 from lavt.experiment.report import FAILED, write_report
 from lavt.experiment.results import read_json, write_json
@@ -103,15 +103,18 @@ class _Work:
                 except BrokenExecutor:
                     broken.append(planned)
                 except Exception as error:  # whatever it is, the other runs have nothing to do with it
-                    why = str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"
-                    self.fail(planned, why)
+                    self.fail(planned, in_words(error))
                 else:
-                    self.drives.append(drive)
-                    self._tell(f"{planned.name}: {drive.result['ending']}")
+                    self.take(planned, drive)
         except KeyboardInterrupt:
             workers.executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
             raise
         return broken
+
+    def take(self, planned: PlannedRun, drive: Drive) -> None:
+        """Note a drive."""
+        self.drives.append(drive)
+        self._tell(f"{planned.name}: {drive.result['ending']}")
 
     def fail(self, planned: PlannedRun, why: str) -> None:
         """Note that a run failed."""
@@ -127,6 +130,10 @@ def _drive_in_processes(work: _Work, todo: Sequence[PlannedRun], jobs: int) -> N
         begun = [each for each in broken if (work.runs_dir / each.name).exists()]
         _remove_unfinished(broken, work.runs_dir)
         for each in begun:
+            directory = work.runs_dir / each.name
+            if is_finished(directory):  # its process died after it
+                work.take(each, read_drive(directory, read_json(directory / RESULT)))
+                continue
             with processes(1) as alone:
                 if work.drive(alone, [each]):
                     work.fail(each, "the process that drove it died, twice")
