@@ -16,6 +16,8 @@ from lavt.config import (
     ClocksConfig,
     Costs,
     DelayConfig,
+    FlowChanges,
+    Impairment,
     NetworkConfig,
     RelayConfig,
     RunConfig,
@@ -363,3 +365,11 @@ def test_nothing_is_delayed_by_default() -> None:
     """Without being told, the relay holds nothing, and the clocks' error lies inside its bound."""
     assert DelayConfig() == DelayConfig(constant_ms=0.0, jitter_median_ms=0.0, jitter_sigma=0.0)
     assert ClocksConfig().error_us <= ClocksConfig().bound_us
+
+
+def test_every_impairment_can_be_changed_by_a_run() -> None:
+    """What a condition can say of a flow a run can replace, within the same bounds, and so a sweep can vary it."""
+    changes = FlowChanges.model_json_schema()["properties"]
+    for name, described in Impairment.model_json_schema()["properties"].items():
+        bounds = {key: each for key, each in described.items() if key not in ("title", "default", "description")}
+        assert bounds in changes[name]["anyOf"], name

@@ -108,6 +108,11 @@ BAD_RUNS = {
         "there is no trace 'nowhere'",
     ),
     "a trace that is a directory": (["--set", "network.video.trace=."], "there is no trace '.'"),
+    "a trace of a long name": (["--set", f"network.video.trace={'a' * 300}"], "there is no trace 'aaa"),
+    "a trace that the state is to follow": (
+        ["--set", "network.condition=handover", "--set", "network.state_delay=with_video"],
+        "cannot follow its trace 'handover.csv': choose none",
+    ),
     "a trace that is none": (["--set", f"network.video.trace={DEMO}"], "is no time of a Mahimahi trace"),
     "a trace and a rate": (
         ["--set", "network.condition=fading", "--set", "network.video.rate_bps=1000000"],

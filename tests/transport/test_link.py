@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,17 @@ def test_share_of_losses(loss: float) -> None:
     both = (lost[:-1] & lost[1:]).mean()
     assert both == pytest.approx(loss**2, abs=4 * (loss**2 / COUNT) ** 0.5)
     assert made.counts == {"packets": COUNT, "lost": int(lost.sum()), "dropped": 0, "overtook": 0}
+
+
+@pytest.mark.parametrize("burst", [0.0, 5.0])
+def test_more_loss_takes_what_less_loss_took(burst: float) -> None:
+    """With the same seed every packet that is lost at 1 % is lost at 5 %, and those at 10 %, in bursts or not."""
+    shares = [0.01, 0.05, 0.1]
+    lost = [
+        np.array([each is None for each in times(link(Law(loss=share, loss_burst_packets=burst)))]) for share in shares
+    ]
+    assert [int(less.sum()) > 100 for less in lost] == [True] * 3
+    assert [int((less & ~more).sum()) for less, more in itertools.pairwise(lost)] == [0, 0]
 
 
 def runs_of(lost: NDArray[np.bool_]) -> NDArray[np.int64]:

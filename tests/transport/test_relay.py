@@ -362,6 +362,21 @@ def test_bad_links(link: LinkConfig, said: str) -> None:
         flows(config)
 
 
+def test_clients_that_are_gone_are_counted() -> None:
+    """What became of a client's packets is counted for its flow when the relay has forgotten the client."""
+    with closing(Net(control=DelayConfig(link=LinkConfig(loss=0.5)))) as net:
+        for _ in range(2):
+            client = net.end()
+            for number in range(40):
+                client.send(bytes([number]), net.at["control"])
+                net.step()
+            net.later(31_000)
+        came = len(net.server["control"].waiting())
+        counts = net.relay.counts()["control upstream"]
+    assert counts["packets"] == 80
+    assert counts["lost"] == 80 - came > 0
+
+
 def test_silent_client(net: Net) -> None:
     """A client silent for half a minute loses its socket when another comes, and begins anew when it speaks."""
     client, seen_at = net.connect("video")

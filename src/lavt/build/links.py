@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
 from lavt.build.injection import plain_law
-from lavt.config import Impairment
+from lavt.config import Condition, Impairment
 from lavt.config_file import shipped
 from lavt.errors import UserError
 from lavt.transport.link import Injected, check_injected
@@ -35,9 +36,19 @@ def trace_path(name: str) -> Path:
     if name in known:
         return shipped(TRACES) / name
     path = Path(name)
-    if not path.is_file():
+    try:
+        exists = path.is_file()
+    except OSError:  # a name that is too long, or in a directory that is not ours to look into
+        exists = False
+    if not exists:
         raise UserError(f"there is no trace {name!r}: name one of {', '.join(known)}, or an existing file")
     return path
+
+
+def trace_digests(asked: Condition) -> dict[str, str]:
+    """Give the SHA-256 of each trace that a condition names, by name: a file can be changed after a run."""
+    names = [flow.trace for flow in (asked.video, asked.control) if flow.trace]
+    return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 
 
 def read_trace(name: str) -> Trace:

@@ -105,7 +105,7 @@ class NetworkConfig(Section):
 
     @property
     def changes(self) -> str | None:
-        """What differs from the condition, in words; None where nothing does."""
+        """What is asked for instead of what the condition says, in words; None where nothing is."""
         flows = {"video": self.video.given, "control": self.control.given}
         words = [f"{flow}.{name} {value}" for flow, given in flows.items() for name, value in given.items()]
         return ", ".join(words) or None
@@ -326,7 +326,8 @@ class ClientConfig(Section):
 class DelayConfig(Section):
     """One direction of a relayed flow: a constant delay, a lognormal one on top, and what a condition does."""
 
-    constant_ms: float = Field(0.0, ge=0, le=60_000)
+    constant_ms: float = Field(0.0, ge=0, le=70_000)
+    """An inherent profile's and a condition's."""
     jitter_median_ms: float = Field(0.0, ge=0, le=60_000)
     jitter_sigma: float = Field(0.0, ge=0, le=3)
     link: LinkConfig = LinkConfig()

@@ -57,6 +57,11 @@ class Impairment(Section):
     queue_packets: int = Field(QUEUE_PACKETS, ge=1, le=1_000_000)
     """So many wait for `rate_bps` or a capacity; what comes then is dropped."""
 
+    @property
+    def has_delay_trace(self) -> bool:
+        """Whether the delay changes by a trace."""
+        return self.trace.endswith(".csv")
+
 
 class LinkConfig(Impairment):
     """What is injected into one direction of a relayed flow, as a condition has it."""
@@ -80,7 +85,7 @@ class FlowChanges(Section):
 
     @property
     def given(self) -> dict[str, Any]:
-        """What differs from the condition."""
+        """What is asked for instead of what the condition says."""
         return self.model_dump(exclude_none=True)
 
     def of(self, delay_ms: float, impairment: Impairment) -> tuple[float, Impairment]:
@@ -97,6 +102,12 @@ class Condition(Section):
     control_ms: float = Field(ge=0, le=60_000)
     video: Impairment = Impairment()
     control: Impairment = Impairment()
+
+    @property
+    def constant_ms(self) -> dict[str, float | None]:
+        """The delay of each flow; None where it changes by a trace."""
+        flows = {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
+        return {name: None if each.has_delay_trace else delay_ms for name, (delay_ms, each) in flows.items()}
 
     @property
     def least_ms(self) -> dict[str, float]:

@@ -73,15 +73,19 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
 
 
 def injected_entry(asked: Condition) -> dict[str, Any]:
-    """Say what is injected and, where jitter or overtaking make that less, how much of it there must be at least."""
-    injected_ms = {"video": asked.video_ms, "control": asked.control_ms}
-    least = {} if asked.least_ms == injected_ms else {"injected_least_ms": asked.least_ms}
-    return {"injected_ms": injected_ms, **least}
+    """Say what is injected (None: a trace's) and, where that is not all, how much of it there must be at least."""
+    least = {} if asked.least_ms == asked.constant_ms else {"injected_least_ms": asked.least_ms}
+    return {"injected_ms": asked.constant_ms, **least}
 
 
 def _check_injection(config: RunConfig, asked: Condition) -> None:
     """Raise `UserError` where what injects cannot do what the condition or the profile asks, or nobody could."""
     network = config.network
+    if network.state_delay == "with_video" and asked.video.trace:
+        raise UserError(
+            "network.state_delay with_video delays the state by the video's constant delay, and cannot follow its "
+            f"trace {asked.video.trace!r}: choose none, or a condition without a trace"
+        )
     if config.time == "real" and network.injection == "netem":
         if network.inherent != "loopback":
             raise UserError(

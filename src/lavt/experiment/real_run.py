@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel
 
-from lavt.build.links import trace_path
+from lavt.build.links import trace_digests, trace_path
 from lavt.clock import Clock, MachineClock, pause
 from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -128,7 +128,8 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
-                    write_json(out / RELAY, {"asked_ms": _asked_ms(planned), **loop.relay.last_line()})
+                    asked = {"asked_ms": _asked_ms(planned), "traces": trace_digests(planned.asked)}
+                    write_json(out / RELAY, {**asked, **loop.relay.last_line()})
                 if netem is not None:
                     write_json(out / NETEM, netem.report())
         finally:

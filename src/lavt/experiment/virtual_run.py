@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from lavt.build.entropy import SeededEntropy
 from lavt.build.fidelity import FIDELITIES
+from lavt.build.links import trace_digests
 from lavt.build.sides import ClientNodes, ServerNodes, build_client, build_server
 from lavt.config import Costs, RunConfig
 from lavt.config_file import load_config, shipped
@@ -119,7 +121,14 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     for writer in writers:
         for name, entries in provenance().items():
             writer.annotate(name, entries)
-        writer.annotate("model", {"costs": costs.model_dump_json(), "condition": asked.model_dump_json()})
+        writer.annotate(
+            "model",
+            {
+                "costs": costs.model_dump_json(),
+                "condition": asked.model_dump_json(),
+                "traces": json.dumps(trace_digests(asked)),
+            },
+        )
     tap = EndingTap(writers[0])
     costs_ns = {
         (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()

@@ -55,10 +55,11 @@ class Draws:
 
 @lru_cache
 def quantiles(distribution: Distribution) -> tuple[float, ...]:
-    """Give the middle of each of 4096 equally likely parts of a distribution, in netem's standard deviations.
+    """Give a value of each of 4096 equally likely parts of a distribution, in netem's standard deviations.
 
-    That of `uniform` is its half width. netem's `pareto` (shape 3) and `paretonormal` are cut at 4 of them and so are
-    not quite what they are called: their standard deviations are 0.82 and 0.83, their means -0.03.
+    It is the middle of the part and, of `pareto`, its lower end. That of `uniform` is its half width. netem's `pareto`
+    (shape 3) and `paretonormal` are cut at 4 of them and so are not quite what they are called: their standard
+    deviations are 0.82 and 0.83, their means -0.03.
     """
     if distribution == "uniform":
         return tuple((2 * part + 1) / QUANTILES - 1 for part in range(QUANTILES))
@@ -111,5 +112,5 @@ class Losses:
             return drawn < self._loss
         begins, ends = self._bursts
         lost = self._bad  # as the kernel has it: what is drawn at a packet counts from the next one
-        self._bad = drawn >= ends if lost else drawn < begins
+        self._bad = drawn < (1 - ends if lost else begins)  # small draws lose in either state: more loss adds to less
         return lost

@@ -11,7 +11,7 @@ import heapq
 import selectors
 import socket
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from statistics import median
@@ -115,7 +115,10 @@ class Relay:
         return {each.flow.name: each.port for each in self._flows}
 
     def held_ms(self) -> dict[str, float | None]:
-        """Tell for each flow and direction the median of how long its datagrams were held; None where none came."""
+        """Tell for each flow and direction the median of how long its datagrams were held; None where none came.
+
+        Of the clients that it has now, and their last datagrams.
+        """
         return {name: _median_ms([each for way in ways for each in way.held_ns]) for name, ways in self._ways()}
 
     def late_ms(self) -> dict[str, float | None]:
@@ -123,13 +126,12 @@ class Relay:
         return {name: _median_ms([each for way in ways for each in way.late_ns]) for name, ways in self._ways()}
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Tell what became of the packets of each flow and direction that are not only delayed; of all its clients."""
-        links = {name: [way.line.link for way in ways if way.line.link is not None] for name, ways in self._ways()}
-        return {
-            name: {key: sum(link.counts[key] for link in each) for key in each[0].counts}
-            for name, each in links.items()
-            if each
-        }
+        """Tell what became of the packets of each flow and direction that are not only delayed; of all clients ever."""
+        counts = {name: _counted(ways) for name, ways in self._ways()}
+        for each in self._flows:
+            for direction, gone in each.gone.items():
+                counts[f"{each.flow.name} {direction}"].update(gone)
+        return {name: dict(each) for name, each in counts.items() if each}
 
     def _ways(self) -> Iterator[tuple[str, list[_Way]]]:
         for each in self._flows:
@@ -216,6 +218,8 @@ class _OpenFlow:
         self.flow = flow
         self._relay = relay
         self._clients: dict[Address, _Client] = {}
+        self.gone: dict[str, Counter[str]] = {"upstream": Counter(), "downstream": Counter()}
+        """What became of the packets of clients that it has no more."""
         self._socket = _bound_socket(flow.listen, flow.name)
         self.port = int(self._socket.getsockname()[1])
         relay.watch(self._socket, self._from_clients)
@@ -266,11 +270,25 @@ class _OpenFlow:
         """Let clients go that are silent and, where there are too many, the one that has been silent for longest."""
         now_ns = self._relay.now_ns()
         if len(self._clients) >= MOST_CLIENTS:
-            longest = min(self._clients, key=lambda address: self._clients[address].heard_ns)
-            self._relay.unwatch(self._clients.pop(longest).upstream_socket)
+            self._let_go(min(self._clients, key=lambda address: self._clients[address].heard_ns))
         for address, client in list(self._clients.items()):
             if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
-                self._relay.unwatch(self._clients.pop(address).upstream_socket)
+                self._let_go(address)
+
+    def _let_go(self, address: Address) -> None:
+        client = self._clients.pop(address)
+        self.gone["upstream"].update(_counted([client.up]))
+        self.gone["downstream"].update(_counted([client.down]))
+        self._relay.unwatch(client.upstream_socket)
+
+
+def _counted(ways: Sequence[_Way]) -> Counter[str]:
+    """Add up what the links of some ways counted; nothing where there is no link."""
+    counts: Counter[str] = Counter()
+    for way in ways:
+        if way.line.link is not None:
+            counts.update(way.line.link.counts)
+    return counts
 
 
 def _median_ms(values_ns: Sequence[int]) -> float | None:
