@@ -4,9 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import periodogram
 
 from lavt.domain import NS_PER_MS, FloatArray
-from lavt.experiment.steering import oscillation_hz, steering, steering_rate_rms_radps
+from lavt.experiment.steering import oscillation_hz, power_spectrum, steering, steering_rate_rms_radps
 from lavt.experiment.table import Table, table_of
 
 
@@ -43,6 +44,15 @@ def test_an_oscillation_is_found(hertz: float) -> None:
     """The frequency of a sine is found to 0.01 Hz in 30 s, though the steering drifts beside it."""
     at_s, angle_rad = swinging(hertz, 0.05)
     assert oscillation_hz(at_s, angle_rad + 0.05 * at_s) == pytest.approx(hertz, abs=0.01)
+
+
+def test_the_spectrum_is_scipys() -> None:
+    """Power over frequency is that of SciPy's periodogram with the same window, but at 0 Hz and the highest."""
+    even_rad = np.random.default_rng(1).normal(size=311).cumsum()
+    hertz, power = power_spectrum(even_rad)
+    expected = periodogram(even_rad, 20.0, "hann", nfft=4096, detrend="linear", scaling="spectrum")
+    assert hertz == pytest.approx(expected[0])
+    assert power[1:-1] == pytest.approx(expected[1][1:-1])
 
 
 def test_the_widest_of_two_oscillations_counts() -> None:

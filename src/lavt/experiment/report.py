@@ -38,12 +38,10 @@ from lavt.experiment.report_parts import (
     run_parts,
     survival_parts,
 )
-from lavt.experiment.results import read_json, write_json
+from lavt.experiment.results import FAILED, read_json, write_json
 from lavt.experiment.summary import summarize
 
 TITLE = "LAVT: latency and driving"
-FAILED = "failed.json"
-"""In a sweep's directory: the runs that failed and why; absent or empty where none did."""
 
 
 def write_report(

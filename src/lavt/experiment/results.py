@@ -14,6 +14,9 @@ from lavt.experiment.payload_json import without_nan
 from lavt.experiment.record import Record
 from lavt.experiment.validity import invalid_because
 
+FAILED = "failed.json"
+"""In a sweep's directory: the runs that failed and why; absent or empty where none did."""
+
 IDENTITY = (
     "run",
     "time",

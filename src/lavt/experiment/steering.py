@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.fft import next_fast_len
-from scipy.signal import find_peaks, periodogram
 
 from lavt.domain import NS_PER_S, FloatArray
 from lavt.experiment.table import Table
@@ -50,24 +48,36 @@ def steering_rate_rms_radps(at_s: FloatArray, steering_rad: FloatArray) -> float
 def oscillation_hz(at_s: FloatArray, steering_rad: FloatArray) -> float | None:
     """Frequency at which the steering swings most; None where no swing is wider than `REVERSAL_DEADBAND_RAD`.
 
-    It is the highest peak of the periodogram (`scipy.signal.periodogram`, Hann's window, mean and slope taken off)
-    between `LOWEST_HZ` and `HIGHEST_HZ` with at least `FEWEST_PERIODS` in the drive.
+    It is the highest peak of the periodogram (Hann's window, mean and slope taken off) between `LOWEST_HZ` and
+    `HIGHEST_HZ` with at least `FEWEST_PERIODS` in the drive.
     """
     lasted_s = float(at_s[-1] - at_s[0]) if len(at_s) else 0.0
     even_s = np.arange(0.0, lasted_s, 1 / SAMPLED_HZ)
     if lasted_s < FEWEST_PERIODS / HIGHEST_HZ:
         return None
     even_rad = np.interp(even_s, at_s - at_s[0], steering_rad)
-    # Longer than the drive, filled up with zeros: the peak is then found finer than one period in the drive.
-    length = next_fast_len(8 * len(even_rad), real=True)
-    hertz, power = periodogram(even_rad, SAMPLED_HZ, window="hann", nfft=length, detrend="linear", scaling="spectrum")
-    peaks = find_peaks(power)[0]
+    hertz, power = power_spectrum(even_rad)
+    peaks = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]))
     peaks = peaks[(hertz[peaks] >= max(LOWEST_HZ, FEWEST_PERIODS / lasted_s)) & (hertz[peaks] <= HIGHEST_HZ)]
     if len(peaks) == 0:
         return None
     highest = peaks[np.argmax(power[peaks])]
     swing_rad = 2 * np.sqrt(2 * power[highest])  # a sine of amplitude a has the power a^2 / 2, and swings by 2 a
     return float(hertz[highest]) if swing_rad > REVERSAL_DEADBAND_RAD else None
+
+
+def power_spectrum(even_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Frequencies, and the power at each of what was sampled at `SAMPLED_HZ`: that of a sine is half its square.
+
+    As `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than the drive of a short route.
+    """
+    at = np.arange(len(even_rad))
+    straight = np.polynomial.Polynomial.fit(at, even_rad, 1)(at)
+    window = np.hanning(len(even_rad) + 1)[:-1]
+    # Longer than the drive, filled up with zeros: the peak is then found finer than one period in the drive.
+    length = 1 << (8 * len(even_rad) - 1).bit_length()
+    amplitudes = np.abs(np.fft.rfft((even_rad - straight) * window, length)) / window.sum()
+    return np.asarray(np.fft.rfftfreq(length, 1 / SAMPLED_HZ), np.float64), np.asarray(2 * amplitudes**2, np.float64)
 
 
 def steering_reversals(steering_rad: FloatArray) -> int:

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,7 @@ from lavt.experiment.cluster import cluster
 from lavt.experiment.directory import prepare_directory
 from lavt.experiment.drives import Drive, read_drive
 from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.report import FAILED, write_report
-from lavt.experiment.results import read_json, write_json
+from lavt.experiment.results import FAILED, read_json, write_json
 from lavt.experiment.run import CONFIG, RESULT, config_text
 from lavt.experiment.workers import Workers, processes
 
@@ -94,6 +94,7 @@ class _Work:
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
         """Have runs driven; give those that were not, because a worker's process died."""
         futures = {workers.submit(each, self.runs_dir / each.name): each for each in todo}
+        import_module("lavt.experiment.report")  # with matplotlib and SciPy it takes long: the others drive already
         broken = []
         try:
             for future in as_completed(futures):
@@ -178,6 +179,8 @@ def sweep(
     write_json(out / FAILED, failed)
     if not driven.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
+    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: see `_Work.drive`)
+
     drives = {drive.directory: drive for drive in driven.drives}
     return write_report(out, speed=speed, base=base_of(config, planned), drives=drives, failed=failed), driven
 
