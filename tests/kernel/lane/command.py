@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import compileall
 import os
 import secrets
 import select
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         out = _writable(options.out)
         os.chdir(REPOSITORY)
         python = interpreter()
+        compileall.compile_dir(REPOSITORY / "src", quiet=2)  # the machines are slow, and start LAVT a hundred times
         tests = [python, "-B", "-m", "pytest", "-p", "no:cacheprovider", *pytest_arguments(given)]
         return _native(tests) if options.native else _pair(python, tests, out)
     except Refusal as refusal:

@@ -57,20 +57,20 @@ def start_loop(
 ) -> Loop:
     """Start the four programs; `out` is a new directory's name on both machines."""
     server_router = _start(server, "router", "zenoh-configs/router-server.json5")
-    server_router.first_line()
-    changes = [f"vehicle.route={SHORT_ROAD}", *LIGHT, *server_changes]
-    server_program = _start(
-        server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes
-    )
     dialled = json.dumps([f"udp/{server.address}:{ROUTER_PORT}?rel=1;mixed_rel=1"])
     client_router = _start(
         client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={dialled}"]
     )
-    client_router.first_line()
-    server_program.first_line()
+    for router in (server_router, client_router):
+        router.first_line()
+    changes = [f"vehicle.route={SHORT_ROAD}", *LIGHT, *server_changes]
+    server_program = _start(
+        server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes
+    )
     changes = [f"video.server={server.address}", *client_changes]
     client_program = _start(client, "client", "configs/client.yaml", "--out", f"{out}/client", changes=changes)
-    client_program.first_line()
+    for program in (server_program, client_program):
+        program.first_line()
     return Loop(server_router, server_program, client_router, client_program)
 
 
