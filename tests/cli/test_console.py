@@ -5,6 +5,7 @@ import signal
 import pytest
 
 from lavt.cli import console
+from lavt.errors import WorkError
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -23,11 +24,20 @@ def test_what_runs_until_told_is_told_by_each_signal_that_ends(number: signal.Si
         signal.signal(number, before)
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_long_work_ends_with_a_sentence(number: signal.Signals) -> None:
+    """SIGTERM and a closed terminal end long work as Ctrl-C does, and afterwards mean what they meant before."""
+    before = signal.getsignal(number)
+    with pytest.raises(WorkError, match="what was finished is kept"), console.interruptible():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) == before
+
+
 def test_a_closed_terminal_that_is_ignored_stays_ignored() -> None:
-    """Under nohup, a program that runs until told goes on when its terminal is closed."""
+    """Under nohup, long work and a program that runs until told go on when their terminal is closed."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with console.until_told() as told:
+        with console.until_told() as told, console.interruptible():
             signal.raise_signal(signal.SIGHUP)
             assert not told.is_set()
     finally:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from lavt.cli.progress import left_words, progress
@@ -28,6 +30,20 @@ def test_each_line_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> 
         "1 of 5, 2 min left: one: completed",
         "2 of 5, 2 min left: two: collision",
     ]
+
+
+def test_on_a_terminal_titles_and_lines_are_shown_as_they_are(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A directory with braces and a reason with brackets are no formats and no markup."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
+    with progress("sweep into out/{x}[b]", 1) as tell:
+        tell("one failed: no space left [/tmp/x]")
+    said = capsys.readouterr().err
+    assert "sweep into out/{x}[b]" in said
+    assert "one failed: no space left [/tmp/x]" in said
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lavt.config import BoundaryConfig
@@ -29,8 +32,9 @@ from lavt.experiment.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.boundary_search import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary_summary import groups_of, summary
 from lavt.experiment.growth import growth_per_s
+from lavt.experiment.plan import PlannedRun
 from lavt.experiment.tabular import html_of
-from lavt.experiment.watched_drive import watched
+from lavt.experiment.watched_drive import WatchedDrive, watched
 from lavt.experiment.workers import Workers
 from lavt.nodes.reports import Admission, Event, FrameWritten
 
@@ -79,7 +83,7 @@ def test_what_has_begun_without_delay_has_only_an_upper_end() -> None:
 
 @pytest.mark.parametrize("guess_ms", [0.0, 130.0, 137.0, 300.0, 1000.0])
 def test_a_rate_is_followed_to_its_zero(guess_ms: float) -> None:
-    """Wherever the guess lies, a smooth rate's zero is bracketed to 2 ms; infinite rates only have a sign."""
+    """Wherever the guess lies, a smooth rate's zero is between ends 2 ms apart; infinite rates only have a sign."""
 
     def rate(delay_ms: float) -> float:
         return math.inf if delay_ms > 200 else (delay_ms - 137) / 500
@@ -88,7 +92,26 @@ def test_a_rate_is_followed_to_its_zero(guess_ms: float) -> None:
     assert found.low_ms is not None
     assert found.high_ms is not None
     assert found.high_ms - found.low_ms == pytest.approx(2.0)
-    assert found.low_ms - 1 <= 137 <= found.high_ms + 1
+    assert found.low_ms <= 137 <= found.high_ms
+
+
+@pytest.mark.parametrize("zero_ms", [7.1, 12.0, 18.3, 23.2, 137.0])
+def test_a_zero_lies_between_its_ends(zero_ms: float) -> None:
+    """Also that of a rate of which only the sign is known, where nothing but halving helps."""
+    found = zero_bracket(lambda delay_ms: math.copysign(math.inf, delay_ms - zero_ms), 100.0, 200.0, 2.0)
+    assert found.low_ms is not None
+    assert found.high_ms is not None
+    assert found.low_ms <= zero_ms <= found.high_ms
+
+
+@pytest.mark.parametrize("zero_ms", [0.3, 199.8])
+def test_the_ends_of_a_zero_are_within_the_range(zero_ms: float) -> None:
+    """Of a zero nearer to an end of the range than the bracket reaches, that end is the bracket's."""
+    found = zero_bracket(lambda delay_ms: (delay_ms - zero_ms) / 500, 100.0, 200.0, 2.0)
+    assert found.low_ms is not None
+    assert found.high_ms is not None
+    assert 0 <= found.low_ms <= zero_ms <= found.high_ms <= 200
+    assert found.low_ms == 0 or found.high_ms == 200
 
 
 def test_a_rate_without_zero_in_the_range_is_out_of_it() -> None:
@@ -306,6 +329,36 @@ def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
     assert found["searched_ms"][1] == pytest.approx(412, abs=2)
 
 
+def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Departure is searched where drives begin: found or not there, and what never begins beyond says nothing of it."""
+
+    def fake(planned: PlannedRun) -> WatchedDrive:
+        delay_ms = planned.config.network.video.delay_ms or 0.0
+        begins = delay_ms <= 250
+        return WatchedDrive(
+            ending="completed" if begins else "time_limit",
+            lane_invasions=int(begins and delay_ms >= leaves_ms),
+            total_delay_ms=delay_ms + 10 if begins else math.nan,
+            time_s=np.arange(int(begins), dtype=np.float64),
+            cross_track_m=np.zeros(int(begins)),
+            speed_mps=np.zeros(int(begins)),
+            limited_s=np.zeros(0),
+        )
+
+    monkeypatch.setattr(boundary_module, "watch_drive", fake)
+    monkeypatch.setattr(boundary_module, "straight_growth", lambda _: (math.nan, -math.inf))
+    (asked,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
+    leaves_ms = 137
+    found = search(asked)
+    assert found["departure_ms"] == pytest.approx(147, abs=1)
+    assert found["not_monotone"] == []
+    assert found["completion_ms"] == pytest.approx(260, abs=1)
+    leaves_ms = 0
+    assert (search(asked)["below"], search(asked)["not_monotone"]) == (["departure"], [])
+    leaves_ms = 300
+    assert (search(asked)["departure_ms"], search(asked)["searched_ms"]) == (None, [10, 410])
+
+
 def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told with its reason, and what the others found is there."""
 
@@ -321,6 +374,26 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     assert (len(found), done) == (2, True)
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
+
+
+def killed_by(asked: boundary_module.Search) -> dict[str, Any]:
+    """Search as if it were one of repetition 1 that its process does not survive, and of 2 that dies the first time."""
+    repetition = int(asked.name[-2:])
+    mark = Path(asked.planned.config.study.participant or "") / str(repetition)
+    if repetition == 1 or (repetition == 2 and not mark.exists()):
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return run_entry("a_key", repetition)
+
+
+def test_a_process_that_dies_costs_no_search(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What a process that died was at is searched again, alone; only the one that dies there too has failed."""
+    monkeypatch.setattr(boundary_module, "search", killed_by)
+    searches = plan_boundary(small("repetitions=5", f"study.participant={tmp_path}"))
+    found, failed, done = search_all(searches, jobs=2, tell=lambda _: None)
+    assert [run["repetition"] for run in found] == [0, 2, 3, 4]
+    assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
+    assert done
 
 
 def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -109,6 +109,7 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
     ({"axes": {"video.bit_rate_bps": [1]}}, "video.bit_rate_bps"),
     ({"axes": {"network.condition": ["L0", "L1"]}}, "use 'conditions'"),
     ({"axes": {"vehicle.route": ["a_key"]}}, "use 'routes'"),
+    ({"axes": {"repetition": [0, 1]}}, "use 'repetitions' for 'repetition'"),
     ({"axes": {"network": [{"inherent": "loopback"}]}}, "use 'conditions' for 'network.condition'"),
     ({"axes": {"vehicle": [{"route": "a_key"}]}}, "use 'routes' for 'vehicle.route'"),
     ({"axes": {"video.gop_frames": []}}, "asks for no run"),

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from lavt.experiment.conditions import road_rates
 from lavt.experiment.statistics import exact_interval
 from lavt.experiment.summary import summarize
 
@@ -104,6 +105,13 @@ def test_completion_is_told_by_route_for_these_and_for_such_roads() -> None:
     assert condition["routes"]["b"]["completion_interval"] == pytest.approx([0.0, 1 - 0.025**0.2])
     assert condition["routes"]["b"]["p95_m"] is None
     assert condition["survival"]["b"]["surviving"][-1] == 0.0
+
+
+@pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])
+def test_a_road_and_its_key_part_are_one(suffix: str) -> None:
+    """By name and by path: a route and the one that has its name with _key are one road."""
+    runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
+    assert road_rates(runs) == [1.0, 0.5]
 
 
 def test_one_road_says_nothing_of_such_roads() -> None:

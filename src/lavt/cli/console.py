@@ -78,29 +78,28 @@ def interruptible() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
-        yield
+        with _handled(interrupt, signal.SIGTERM):
+            yield
     except KeyboardInterrupt:
         raise WorkError("stopped; what was finished is kept") from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
 def until_told() -> Iterator[threading.Event]:
-    """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are told to stop.
-
-    Under `nohup`, which ignores the closed terminal's SIGHUP, that stays ignored.
-    """
+    """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until told to stop."""
     told = threading.Event()
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *_: told.set()) for number in numbers}
-    try:
+    with _handled(lambda *_: told.set(), signal.SIGINT, signal.SIGTERM):
         yield told
+
+
+@contextmanager
+def _handled(handler: Callable[..., None], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle these signals, and a closed terminal's SIGHUP but where it is ignored (by `nohup`): it stays ignored."""
+    closed = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+    before = {number: signal.signal(number, handler) for number in (*numbers, *closed)}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)

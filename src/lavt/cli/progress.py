@@ -22,11 +22,11 @@ def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[
         yield _lines(total, clock or MachineClock())
         return
     columns = (
-        TextColumn(title),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[last]}"),
+        TextColumn("{task.fields[last]}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=total, last="")

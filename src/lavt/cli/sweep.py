@@ -47,7 +47,7 @@ def sweep(
         raise UserError("--cluster is for virtual time: real time is driven on this machine, set time: virtual")
     out = out or Path("out") / "sweep"
     if cluster:
-        check_cluster(cluster)
+        check_cluster(cluster, jobs)
     open_sweep(out, resume=resume)
     missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
     with console.interruptible(), progress(f"sweep into {out}", missing) as tell:

@@ -8,7 +8,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import BrokenExecutor, Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from lavt.experiment.report_files import save_figure
 from lavt.experiment.results import write_json
 from lavt.experiment.theory import configured_loop, critical_delay_s
 from lavt.experiment.watched_drive import WatchedDrive, watch_drive
-from lavt.experiment.workers import processes
+from lavt.experiment.workers import Workers, processes
 
 BOUNDARY = "boundary.json"
 FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
@@ -90,6 +90,11 @@ def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
     return config.model_copy(update={"network": config.network.model_copy(update={"video": video})})
 
 
+def began(drive: WatchedDrive) -> bool:
+    """Whether the vehicle was armed: with pictures that are too old it is not, and nobody drives anywhere."""
+    return len(drive.time_s) > 0
+
+
 def departed(drive: WatchedDrive) -> bool:
     """Whether the car left its lane: at least one event `lane_invasion`."""
     return drive.lane_invasions > 0
@@ -127,7 +132,8 @@ def search(asked: Search) -> dict[str, Any]:
     theory_ms = theoretical_ms(config)
     guess_ms = asked.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
     onset = zero_bracket(functools.cache(growth), guess_ms, asked.longest_delay_ms, asked.within_ms)
-    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), grid_ms, asked.within_ms)
+    begun_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
+    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, asked.within_ms)
     completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, asked.within_ms)
     found: dict[str, tuple[Bracket, Totals]] = {
         "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
@@ -175,30 +181,64 @@ def search_all(
     Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
     Ctrl-C, which lets the searches under way end, and takes what they found.
     """
-    found: dict[str, dict[str, Any]] = {}
-    failed: list[dict[str, Any]] = []
-    done = True
-    with processes(jobs or os.cpu_count() or 1) as workers:
-        futures = {workers.executor.submit(search, each): each for each in searches}
+    work, done = _Work(tell), True
+    try:
+        _search_in_processes(work, searches, jobs or os.cpu_count() or 1)
+    except KeyboardInterrupt:
+        done = False
+    return [work.found[each.name] for each in searches if each.name in work.found], work.failed, done
+
+
+class _Work:
+    """What has become of the searches so far."""
+
+    def __init__(self, tell: Tell) -> None:
+        self.found: dict[str, dict[str, Any]] = {}
+        self.failed: list[dict[str, Any]] = []
+        self._tell = tell
+
+    def search(self, workers: Workers, todo: Sequence[Search]) -> list[Search]:
+        """Have searches done; give those that were not, because a worker's process died, in the order of `todo`."""
+        futures = {workers.executor.submit(search, each): each for each in todo}
+        broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
             asked = futures.pop(future)
             try:
-                found[asked.name] = future.result()
+                self.found[asked.name] = future.result()
+            except BrokenExecutor:
+                broken.add(asked.name)
             except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                failed.append({"name": asked.name, "why": in_words(error)})
-            said = _sentence(found[asked.name]) if asked.name in found else f"failed: {failed[-1]['why']}"
-            tell(f"{asked.name}: {said}")
+                self.fail(asked, in_words(error))
+            else:
+                self._tell(f"{asked.name}: {_sentence(self.found[asked.name])}")
 
         try:
             for future in as_completed(list(futures)):
                 take(future)
         except KeyboardInterrupt:
-            workers.executor.shutdown(wait=True, cancel_futures=True)
-            done = False
+            workers.stop()
             for future in [each for each in futures if not each.cancelled()]:
                 take(future)
-    return [found[each.name] for each in searches if each.name in found], failed, done
+            raise
+        return [each for each in todo if each.name in broken]
+
+    def fail(self, asked: Search, why: str) -> None:
+        """Note that a search failed."""
+        self.failed.append({"name": asked.name, "why": why})
+        self._tell(f"{asked.name}: failed: {why}")
+
+
+def _search_in_processes(work: _Work, todo: Sequence[Search], jobs: int) -> None:
+    """Search, also when a process dies, which takes the pool with it: what may have been begun is searched alone."""
+    while todo:
+        with processes(jobs) as workers:
+            broken = work.search(workers, todo)
+        for each in broken[:jobs]:  # they are begun in their order
+            with processes(1) as alone:
+                if work.search(alone, [each]):
+                    work.fail(each, "the process that searched it died")
+        todo = broken[jobs:]
 
 
 def _sentence(run: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ LARGEST_RATE_PER_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """The last delay at which something did not happen, and the first at which it did; None where there is none."""
+    """Two delays between which something begins; None where it has begun below the range, or begins beyond it."""
 
     low_ms: float | None
     high_ms: float | None
@@ -26,7 +26,7 @@ class Bracket:
 def first_bracket(happens: Callable[[float], bool], grid_ms: Sequence[float], within_ms: float) -> Bracket:
     """Find the first delays of the grid between which `happens` turns true, and bisect there to `within_ms`.
 
-    `grid_ms` grows. What comes and goes between two delays of the grid is not seen.
+    `grid_ms` grows. What comes and goes between two delays of the grid is not seen. Both ends were asked.
     """
     happened = [happens(delay_ms) for delay_ms in grid_ms]
     if not any(happened):
@@ -49,7 +49,8 @@ def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: fl
     """Find where `rate` rises through 0 between delays of 0 and `longest_ms`, nearest to a guess, to `within_ms`.
 
     Looks `NEAR_MS` to both sides of the guess and farther out as long as the sign does not change; then Brent's method
-    (`scipy.optimize.brentq`), which needs few values of a rate that is smooth.
+    (`scipy.optimize.brentq`), which needs few values of a rate that is smooth. The zero is at most half of `within_ms`
+    from what it gives: the ends are so far to both sides, cut to the range. `rate` was not asked there.
     """
 
     def cut(delay_ms: float) -> float:
@@ -66,6 +67,6 @@ def zero_bracket(rate: Callable[[float], float], guess_ms: float, longest_ms: fl
         if high_ms == longest_ms:
             return Bracket(longest_ms, None)
         low_ms, high_ms, step_ms = high_ms, min(high_ms + step_ms, longest_ms), 2 * step_ms
-    root_ms = float(brentq(cut, low_ms, high_ms, xtol=within_ms))
     half_ms = within_ms / 2
-    return Bracket(root_ms - half_ms, root_ms + half_ms)
+    root_ms = float(brentq(cut, low_ms, high_ms, xtol=half_ms))
+    return Bracket(max(root_ms - half_ms, 0.0), min(root_ms + half_ms, longest_ms))

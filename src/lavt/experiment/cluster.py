@@ -11,7 +11,7 @@ from typing import Any
 
 from lavt.errors import UserError
 from lavt.experiment.provenance import provenance
-from lavt.experiment.workers import Workers
+from lavt.experiment.workers import Workers, ignore_terminal
 
 LOCAL = "local"
 """Instead of an address: Dask's workers on this machine."""
@@ -22,9 +22,11 @@ CONNECT_S = 10
 def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
     """Give the workers of the Dask scheduler at `address`, or `LOCAL` ones, `jobs` of them.
 
-    Raises `UserError` where there is no Dask, no scheduler or no worker, or where a worker has other versions: the same
-    digests are promised for equal versions only.
+    Raises `UserError` where `jobs` are asked of a scheduler, where there is no Dask, no scheduler or no worker, or
+    where a worker has other versions: the same digests are promised for equal versions only.
     """
+    if address != LOCAL and jobs is not None:
+        raise UserError(f"--jobs is for this machine, and {address} has the workers it has: leave --jobs away")
     dask = _dask()
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
@@ -38,6 +40,7 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
             ) as started,
             dask.Client(started) as client,
         ):
+            client.run(ignore_terminal)
             yield _of_client(client, address)
         return
     try:
@@ -50,11 +53,12 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
         yield _of_client(client, address)
 
 
-def check_cluster(address: str) -> None:
+def check_cluster(address: str, jobs: int | None) -> None:
     """Raise the `UserError` that `cluster` would, before anything is begun."""
-    _dask()
-    if address != LOCAL:
-        with cluster(address, None):
+    if address == LOCAL:
+        _dask()
+    else:
+        with cluster(address, jobs):
             pass
 
 

@@ -83,10 +83,11 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Completion rate of each road: a route and its key part are one."""
+    """Completion rate of each road: a route and its key part are one, by name or by path."""
     members: dict[str, list[bool]] = {}
     for run in runs:
-        members.setdefault(str(run["route"]).removesuffix(KEY_PART), []).append(run["ending"] == "completed")
+        road = str(run["route"]).removesuffix(".yaml").removesuffix(".yml").removesuffix(KEY_PART)
+        members.setdefault(road, []).append(run["ending"] == "completed")
     return [sum(members[road]) / len(members[road]) for road in sorted(members)]
 
 

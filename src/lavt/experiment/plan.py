@@ -17,7 +17,7 @@ from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 from lavt.transport.netem import check_flows
 
-TAKEN = {"vehicle.route": "routes", "network.condition": "conditions"}
+TAKEN = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
 """What a sweep varies anyway, by keys of its own."""
 
 

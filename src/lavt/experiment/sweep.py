@@ -97,8 +97,8 @@ class _Work:
         import_module("lavt.experiment.report")  # with matplotlib and SciPy it takes long: the others drive already
         broken = []
         try:
-            for future in as_completed(futures):
-                planned = futures[future]
+            for future in as_completed(list(futures)):
+                planned = futures.pop(future)  # with it goes what it gave: a run's files, where they came from far
                 try:
                     drive = workers.collect(future.result(), self.runs_dir / planned.name)
                 except BrokenExecutor:
@@ -108,7 +108,7 @@ class _Work:
                 else:
                     self.take(planned, drive)
         except KeyboardInterrupt:
-            workers.executor.shutdown(wait=True, cancel_futures=True)  # what is under way is finished, and kept
+            workers.stop()
             raise
         return broken
 
@@ -167,6 +167,7 @@ def sweep(
     `planned` are the runs of `config`; `cluster_at` is that of `run_all`. Returns the report's page, and what was
     driven. Runs that failed are in `out`/failed.json, and in summary and report.
     """
+    _check_sweep(config, out)
     runs_dir = out / "runs"
     runs_dir.mkdir(exist_ok=True)
     for each in planned:
@@ -207,6 +208,18 @@ def recorded_base(out: Path) -> dict[str, Any] | None:
 
 def _value_at(config: RunConfig, key: str) -> Any:
     return functools.reduce(lambda section, name: section[name], key.split("."), config.model_dump(mode="json"))
+
+
+def _check_sweep(config: SweepConfig, out: Path) -> None:
+    """Raise `UserError` where another sweep was begun in `out`: the report would mix the runs of both."""
+    if not (out / SWEEP).is_file():
+        return
+    begun, asked = (each.model_dump(mode="json") for each in (load_config(SweepConfig, out / SWEEP), config))
+    different = [key for key in asked if asked[key] != begun[key]]
+    if different:
+        raise UserError(
+            f"{out} was begun with another config ({', '.join(different)}): resume with that one, or name another --out"
+        )
 
 
 def _check_config(planned: PlannedRun, directory: Path) -> None:

@@ -182,12 +182,8 @@ def critical_delay_s(loop: LateralLoop) -> float:
     return math.inf
 
 
-def open_loop(loop: LateralLoop, total_delay_s: float, frequencies_radps: FloatArray) -> ComplexArray:
-    """Give the loop's frequency response from command to command, cut open at the controller's output, (n,)."""
-    return _response(loop, _sampled(loop, total_delay_s), frequencies_radps)
-
-
 def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
+    """Give the frequency response from command to command, cut open at the controller's output, (n,)."""
     z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
     delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
     resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition

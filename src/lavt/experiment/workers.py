@@ -46,6 +46,13 @@ class Workers:
             put_files(files, directory)
         return replace(drive, directory=directory)
 
+    def stop(self) -> None:
+        """Begin nothing more; wait for what is under way, but for `far` runs, which are lost."""
+        if self.far:
+            self.executor.shutdown(wait=False)  # Dask's cancels all then, and knows no cancel_futures
+        else:
+            self.executor.shutdown(wait=True, cancel_futures=True)
+
 
 @contextmanager
 def processes(jobs: int) -> Iterator[Workers]:
@@ -55,8 +62,14 @@ def processes(jobs: int) -> Iterator[Workers]:
         yield Workers(executor, jobs, far=False)
 
 
+def ignore_terminal() -> None:
+    """Let Ctrl-C and a closed terminal be: they go to all processes of the terminal, but only the parent decides."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+
+
 def _begin_process() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all processes of a terminal; only the parent decides
+    ignore_terminal()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
