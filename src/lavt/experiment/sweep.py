@@ -94,9 +94,9 @@ class _Work:
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
         """Have runs driven; give those that were not, because a worker's process died."""
         futures = {workers.submit(each, self.runs_dir / each.name): each for each in todo}
-        import_module("lavt.experiment.report")  # with matplotlib and SciPy it takes long: the others drive already
         broken = []
         try:
+            import_module("lavt.experiment.report")  # with matplotlib and SciPy it takes long: the others drive already
             for future in as_completed(list(futures)):
                 planned = futures.pop(future)  # with it goes what it gave: a run's files, where they came from far
                 try:
