@@ -42,6 +42,10 @@ LATENCIES_NOTE = (
     "frame stamped to its command applied on the server's own clock, needs no offset."
 )
 PAPER_NOTE = " The paper measured no loop: the sum of its two medians stands beside ours."
+PAPER_POINTS = (
+    " The paper's points stand at the sum of its two one-way medians; the bar of its completion is that of its counts, "
+    "and of its error it gives none."
+)
 ROADS_NOTE = (
     " Of the completion: these routes, the exact interval of what repeating just these routes would give; such roads, "
     "how far the rates of the roads lie apart, a route and its key part being one road, and no interval of 95 %."
@@ -137,7 +141,10 @@ def conditions_parts(report: Report) -> Parts:
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     beside = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [*parts, page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ROADS_NOTE + ERRORS_NOTE, note=True)]
+    return [
+        *parts,
+        page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ROADS_NOTE + ERRORS_NOTE, note=True),
+    ]
 
 
 def contrast_parts(report: Report) -> Parts:
@@ -203,9 +210,8 @@ def degradation_parts(report: Report) -> Parts:
     paper = report.paper(report.summary["conditions"])
     caption = (
         "Completion and error over the median loop latency (frame stamped to its command applied) and over the mean "
-        "age of the picture that the vehicle acts on; 95 % intervals."
-        + (" The paper's points stand at the sum of its two one-way medians." if paper else "")
-        + of_base(report)
+        "age of the picture that the vehicle acts on. Bars are 95 % intervals; where names stand together, the upper "
+        "is the upper point's." + (PAPER_POINTS if paper else "") + of_base(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
@@ -281,7 +287,10 @@ def group_parts(report: Report) -> Parts:
     parts = []
     if len(groups) <= COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
-        caption = "The groups beside each other, virtual time; what makes them differ is in the legend."
+        caption = (
+            "The groups beside each other, virtual time; what makes them differ is in the legend. "
+            "Conditions that hide one another are named, the upper above."
+        )
         parts.append(save_figure(report.directory, "groups", figure, "groups compared", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
 

@@ -189,7 +189,8 @@ def _tex_column(column: Column, texts: Sequence[str]) -> tuple[str, int, list[st
     if column.is_long or (column.is_text and longest > LONG_CHARACTERS):
         return f"p{{{LONG_CM}cm}}", LONG_CHARACTERS, [_tex(column.title), *map(_tex_long, texts)]
     place = "l" if column.is_text else "r"
-    lines = textwrap.wrap(column.title, TITLE_CHARACTERS, break_long_words=False) or [""]
+    title = column.title.replace(" %", f"{UNBROKEN}%")
+    lines = textwrap.wrap(title, TITLE_CHARACTERS, break_long_words=False) or [""]
     stack = r"\\".join(map(_tex, lines))
     title = stack if len(lines) == 1 else rf"\shortstack[{place}]{{{stack}}}"
     return place, max(longest, *map(len, lines)), [title, *map(_tex, texts)]
