@@ -52,8 +52,8 @@ def test_latex_escapes_what_would_be_a_command() -> None:
         r'"$<$b$>$" $\tau$ & 0.33 & 50~\% & 12~to~100~\%'
     )
     assert lines[0] == r"% needs \usepackage{booktabs}"
-    assert lines[1] == r"\begin{tabular}{lrrrr}"
-    assert lines[-3:] == [r"nothing & -- & -- & -- & -- \\", r"\bottomrule", r"\end{tabular}"]
+    assert lines[2] == r"\resizebox{\textwidth}{!}{\begin{tabular}{lrrrr}"
+    assert lines[-3:] == [r"nothing & -- & -- & -- & -- \\", r"\bottomrule", r"\end{tabular}}"]
     assert [line for line in lines if line.startswith("\\") and "rule" in line] == [
         r"\toprule", r"\midrule", r"\bottomrule",
     ]  # fmt: skip
@@ -79,12 +79,14 @@ def test_a_wide_table_is_fitted_to_the_page_in_latex() -> None:
 
 
 def test_long_texts_can_be_broken_in_latex() -> None:
-    """A text too long for a line stands in a column that breaks it, after commas, too."""
-    text = ",".join(["of one word"] * 5)
+    """A text too long for a line stands in a column that breaks it, within JSON, too."""
+    text = 'said: {"of_one":"word","of_two":"words, or more"}'
     for column in (words("endings"), words("endings", is_long=True)):
         lines = tex_of(TableData([column], [[text]])).splitlines()
         assert lines[1] == r"\begin{tabular}{p{6cm}}"
-        assert lines[5] == r",\allowbreak{}".join(["of one word"] * 5) + r" \\"
+        assert lines[5] == (
+            r'said: \{"of\_one":\allowbreak{}"word",\allowbreak{}"of\_two":\allowbreak{}"words, or more"\} \\'
+        )
 
 
 def test_html_escapes_texts() -> None:

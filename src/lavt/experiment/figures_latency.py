@@ -54,7 +54,7 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
     to the common distance, of all runs.
     """
     scales = {label: place for label, place in SCALES.items() if any(_known(kinds, place))}
-    named: list[tuple[Axes, str, Sequence[Point]]] = []
+    named: list[tuple[Axes, str, list[Point]]] = []
     figure = new_figure(5.6)
     panels = figure.subplots(2, len(scales), sharex="col", sharey="row", squeeze=False)
     for column, (label, place) in enumerate(scales.items()):
@@ -132,7 +132,7 @@ def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure
     """
     figure = new_figure(3.8)
     completion, error = figure.subplots(1, 2)
-    lines: list[tuple[Axes, Sequence[Point]]] = []
+    lines: list[tuple[Axes, list[Point]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
     for title, conditions in groups.items():
         for axes, key, unit in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ PERCENTILES = ("p50", "p5", "p95")
 TITLE_CHARACTERS = 14
 """A longer title of a column is broken into lines in LaTeX, where a page has an end."""
 
-LINE_CHARACTERS = 90
-"""A wider table is made as narrow as the text in LaTeX."""
+LINE_CHARACTERS = 66
+"""A wider table is made as narrow as the text in LaTeX: so many are in a line of its article."""
 
 LONG_CHARACTERS, LONG_CM = 35, 6
 """A column of texts of which one is longer is broken into lines of so many centimetres in LaTeX."""
@@ -186,7 +187,7 @@ def tex_of(table: TableData) -> str:
 def _tex_column(column: Column, texts: Sequence[str]) -> tuple[str, int, list[str]]:
     """Give a column's place in LaTeX, about how many characters wide it is, and its cells, the title first."""
     longest = max(map(len, texts), default=0)
-    if column.is_long or (column.is_text and longest > LONG_CHARACTERS):
+    if column.is_text and longest > LONG_CHARACTERS:
         return f"p{{{LONG_CM}cm}}", LONG_CHARACTERS, [_tex(column.title), *map(_tex_long, texts)]
     place = "l" if column.is_text else "r"
     title = column.title.replace(" %", f"{UNBROKEN}%")
@@ -241,5 +242,5 @@ def _tex(text: str) -> str:
 
 
 def _tex_long(text: str) -> str:
-    """Escape a text that may be broken after a comma, too: JSON has no spaces."""
-    return _tex(text).replace(",", r",\allowbreak{}")
+    """Escape a text that may be broken where JSON has no spaces, too."""
+    return re.sub(r"([,:])(?=[^\s~])", r"\1\\allowbreak{}", _tex(text))
