@@ -104,6 +104,10 @@ def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
     parts = all_parts(report_of(summarize(campaign(), None), tmp_path))
     assert "the paper's completed" in parts["conditions"].replace("&#x27;", "'")
     assert "13.15" in parts["conditions"]
+    titles = re.findall("<th[^>]*>(.*?)</th>", parts["conditions"].replace("&#x27;", "'"))
+    assert {"the paper's τ video ms", "the paper's τ control ms", "its 95 % interval m"} < set(titles)
+    assert "range over such roads" in titles
+    assert "and no interval of 95 %" in text_of(parts["conditions"])
     assert "13.15" in parts["degradation"] + parts["differences"]
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
