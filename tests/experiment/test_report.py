@@ -121,7 +121,7 @@ def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
     with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
         rows = {row["condition"]: row for row in csv.DictReader(file)}
     entry = summary["conditions"]["L1"]
-    read = [float(rows["L1"][f"95 %, these routes {end}"]) for end in ("low", "high")]
+    read = [float(rows["L1"][f"95 %, these routes {end} (share)"]) for end in ("low", "high")]
     assert read == entry["completion_interval"]
     assert float(rows["L1"]["lane invasions / km"]) == entry["lane_invasions_per_km"]
     with (sweep / "report" / "tables" / "conditions_virtual_latency.csv").open(newline="") as file:
@@ -129,6 +129,7 @@ def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
     assert float(latencies["L0"]["τ video ms p50"]) == summary["conditions"]["L0"]["tau_v_ms"]["p50"]
     with (sweep / "report" / "tables" / "conditions_virtual_error.csv").open(newline="") as file:
         errors = {row["condition"]: row for row in csv.DictReader(file)}
+    assert float(errors["L1"]["maximum m, mean of runs"]) == summary["conditions"]["L1"]["max_m"]
     assert errors["L1"]["p95 m, all runs ranked p75"] == ""
 
 
@@ -149,6 +150,8 @@ def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
     assert cells[0][2:4] == ["250.030±6.000", "20.00"]
     assert [cell.partition("±")[0] for cell in (cells[0][4], cells[1][2], cells[1][4])] == ["250.030"] * 3
     assert "half the round trip" in clocks
+    first, *_ = (sweep / "report" / "tables" / "clocks.csv").read_text().splitlines()
+    assert first.split(",")[2:4] == ["Delta ms", "Delta ms bound"]
 
 
 def test_names_cannot_become_html(sweep: Path) -> None:

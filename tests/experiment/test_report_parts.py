@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import csv
 import json
 import re
 from collections.abc import Callable
@@ -103,6 +104,10 @@ def test_the_papers_figures_stand_beside_ours(tmp_path: Path) -> None:
     parts = all_parts(report_of(summarize(campaign(), None), tmp_path))
     assert "the paper's completed" in parts["conditions"].replace("&#x27;", "'")
     assert "13.15" in parts["conditions"]
+    titles = re.findall("<th[^>]*>(.*?)</th>", parts["conditions"].replace("&#x27;", "'"))
+    assert {"the paper's τ video ms", "the paper's τ control ms", "its 95 % interval m"} < set(titles)
+    assert "range over such roads" in titles
+    assert "and no interval of 95 %" in text_of(parts["conditions"])
     assert "13.15" in parts["degradation"] + parts["differences"]
     row = re.search(r"<tr><td class=\"text\">L3 – L4</td>(.*?)</tr>", parts["contrasts"])
     assert row is not None
@@ -115,9 +120,44 @@ def test_survival_curves_are_there_as_numbers(tmp_path: Path) -> None:
     report = report_of(summarize(campaign(), None), tmp_path)
     assert 'href="tables/survival_virtual.csv"' in "".join(survival_parts(report))
     first, *rows = (tmp_path / "tables" / "survival_virtual.csv").read_text().splitlines()
-    assert first == "route,condition,distance m,still driving,95 % interval low,95 % interval high,ended so far"
+    interval = "95 % interval low (share),95 % interval high (share)"
+    assert first == f"route,condition,distance m,still driving (share),{interval},ended so far"
     curves = [curve for entry in report.kinds["virtual"].values() for curve in entry["survival"].values()]
     assert len(rows) == sum(len(curve["distance_m"]) for curve in curves) > 0
+
+
+def test_figures_and_tables_say_of_which_group_they_are(tmp_path: Path) -> None:
+    """With two groups the first contrasts, both figures of survival and the sentence on equal totals name theirs."""
+    runs = [*campaign(sweep="x"), *campaign(sweep="y", preset="designed")]
+    parts = all_parts(report_of(summarize(runs, None, base={"sweep": "x"}), tmp_path))
+    assert re.findall("<h3>(.*?)</h3>", parts["contrasts"]) == ["preset paper_calibrated", "preset designed"]
+    assert "<p>preset paper_calibrated: L3 (225 + 0 ms) and L4" in parts["contrasts"]
+    assert parts["survival"].count("Virtual time (preset paper_calibrated).") == 2
+    assert "Virtual runs are of one group (preset paper_calibrated)." in text_of(parts["degradation"])
+    alone = all_parts(report_of(summarize(campaign(), None), tmp_path))
+    assert "<h3>" not in alone["contrasts"]
+    assert "<p>L3 (225 + 0 ms) and L4" in alone["contrasts"]
+
+
+def test_the_bar_of_hops_is_the_loop(tmp_path: Path) -> None:
+    """What the actuator reports once the command is applied is in the table and in no bar; a rest fills the loop."""
+    hops = [
+        {"node": "camera", "hop": "encode", "p50": 50.0}, {"node": "actuator", "hop": "apply", "p50": 10.0},
+        {"node": "actuator", "hop": "report", "p50": 8.0},
+    ]  # fmt: skip
+    report = report_of(summarize([run_of("L0", hops_ms=hops)], None), tmp_path)
+    said = text_of("".join(hop_parts(report, {"virtual": {"L0": 5.0}})))
+    assert ">72 ms</text>" in (tmp_path / "hops_virtual.svg").read_text()
+    with (tmp_path / "tables" / "hops_virtual.csv").open(newline="") as file:
+        assert list(csv.reader(file))[1:] == [
+            ["camera: capture to stamp, before the loop", "5.0"],
+            ["camera: encode", "50.0"],
+            ["actuator: apply", "10.0"],
+            ["rest: waiting, and what medians do not add up to", "12.0"],
+            ["actuator: report, after the loop", "8.0"],
+        ]
+    assert "the sum of these medians, which need not be the median loop exactly" in said
+    assert "is of one run of each condition" in said
 
 
 def test_runs_that_failed_are_told_at_the_top(tmp_path: Path) -> None:

@@ -83,8 +83,12 @@ def test_differences_are_told_where_they_are_true() -> None:
     assert any(
         "falls more sharply here (100, 100, 100, 30, 30, 0 %) than in the paper (100, 93," in each for each in sharp
     )
-    assert any(each.startswith("P95 at L0 is 0.10 m here and 2.30 m in the paper.") for each in sharp)
-    assert any("rails and a median barrier" in each for each in sharp)
+    assert any(each.startswith("The mean P95 at L0 is 0.10 m here and 2.30 m in the paper.") for each in sharp)
+    assert any(
+        each.startswith("The largest mean P95 of a condition's completed runs is 0.10 m here and 13.15 m in the paper")
+        and "rails and a median barrier" in each
+        for each in sharp
+    )
     assert any(each.startswith("L1 is completed in full here, and 28 times of 30") for each in sharp)
     like = {
         name: entry(name, theirs["completion_rate"], 100.0, theirs["p95_m"])
@@ -112,7 +116,20 @@ def test_conditions_of_one_loop_stand_in_the_order_of_their_names() -> None:
     }
     said = headline("Virtual time", conditions)
     assert "L3 53 % (298 ms), L4 47 % (297 ms), L5 10 % (397 ms)" in said
-    assert "Under half of the runs are completed from 297 ms on." in said
+    assert "The largest fall is from 90 % at L2 to 47 % at L4: between 222 and 297 ms in all." in said
+    assert "Under half of the runs are completed from 397 ms on." in said
+    conditions["L3"]["completion_rate"] = 0.49
+    assert "Under half of the runs are completed from 297 ms on." in headline("Virtual time", conditions)
+
+
+def test_a_fall_is_between_two_places() -> None:
+    """Conditions of one loop that fare unlike are no fall with latency."""
+    rates = {"L3": (297.6, 0.9), "L4": (297.4, 0.1)}
+    conditions = {
+        name: {"loop_ms": {"p50": loop_ms}, "completion_rate": rate, "p95_m": None}
+        for name, (loop_ms, rate) in rates.items()
+    }
+    assert "fall" not in headline("Virtual time", conditions)
 
 
 def test_what_chance_does_not_explain_is_named() -> None:

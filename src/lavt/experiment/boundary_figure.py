@@ -98,8 +98,8 @@ def boundary_table(boundary: Boundary) -> TableData:
     for name in CRITERIA:
         columns += [
             numbers(f"{LABELS[name]}: median (ms)", 0),
-            Column(f"{LABELS[name]}: 95 % interval", span, LOW_HIGH),
-            Column(f"{LABELS[name]}: quartiles", span, LOW_HIGH),
+            Column(f"{LABELS[name]}: 95 % interval (ms)", span, LOW_HIGH),
+            Column(f"{LABELS[name]}: quartiles (ms)", span, LOW_HIGH),
             numbers(f"{LABELS[name]}: in range", 0),
         ]
     columns.append(numbers("not monotone", 0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,20 @@ LINE_CHARACTERS = 115
 
 SMALL = 8
 """Points of a small text."""
+
+ASIDE = {
+    "virtual": ((7, -2), "left", "top", "black"),
+    "real": ((-7, 2), "right", "bottom", "black"),
+    "paper": ((-7, 2), "right", "bottom", "0.45"),
+    "group": ((7, 2), "left", "bottom", "black"),
+}
+"""Where the names of a kind of points go, in points of text and by which edges, and their colour."""
+
+NAMES = 14
+"""So many names of points fit above each other in a panel, and beside each other."""
+
+Point = tuple[str, float, float, Sequence[float] | None]
+"""A condition, its place on x and on y, and the interval of y."""
 
 
 def condition_colours(names: Iterable[str]) -> dict[str, Any]:
@@ -62,9 +76,29 @@ def marker(kind: str, colour: Any) -> dict[str, Any]:
 
 
 def beside(kind: str) -> dict[str, Any]:
-    """Say where a point's name goes: right of virtual runs, left of real ones, so that two at one place can be read."""
-    offset, side = ((7, -9), "left") if kind == "virtual" else ((-7, 4), "right")
-    return {"xytext": offset, "ha": side, "textcoords": "offset points", "fontsize": SMALL}
+    """Say where names go and in which colour: none lies on those of another kind at the same place, if it can be."""
+    offset, side, edge, colour = ASIDE[kind]
+    return {
+        "xytext": offset, "ha": side, "va": edge, "color": colour, "textcoords": "offset points", "fontsize": SMALL,
+    }  # fmt: skip
+
+
+def near_each_other(points: Sequence[Point], axes: Axes) -> list[list[Point]]:
+    """Put points together whose names, beside each of them in `axes`, would lie on each other; the upper are first."""
+    reach_x, reach_y = ((high - low) / NAMES for low, high in (axes.get_xlim(), axes.get_ylim()))
+    together: list[list[Point]] = []
+    for point in sorted(points, key=lambda point: (-point[2], point[0])):
+        near = (
+            each
+            for each in together
+            if abs(each[-1][1] - point[1]) <= reach_x and abs(each[-1][2] - point[2]) <= reach_y
+        )
+        place = next(near, None)
+        if place is None:
+            together.append([point])
+        else:
+            place.append(point)
+    return together
 
 
 def legend_below(figure: Figure, handles: list[Any]) -> None:

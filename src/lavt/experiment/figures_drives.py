@@ -105,7 +105,7 @@ def cross_track_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) 
         if ends:
             axes.plot(*np.transpose(ends), **CROSS)
         tidy(axes, "", "", f"Route {route}")
-    for axes in panels[-1]:
+    for axes in panels.flat[max(len(routes) - columns, 0) : len(routes)]:
         axes.set_xlabel("distance along the route (m)")
     figure.supylabel("left of lane centre (m)", fontsize=10)
     _legend(figure, routes, colours)

@@ -15,10 +15,12 @@ from lavt.experiment.figure_style import (
     SMALL,
     Colours,
     Conditions,
+    Point,
     beside,
     kind_handles,
     legend_below,
     marker,
+    near_each_other,
     new_figure,
     tidy,
 )
@@ -26,10 +28,12 @@ from lavt.experiment.figure_style import (
 NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "driver": "Greens", "actuator": "Oranges"}
 OTHER_COLOURS = "Reds"
 
-PAPER_MARKER: dict[str, Any] = {"marker": "^", "color": "0.55", "label": "the paper"}
+PAPER_MARKER: dict[str, Any] = {"marker": "^", "color": "0.55", "label": "the paper", "zorder": 1}
 
-Point = tuple[str, float, float, Sequence[float] | None]
-"""A condition, its place on x and on y, and the interval of y."""
+DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "white"}
+"""The error up to the common distance."""
+
+ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
 
 Place = tuple[str, str]
 """Where a condition has a latency: key, and key in that."""
@@ -50,34 +54,34 @@ def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colou
     to the common distance, of all runs.
     """
     scales = {label: place for label, place in SCALES.items() if any(_known(kinds, place))}
+    named: list[tuple[Axes, str, list[Point]]] = []
     figure = new_figure(5.6)
     panels = figure.subplots(2, len(scales), sharex="col", sharey="row", squeeze=False)
     for column, (label, place) in enumerate(scales.items()):
         completion, error = panels[:, column]
-        if place == LOOP:
-            for axes, name, unit in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
-                _draw_paper(axes, paper, name, unit)
-        for kind, conditions in kinds.items():
-            _points(
-                completion, _over(conditions, place, "completion_rate", "completion_interval", 100.0), kind, colours
-            )
-            _points(error, _over(conditions, place, "p95_m", "p95_interval"), kind, colours)
-            for name, x, y, _ in _over(conditions, place, "p95_common_m", "p95_common_interval"):
-                error.plot(x, y, marker="D", markersize=4, markerfacecolor="white", color=colours[name], zorder=4)
+        for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
+            shown = {
+                completion: _over(conditions, place, "completion_rate", "completion_interval", 100.0),
+                error: _over(conditions, place, "p95_m", "p95_interval"),
+            }
+            for axes, points in shown.items():
+                for point in points:
+                    _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point[0]]))
+                named.append((axes, kind, points))
+            for point in _over(conditions, place, "p95_common_m", "p95_common_interval"):
+                _draw(error, point, {**DIAMOND, "color": colours[point[0]], "zorder": 4})
+        completion.margins(x=0.16)
+        error.margins(x=0.16)
         tidy(completion, "", "runs completed (%)" if column == 0 else "")
-        tidy(error, label, "cross-track error, p95 (m)" if column == 0 else "")
+        tidy(error, label, ERROR_LABEL if column == 0 else "")
     panels[0, 0].set_ylim(-9, 112)  # names of points stand below them, or above
     panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
+    for axes, kind, points in named:
+        _name(axes, near_each_other(points, axes), kind)
     handles: list[Any] = kind_handles(kinds)
     if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
-        diamond: dict[str, Any] = {
-            "marker": "D",
-            "markersize": 4,
-            "markerfacecolor": "white",
-            "color": "0.4",
-            "linestyle": "none",
-        }
-        handles.append(Line2D([], [], label="error up to the common distance", **diamond))
+        said = "error up to the common distance"
+        handles.append(Line2D([], [], label=said, color="0.4", linestyle="none", **DIAMOND))
     if paper:
         handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
     legend_below(figure, handles)
@@ -102,45 +106,48 @@ def _over(conditions: Conditions, place: Place, value: str, bounds: str, unit: f
     return points
 
 
-def _draw_paper(axes: Axes, paper: Conditions, key: str, unit: float) -> None:
-    places = [
-        (entry["tau_v_ms"] + entry["tau_c_ms"], entry[key] * unit) for entry in paper.values() if entry[key] is not None
-    ]
-    for x, y in sorted(places):
-        axes.plot(x, y, linestyle="none", zorder=1, **PAPER_MARKER)
+def _with_totals(paper: Conditions) -> Conditions:
+    """Put the paper's points where its two latencies sum to."""
+    return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
 
 
-def _points(axes: Axes, points: Sequence[Point], kind: str, colours: Colours) -> None:
-    """Draw points with their intervals, and name them; names of points at one place are written together."""
-    names: dict[tuple[int, int], tuple[tuple[float, float], list[str]]] = {}
-    highest = max((y for _, _, y, _ in points), default=0.0) or 1.0
-    for name, x, y, interval in points:
-        low, high = interval or (y, y)
-        reach = [[max(y - low, 0)], [max(high - y, 0)]]
-        style = {"capsize": 3, "linestyle": "none", "elinewidth": 1, **marker(kind, colours[name])}
-        axes.errorbar(x, y, yerr=reach, **style)
-        names.setdefault((round(x / 8), round(y / highest * 12)), ((x, y), []))[1].append(name)
-    for place, together in names.values():
-        axes.annotate(", ".join(together), place, **beside(kind))
-    axes.margins(x=0.12)
+def _draw(axes: Axes, point: Point, style: Mapping[str, Any]) -> None:
+    """Draw a point with its interval, where it has one."""
+    _, x, y, interval = point
+    reach = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
+    axes.errorbar(x, y, yerr=reach, capsize=3, linestyle="none", elinewidth=1, **style)
+
+
+def _name(axes: Axes, places: Sequence[Sequence[Point]], kind: str) -> None:
+    """Write the names of points that are near each other together, the upper point's above."""
+    for place in places:
+        middle = (sum(x for _, x, _, _ in place) / len(place), sum(y for _, _, y, _ in place) / len(place))
+        axes.annotate("\n".join(name for name, _, _, _ in place), middle, **beside(kind))
 
 
 def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
-    """Completion and cross-track error over loop latency: one line a group, one colour a condition."""
+    """Completion and cross-track error over loop latency: one line a group, one colour a condition.
+
+    Conditions at one place, of which one hides another, are named.
+    """
     figure = new_figure(3.8)
     completion, error = figure.subplots(1, 2)
+    lines: list[tuple[Axes, list[Point]]] = []
     symbols = dict(zip(groups, "osD^vP", strict=False))
     for title, conditions in groups.items():
         for axes, key, unit in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
             points = sorted(_over(conditions, LOOP, key, "", unit), key=lambda point: point[1])
+            lines.append((axes, points))
             dashes = (0, (1 + 2 * list(groups).index(title), 1)) if list(groups).index(title) else "solid"
             axes.plot([x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.6", linestyle=dashes)
             for name, x, y, _ in points:
                 axes.plot(x, y, marker=symbols[title], color=colours[name], linestyle="none")
     tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion")
-    completion.set_ylim(-5, 105)
-    tidy(error, "loop latency, median (ms)", "cross-track error, p95 (m)", "Error of completed runs")
-    error.set_ylim(bottom=0)
+    completion.set_ylim(-5, 112)
+    tidy(error, "loop latency, median (ms)", ERROR_LABEL, "Error of completed runs")
+    error.set_ylim(0, 1.1 * error.get_ylim()[1])
+    for axes, points in lines:
+        _name(axes, [place for place in near_each_other(points, axes) if len(place) > 1], "group")
     groups_shown = [
         Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
     ]

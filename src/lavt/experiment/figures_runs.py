@@ -25,7 +25,7 @@ MOST_TICKS = 8
 
 AXIS_ROWS = (
     ("runs completed (%)", "completion_rate", 100.0),
-    ("error, p95 (m)", "p95_m", 1.0),
+    ("error, mean P95 (m)", "p95_m", 1.0),
     ("picture age (ms)", "picture_age_ms", 1.0),
 )
 """What is drawn over an axis of a sweep: label, key of a condition, unit."""

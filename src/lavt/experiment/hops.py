@@ -16,6 +16,9 @@ from lavt.experiment.table import MISSING, IntArray, Table
 Hop = tuple[str, str]
 """Node or "network", and what it did."""
 
+AFTER_LOOP: frozenset[Hop] = frozenset({("actuator", "report")})
+"""What happens once the command is applied, which ends the loop."""
+
 Durations = list[tuple[Hop, IntArray]]
 """For each hop, in order, how long it took for each frame that it was done for."""
 

@@ -12,6 +12,7 @@ from lavt.experiment.clocks import PROBE, SAME_KERNEL
 from lavt.experiment.figure_style import Colours, Conditions
 from lavt.experiment.figures_latency import degradation_figure, hops_figure, injected_figure, presets_figure
 from lavt.experiment.figures_runs import axis_figure, incidence_figure, routes_with_survival, survival_figure
+from lavt.experiment.hops import AFTER_LOOP
 from lavt.experiment.report_files import link_table, save_figure, save_table
 from lavt.experiment.report_groups import Group, axes_of, differing, in_order, short, title_of
 from lavt.experiment.report_tables import (
@@ -41,10 +42,23 @@ LATENCIES_NOTE = (
     "frame stamped to its command applied on the server's own clock, needs no offset."
 )
 PAPER_NOTE = " The paper measured no loop: the sum of its two medians stands beside ours."
+PAPER_POINTS = (
+    " The paper's points stand at the sum of its two one-way medians; the bar of its completion is that of its counts, "
+    "and of its error it gives none."
+)
+ROADS_NOTE = (
+    " Of the completion: these routes, the exact interval of what repeating just these routes would give; such roads, "
+    "how far the rates of the roads lie apart, a route and its key part being one road, and no interval of 95 %."
+)
 ERRORS_NOTE = (
-    " P95 of the cross-track error three ways: over completed runs, so read it beside the completion; of all runs up "
+    " Each error is the mean over runs of what each run has by itself, its P95 and its maximum, too. P95 of the "
+    "cross-track error three ways: over completed runs, so read it beside the completion; of all runs up "
     "to the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended "
     "early being last: median (quartiles). docs/metrics.md defines every number."
+)
+HOPS_NOTE = (
+    "The first row, from capture to stamp, is of one run of each condition, the others of all its runs; it is before "
+    "the loop, and what the actuator reports is after it: both are in no bar."
 )
 
 LEAST_REST_MS = 0.5
@@ -127,7 +141,10 @@ def conditions_parts(report: Report) -> Parts:
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
     beside = any(report.paper(conditions) for conditions in report.kinds.values())
-    return [*parts, page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ERRORS_NOTE, note=True)]
+    return [
+        *parts,
+        page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ROADS_NOTE + ERRORS_NOTE, note=True),
+    ]
 
 
 def contrast_parts(report: Report) -> Parts:
@@ -137,11 +154,14 @@ def contrast_parts(report: Report) -> Parts:
     if not contrasts:
         return []
     shown = paper if report.paper(summary["conditions"]) else []
+    names = differing(report.groups)
+    base = title_of(report.base[0], names) if report.groups[1:] and report.base else ""
     several = report.groups[1:] and len(report.groups) <= COMPARED_GROUPS
-    parts = [save_table(report.directory, "contrasts", contrast_table(contrasts, shown))]
+    parts = [page.heading(base)] if base else []
+    parts += [save_table(report.directory, "contrasts", contrast_table(contrasts, shown))]
     for group in report.groups if several else []:
-        if group not in report.base and group.get("contrasts"):
-            title = title_of(group, differing(report.groups))
+        if group not in report.base[:1] and group.get("contrasts"):
+            title = title_of(group, names)
             parts.append(page.heading(title))
             name = f"contrasts_{page.slug(title)}"
             parts.append(save_table(report.directory, name, contrast_table(group["contrasts"], shown)))
@@ -154,7 +174,7 @@ def contrast_parts(report: Report) -> Parts:
     )
     changed = any(run.get("changes") for run in summary["runs"])
     said = [] if changed else equal_totals(contrasts, summary["conditions"], shown)
-    return [*parts, *map(page.paragraph, said)]
+    return [*parts, *(page.paragraph(f"{base}: {each}" if base else each) for each in said)]
 
 
 def difference_parts(report: Report) -> Parts:
@@ -167,7 +187,7 @@ def difference_parts(report: Report) -> Parts:
 
 def of_base(report: Report) -> str:
     """Say below a figure of both kinds of time which group the virtual runs in it are of, where there are several."""
-    return f" Virtual runs:{report.which()}." if len(report.groups) > 1 and report.base else ""
+    return f" Virtual runs are of one group{report.which()}." if len(report.groups) > 1 and report.base else ""
 
 
 def injected_parts(report: Report) -> Parts:
@@ -190,9 +210,8 @@ def degradation_parts(report: Report) -> Parts:
     paper = report.paper(report.summary["conditions"])
     caption = (
         "Completion and error over the median loop latency (frame stamped to its command applied) and over the mean "
-        "age of the picture that the vehicle acts on; 95 % intervals."
-        + (" The paper's points stand at the sum of its two one-way medians." if paper else "")
-        + of_base(report)
+        "age of the picture that the vehicle acts on. Bars are 95 % intervals; where names stand together, the upper "
+        "is the upper point's." + (PAPER_POINTS if paper else "") + of_base(report)
     )
     figure = degradation_figure(report.kinds, paper, report.colours)
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
@@ -217,7 +236,11 @@ def survival_parts(report: Report) -> Parts:
             alternative = f"{name} by distance, {kind} time"
             parts.append(
                 save_figure(
-                    report.directory, f"{name}_{kind}", figure, alternative, f"{caption} {kind.capitalize()} time."
+                    report.directory,
+                    f"{name}_{kind}",
+                    figure,
+                    alternative,
+                    f"{caption} {kind.capitalize()} time{report.which(kind)}.",
                 )
             )
         parts.append(link_table(report.directory, f"survival_{kind}", survival_table(conditions)))
@@ -228,21 +251,29 @@ def hop_parts(report: Report, captured_ms: Mapping[str, Mapping[str, float | Non
     """Show where the loop's time goes; `captured_ms` is by kind of time and condition."""
     parts = []
     for kind, conditions in report.kinds.items():
-        hops = {name: _with_rest(entry) for name, entry in conditions.items() if entry.get("hops_ms")}
-        if not hops:
+        known = {name: entry for name, entry in conditions.items() if entry.get("hops_ms")}
+        if not known:
             continue
+        loops = {name: _loop_of(entry) for name, entry in known.items()}
+        hops = {name: [*loops[name], *filter(_is_after_loop, entry["hops_ms"])] for name, entry in known.items()}
         caption = (
-            f"Where the median loop goes, in the order of a frame's life: medians over all runs. {kind.capitalize()} "
-            f"time{report.which(kind)}."
+            "Where the median loop goes, in the order of a frame's life: of each hop the median over all runs. The "
+            "number is the sum of these medians, which need not be the median loop exactly. "
+            f"{kind.capitalize()} time{report.which(kind)}."
         )
-        parts.append(save_figure(report.directory, f"hops_{kind}", hops_figure(hops), "latency of each hop", caption))
+        parts.append(save_figure(report.directory, f"hops_{kind}", hops_figure(loops), "latency of each hop", caption))
         parts.append(save_table(report.directory, f"hops_{kind}", hop_table(hops, captured_ms.get(kind))))
+        parts.append(page.paragraph(HOPS_NOTE, note=True))
     return parts
 
 
-def _with_rest(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Add to the hops of a condition what is left of its median loop: every wait for a next tick."""
-    hops, loop_ms = list(entry["hops_ms"]), entry["loop_ms"]["p50"]
+def _is_after_loop(hop: Mapping[str, Any]) -> bool:
+    return (hop["node"], hop["hop"]) in AFTER_LOOP
+
+
+def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Give the hops that make a condition's loop, and what is left of its median: every wait for a next tick."""
+    hops, loop_ms = [hop for hop in entry["hops_ms"] if not _is_after_loop(hop)], entry["loop_ms"]["p50"]
     rest_ms = 0.0 if loop_ms is None else loop_ms - sum(hop["p50"] or 0.0 for hop in hops)
     rest = {"node": "rest", "hop": "waiting, and what medians do not add up to", "p50": rest_ms}
     return [*hops, rest] if rest_ms > LEAST_REST_MS else hops
@@ -256,7 +287,10 @@ def group_parts(report: Report) -> Parts:
     parts = []
     if len(groups) <= COMPARED_GROUPS:
         figure = presets_figure({title_of(group, names): group["conditions"] for group in groups}, report.colours)
-        caption = "The groups beside each other, virtual time; what makes them differ is in the legend."
+        caption = (
+            "The groups beside each other, virtual time; what makes them differ is in the legend. "
+            "Conditions that hide one another are named, the upper above."
+        )
         parts.append(save_figure(report.directory, "groups", figure, "groups compared", caption))
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lavt.experiment.figure_style import Conditions
+from lavt.experiment.hops import AFTER_LOOP
 from lavt.experiment.report_groups import Group, short
 from lavt.experiment.tabular import (
     NOTHING,
@@ -25,6 +26,11 @@ from lavt.experiment.tabular import (
 )
 
 FLOWS = ("video", "control")
+
+COMPLETED_P95 = "p95 m, completed runs"
+COMMON_P95 = "p95 m, to the common distance"
+
+AFTERWARDS = ", after the loop"
 
 ENDED_EARLY = "ended early"
 """What a quantile is over all runs where it lies among those that were not completed."""
@@ -63,11 +69,11 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
         numbers("injected into video ms", 0),
         numbers("into control ms", 0),
         latencies("τ video ms", bounded=True),
-        numbers("the paper's τ video", 0),
+        numbers("the paper's τ video ms", 0),
         latencies("τ control ms", bounded=True),
-        numbers("the paper's τ control", 0),
+        numbers("the paper's τ control ms", 0),
         latencies("loop ms"),
-        numbers("the paper's τ video + τ control", 0),
+        numbers("the paper's τ video + τ control ms", 0),
         numbers("picture age, mean ms", 0),
         numbers("picture age, p95 ms", 0),
         latencies("age when a command is applied ms"),
@@ -103,7 +109,7 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
         numbers("runs", 0),
         shares("completed"),
         share_intervals("95 %, these routes"),
-        share_intervals("95 %, such roads"),
+        share_intervals("range over such roads"),
         shares("the paper's completed"),
         share_intervals("the paper's 95 %"),
         numbers("collisions / run", 2),
@@ -143,15 +149,15 @@ def error_table(conditions: Conditions, paper: Conditions) -> TableData:
     """How well the lane was kept, P95 three ways, ours and the paper's: one row a condition."""
     columns = [
         words("condition"),
-        numbers("p95 m, completed runs", 2),
-        intervals("95 % interval"),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        intervals("its 95 % interval m"),
         numbers("the paper's p95 m", 2),
-        numbers("p95 m, to the common distance", 2),
-        intervals("its 95 % interval"),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
+        intervals("95 % interval of that m"),
         Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")),
         numbers("mean error m", 2),
-        numbers("rms m", 2),
-        numbers("largest m", 2),
+        numbers("rms m, mean of runs", 2),
+        numbers("maximum m, mean of runs", 2),
         numbers("heading rms rad", 3),
         numbers("steering reversals / s", 2),
         numbers("oscillation Hz", 2),
@@ -214,8 +220,8 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
         share_intervals("95 % interval"),
         numbers("collisions / run", 2),
         numbers("lane invasions / run", 2),
-        numbers("p95 m, completed runs", 2),
-        numbers("p95 m, to the common distance", 2),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
         numbers("loop ms, median"),
         numbers("picture age, mean ms", 0),
     ]
@@ -248,8 +254,8 @@ def route_table(conditions: Conditions) -> TableData:
         numbers("completed", 0),
         shares("share"),
         share_intervals("95 % interval"),
-        numbers("p95 m, completed runs", 2),
-        numbers("p95 m, to the common distance", 2),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
     ]
     keys = ("runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m")
     routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
@@ -369,7 +375,10 @@ def hop_table(
     before: list[Any] = [known.get(name) for name in hops]
     show = numbers("", 2).show
     columns = [words("hop, median ms"), *(Column(name, show) for name in hops)]
-    rows = [[f"{node}: {hop}", *(of.get((node, hop)) for of in durations)] for node, hop in names]
+    rows = [
+        [f"{node}: {hop}{AFTERWARDS if (node, hop) in AFTER_LOOP else ''}", *(of.get((node, hop)) for of in durations)]
+        for node, hop in names
+    ]
     return TableData(columns, [["camera: capture to stamp, before the loop", *before], *rows])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import groupby, pairwise, product
 from typing import Any
 
 from lavt.experiment.figure_style import Conditions
@@ -24,19 +24,26 @@ CLEARLY_FEWER = 2
 
 Contrast = Mapping[str, Any]
 
+Known = tuple[str, float, float]
+"""Name, median loop latency in ms, and completion of a condition."""
 
-def _known(conditions: Conditions) -> list[tuple[str, float, float]]:
-    """Give name, loop latency and completion of the conditions that know both, least delayed first."""
+
+def _places(conditions: Conditions) -> list[list[Known]]:
+    """Give the conditions that know loop latency and completion, together where they are one place, least first."""
     known = [
         (name, float(entry["loop_ms"]["p50"]), float(entry["completion_rate"]))
         for name, entry in conditions.items()
         if entry["loop_ms"]["p50"] is not None and entry["completion_rate"] is not None
     ]
-    places: list[float] = []
+    begins_ms: list[float] = []
     for _, loop_ms, _ in sorted(known, key=lambda each: each[1]):
-        if not places or loop_ms - places[-1] > SAME_LOOP_MS:
-            places.append(loop_ms)
-    return sorted(known, key=lambda each: (max(place for place in places if place <= each[1]), each[0]))
+        if not begins_ms or loop_ms - begins_ms[-1] > SAME_LOOP_MS:
+            begins_ms.append(loop_ms)
+
+    def place(each: Known) -> int:
+        return sum(begin_ms <= each[1] for begin_ms in begins_ms)
+
+    return [list(members) for _, members in groupby(sorted(known, key=lambda each: (place(each), each[0])), place)]
 
 
 def what_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -60,36 +67,41 @@ def _some(word: str, names: Sequence[str]) -> str:
 
 def headline(name: str, conditions: Conditions) -> str:
     """Say of the runs called `name` where completion falls, and by what total latency; nothing without conditions."""
-    known = _known(conditions)
+    places = _places(conditions)
+    known = [each for place in places for each in place]
     if not known:
         return ""
     parts = []
     if len(known) <= LISTED:
         each = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
         parts.append(f"Completed, by the median loop latency: {each}.")
-    parts += _where_it_falls(known)
+    parts += _where_it_falls(places)
     errors = [(condition, conditions[condition]["p95_m"]) for condition, _, _ in known]
     told = [(condition, error_m) for condition, error_m in errors if error_m is not None]
     if len(told) > 1:
         (first, least_m), (last, most_m) = told[0], told[-1]
         parts.append(
-            f"P95 of the cross-track error in completed runs: {least_m:.2f} m at {first}, {most_m:.2f} m at {last}."
+            f"P95 of the cross-track error, mean of the completed runs: {least_m:.2f} m at {first}, {most_m:.2f} m at "
+            f"{last}."
         )
     return f"{name}: {' '.join(parts)}"
 
 
-def _where_it_falls(known: Sequence[tuple[str, float, float]]) -> list[str]:
-    falls = [(before[2] - after[2], before, after) for before, after in pairwise(known)]
-    if not falls or max(falls)[0] <= 0:
-        return ["Completion does not fall with latency."] if len(known) > 1 else []
-    _, before, after = max(falls, key=lambda fall: fall[0])
+def _where_it_falls(places: Sequence[Sequence[Known]]) -> list[str]:
+    falls = [each for nearer, farther in pairwise(places) for each in product(nearer, farther)]
+    if not falls:
+        return []
+    before, after = max(falls, key=lambda fall: fall[0][2] - fall[1][2])
+    if before[2] <= after[2]:
+        return ["Completion does not fall with latency."]
     parts = [
         f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}: "
         f"between {before[1]:.0f} and {after[1]:.0f} ms in all."
     ]
-    last = max((place for place, (_, _, rate) in enumerate(known) if rate >= 0.5), default=-1)
-    if last + 1 < len(known):
-        parts.append(f"Under half of the runs are completed from {known[last + 1][1]:.0f} ms on.")
+    last = max((index for index, place in enumerate(places) if any(rate >= 0.5 for _, _, rate in place)), default=-1)
+    if last + 1 < len(places):
+        begin_ms = min(loop_ms for _, loop_ms, _ in places[last + 1])
+        parts.append(f"Under half of the runs are completed from {begin_ms:.0f} ms on.")
     return parts
 
 
@@ -201,7 +213,7 @@ def _reference(conditions: Conditions, paper: Conditions) -> str:
     if ours_m is None or theirs_m < 5 * ours_m:
         return ""
     return (
-        f"P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the "
+        f"The mean P95 at {name} is {ours_m:.2f} m here and {theirs_m:.2f} m in the paper. Whoever is so far from the "
         "middle is out of the lane, but the paper counts "
         f"{paper[name]['lane_invasions_per_run']:.2f} lane invasions a run there: its reference, one of its own "
         "drives, is probably not the middle of the lane that was driven. Ours is that middle."
@@ -214,9 +226,9 @@ def _rails(conditions: Conditions, paper: Conditions) -> str:
     if not ours or max(ours) >= theirs_m or all(conditions[name]["completion_rate"] == 1.0 for name in paper):
         return ""
     return (
-        f"The largest P95 of completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the paper: our "
-        "roads have rails and a median barrier, and whoever reaches one has collided and does not complete. They bound "
-        "the error of a completed run."
+        f"The largest mean P95 of a condition's completed runs is {max(ours):.2f} m here and {theirs_m:.2f} m in the "
+        "paper: our roads have rails and a median barrier, and whoever reaches one has collided and does not complete. "
+        "They bound the error of a completed run."
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -12,8 +14,20 @@ from typing import Any
 NOTHING = "–"
 UNBROKEN = "\N{NO-BREAK SPACE}"
 
+SHARE = "share"
+"""In CSV a share is a part of 1."""
+
 LOW_HIGH = ("low", "high")
 PERCENTILES = ("p50", "p5", "p95")
+
+TITLE_CHARACTERS = 14
+"""A longer title of a column is broken into lines in LaTeX, where a page has an end."""
+
+LINE_CHARACTERS = 66
+"""A wider table is made as narrow as the text in LaTeX: so many are in a line of its article."""
+
+LONG_CHARACTERS, LONG_CM = 35, 6
+"""A column of texts of which one is longer is broken into lines of so many centimetres in LaTeX."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +35,8 @@ class Column:
     """One column: its title, and how a cell's value is shown as text.
 
     `parts` names the values that a cell consists of, where it has several (a sequence, or a mapping with these keys):
-    CSV has a column for each of them. `is_text` is for words, which begin at the left; `is_long` for sentences.
+    CSV has a column for each of them. `in_csv` is the unit of its values in CSV, where they are shown in another one.
+    `is_text` is for words, which begin at the left; `is_long` for sentences.
     """
 
     title: str
@@ -29,6 +44,7 @@ class Column:
     parts: tuple[str, ...] = ()
     is_text: bool = False
     is_long: bool = False
+    in_csv: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +77,17 @@ def numbers(title: str, digits: int = 1) -> Column:
 
 def shares(title: str) -> Column:
     """Make a column of shares of 1, shown as whole per cent."""
-    return Column(title, percent)
+    return Column(title, percent, in_csv=SHARE)
 
 
 def share_intervals(title: str) -> Column:
     """Make a column of intervals of shares of 1."""
-    return Column(title, lambda cell: NOTHING if cell is None else f"{interval(cell, unit=100.0)}{UNBROKEN}%", LOW_HIGH)
+    return Column(
+        title,
+        lambda cell: NOTHING if cell is None else f"{interval(cell, unit=100.0)}{UNBROKEN}%",
+        LOW_HIGH,
+        in_csv=SHARE,
+    )
 
 
 def intervals(title: str, digits: int = 2) -> Column:
@@ -151,23 +172,29 @@ def csv_of(table: TableData) -> str:
 
 
 def tex_of(table: TableData) -> str:
-    r"""Make a LaTeX `tabular` of a table, as it is shown; needs `\usepackage{booktabs}`."""
-    places = "".join("p{6cm}" if column.is_long else "l" if column.is_text else "r" for column in table.columns)
-    lines = [[column.title for column in table.columns], *_texts(table)]
-    head, *rows = [" & ".join(_tex(text) for text in line) + r" \\" for line in lines]
-    return "\n".join(
-        [
-            r"% \usepackage{booktabs}",
-            rf"\begin{{tabular}}{{{places}}}",
-            r"\toprule",
-            head,
-            r"\midrule",
-            *rows,
-            r"\bottomrule",
-            r"\end{tabular}",
-            "",
-        ]
-    )
+    r"""Make a LaTeX `tabular` of a table, as it is shown; needs `booktabs`, and `graphicx` where it is wide."""
+    texts = _texts(table)
+    columns = [_tex_column(column, [row[index] for row in texts]) for index, column in enumerate(table.columns)]
+    head, *rows = [" & ".join(cells) + r" \\" for cells in zip(*(cells for _, _, cells in columns), strict=True)]
+    packages = [r"% needs \usepackage{booktabs}"]
+    begin, end = rf"\begin{{tabular}}{{{''.join(place for place, _, _ in columns)}}}", r"\end{tabular}"
+    if sum(width + 2 for _, width, _ in columns) > LINE_CHARACTERS:
+        packages.append(r"% needs \usepackage{graphicx}")
+        begin, end = r"\resizebox{\textwidth}{!}{" + begin, end + "}"
+    return "\n".join([*packages, begin, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", end, ""])
+
+
+def _tex_column(column: Column, texts: Sequence[str]) -> tuple[str, int, list[str]]:
+    """Give a column's place in LaTeX, about how many characters wide it is, and its cells, the title first."""
+    longest = max(map(len, texts), default=0)
+    if column.is_text and longest > LONG_CHARACTERS:
+        return f"p{{{LONG_CM}cm}}", LONG_CHARACTERS, [_tex(column.title), *map(_tex_long, texts)]
+    place = "l" if column.is_text else "r"
+    title = column.title.replace(" %", f"{UNBROKEN}%")
+    lines = textwrap.wrap(title, TITLE_CHARACTERS, break_long_words=False) or [""]
+    stack = r"\\".join(map(_tex, lines))
+    title = stack if len(lines) == 1 else rf"\shortstack[{place}]{{{stack}}}"
+    return place, max(longest, *map(len, lines)), [title, *map(_tex, texts)]
 
 
 def _texts(table: TableData) -> list[list[str]]:
@@ -175,7 +202,8 @@ def _texts(table: TableData) -> list[list[str]]:
 
 
 def _names(column: Column) -> list[str]:
-    return [f"{column.title} {part}" for part in column.parts] or [column.title]
+    unit = f"({column.in_csv})" if column.in_csv else ""
+    return [" ".join(filter(None, (column.title, part, unit))) for part in column.parts or ("",)]
 
 
 def _values(column: Column, cell: Any) -> list[Any]:
@@ -198,6 +226,8 @@ _TEX = {
     "<": r"$<$",
     ">": r"$>$",
     "|": r"$|$",
+    "[": "{[}",  # after a row, these would be read as the height of a space, and as a star
+    "*": "{*}",
     "τ": r"$\tau$",
     "±": r"$\pm$",
     "°": r"$^\circ$",
@@ -209,3 +239,8 @@ _TEX = {
 def _tex(text: str) -> str:
     """Escape what LaTeX would read as a command; a line break ends a table's row there, so it becomes a space."""
     return "".join(_TEX.get(character, character) for character in text.replace("\n", " "))
+
+
+def _tex_long(text: str) -> str:
+    """Escape a text that may be broken where JSON has no spaces, too."""
+    return re.sub(r"([,:])(?=[^\s~])", r"\1\\allowbreak{}", _tex(text))
