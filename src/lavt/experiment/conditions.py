@@ -82,12 +82,21 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
     }
 
 
+def stem_of(route: str) -> str:
+    """Give a route's name, or the path of its file without ".yaml"."""
+    return route.removesuffix(".yaml").removesuffix(".yml")
+
+
+def road_of(route: str) -> str:
+    """Give the name of the road that a route, or a key part, is of."""
+    return stem_of(route).removesuffix(KEY_PART)
+
+
 def road_rates(runs: Sequence[Run]) -> list[float]:
     """Completion rate of each road: a route and its key part are one, by name or by path."""
     members: dict[str, list[bool]] = {}
     for run in runs:
-        road = str(run["route"]).removesuffix(".yaml").removesuffix(".yml").removesuffix(KEY_PART)
-        members.setdefault(road, []).append(run["ending"] == "completed")
+        members.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
     return [sum(members[road]) / len(members[road]) for road in sorted(members)]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lavt.domain import Picture
 from lavt.experiment import page
+from lavt.experiment.conditions import road_of, stem_of
 from lavt.experiment.drives import Drive, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.figures_drives import cross_track_figure, frames_figure, time_figure, trajectories_figure
 from lavt.experiment.record import read_record
@@ -24,7 +25,6 @@ DRAWN_GROUPS = 4
 PANELS = 3
 """Routes in one figure of trajectories: the paper's three key parts, and its three whole routes."""
 
-KEY_PART = "_key"
 
 DriveSets = Mapping[tuple[str, str], Sequence[Drive]]
 """Drives by kind of time and title of their group: what may be drawn into one figure."""
@@ -83,8 +83,8 @@ def trajectory_parts(report: Report, sets: DriveSets) -> Parts:
 def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
     """Say which routes share a figure: key parts first, `PANELS` in each."""
     kinds = {
-        "key": [route for route in routes if route.lower().endswith(KEY_PART)],
-        "whole": [route for route in routes if not route.lower().endswith(KEY_PART)],
+        "key": [route for route in routes if road_of(route) != stem_of(route)],
+        "whole": [route for route in routes if road_of(route) == stem_of(route)],
     }
     return [
         (f"{name}{begin // PANELS + 1 if begin else ''}", members[begin : begin + PANELS])
