@@ -11,7 +11,7 @@ from typing import Any
 
 from lavt.errors import UserError
 from lavt.experiment.provenance import provenance
-from lavt.experiment.workers import Workers, ignore_terminal
+from lavt.experiment.workers import Workers, ignore_terminal, terminal_held
 
 LOCAL = "local"
 """Instead of an address: Dask's workers on this machine."""
@@ -30,16 +30,15 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
     dask = _dask()
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
-        with (
-            dask.LocalCluster(
+        with terminal_held():
+            started = dask.LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
                 dashboard_address=None,
                 protocol="tcp",
                 silence_logs=logging.CRITICAL,
-            ) as started,
-            dask.Client(started) as client,
-        ):
+            )
+        with started, dask.Client(started) as client:
             client.run(ignore_terminal)
             yield _of_client(client, address)
         return

@@ -23,6 +23,9 @@ from lavt.experiment.drives import Drive
 from lavt.experiment.plan import PlannedRun
 from lavt.experiment.run import RESULT, drive_once
 
+TERMINAL = (signal.SIGINT, signal.SIGHUP)
+"""What Ctrl-C and a closed terminal send."""
+
 
 @dataclass(frozen=True, slots=True)
 class Workers:
@@ -58,14 +61,30 @@ class Workers:
 def processes(jobs: int) -> Iterator[Workers]:
     """Give processes of this machine, which end with this one, whatever ends it."""
     context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process) as executor:
+    with terminal_held():
+        executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process)
+    with terminal_held():  # again: Python's resource tracker, which has been started now, lets Ctrl-C through
+        for _ in range(jobs):
+            executor.submit(os.getpid)  # which starts a process
+    with executor:
         yield Workers(executor, jobs, far=False)
+
+
+@contextmanager
+def terminal_held() -> Iterator[None]:
+    """Hold Ctrl-C and a closed terminal back; from processes that are started meanwhile, until `ignore_terminal`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def ignore_terminal() -> None:
     """Let Ctrl-C and a closed terminal be: they go to all processes of the terminal, but only the parent decides."""
-    for number in (signal.SIGINT, signal.SIGHUP):
+    for number in TERMINAL:
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL)
 
 
 def _begin_process() -> None:
