@@ -12,6 +12,7 @@ import shlex
 import signal
 import subprocess
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
@@ -34,7 +35,7 @@ Run = Callable[[Sequence[str], float], Ended | None]
 """Runs a program for so many seconds at most; None where it has not ended by then."""
 
 
-class Interpreter:
+class Interpreter(ABC):
     """A program that stays and obeys one command after the other, started with the first one; to be closed."""
 
     program: tuple[str, ...]
@@ -45,13 +46,13 @@ class Interpreter:
         self._process: subprocess.Popen[bytes] | None = None
         self._one_at_a_time = threading.Lock()
 
+    @abstractmethod
     def lines(self, command: Sequence[str]) -> str:
         """Write a command as the program reads it, with one behind it that marks where its answer ends."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ended(self, answer: bytes) -> Ended | None:
         """Read an answer; None as long as its end has not come."""
-        raise NotImplementedError
 
     def run(self, command: Sequence[str], timeout_s: float) -> Ended | None:
         """Run a command to its end; None where that takes too long, or where the program has died."""
