@@ -46,9 +46,10 @@ PAPER_POINTS = (
     " The paper's points stand at the sum of its two one-way medians; the bar of its completion is that of its counts, "
     "and of its error it gives none."
 )
+ROUTES_NOTE = " Of the completion: these routes, the exact interval of what repeating just these routes would give."
 ROADS_NOTE = (
-    " Of the completion: these routes, the exact interval of what repeating just these routes would give; such roads, "
-    "how far the rates of the roads lie apart, a route and its key part being one road, and no interval of 95 %."
+    " Of the completion: such roads, how far the rates of the roads lie apart, a route and its key part being one "
+    "road, and no interval of 95 %."
 )
 ERRORS_NOTE = (
     " Each error is the mean over runs of what each run has by itself, its P95 and its maximum, too. P95 of the "
@@ -140,10 +141,13 @@ def conditions_parts(report: Report) -> Parts:
         parts.append(page.heading(report.how(kind)))
         for name, make in (("driving", driving_table), ("latency", latency_table), ("error", error_table)):
             parts.append(save_table(report.directory, f"conditions_{kind}_{name}", make(conditions, paper)))
+    roads = any(entry.get("completion_such_roads") for of in report.kinds.values() for entry in of.values())
     beside = any(report.paper(conditions) for conditions in report.kinds.values())
     return [
         *parts,
-        page.paragraph(LATENCIES_NOTE + (PAPER_NOTE if beside else "") + ROADS_NOTE + ERRORS_NOTE, note=True),
+        page.paragraph(
+            "".join((LATENCIES_NOTE, PAPER_NOTE * beside, ROUTES_NOTE, ROADS_NOTE * roads, ERRORS_NOTE)), note=True
+        ),
     ]
 
 
