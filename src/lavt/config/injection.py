@@ -104,16 +104,19 @@ class Condition(Section):
     control: Impairment = Impairment()
 
     @property
+    def flows(self) -> dict[str, tuple[float, Impairment]]:
+        """The delay of each flow, and what else happens to it."""
+        return {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
+
+    @property
     def constant_ms(self) -> dict[str, float | None]:
         """The delay of each flow; None where it changes by a trace."""
-        flows = {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
-        return {name: None if each.has_delay_trace else delay_ms for name, (delay_ms, each) in flows.items()}
+        return {name: None if each.has_delay_trace else delay_ms for name, (delay_ms, each) in self.flows.items()}
 
     @property
     def least_ms(self) -> dict[str, float]:
         """A delay that next to no median of each flow is below: jitter and overtaking make it less than was asked."""
-        flows = {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
         return {
             name: 0.0 if each.reorder >= HALF else max(0.0, delay_ms - 4 * each.jitter_ms)
-            for name, (delay_ms, each) in flows.items()
+            for name, (delay_ms, each) in self.flows.items()
         }

@@ -69,7 +69,7 @@ def oscillation_hz(at_s: FloatArray, steering_rad: FloatArray) -> float | None:
 def power_spectrum(even_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Frequencies, and the power at each of what was sampled at `SAMPLED_HZ`: that of a sine is half its square.
 
-    As `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than the drive of a short route.
+    As `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than a short geometry drive.
     """
     at = np.arange(len(even_rad))
     straight = np.polynomial.Polynomial.fit(at, even_rad, 1)(at)

@@ -1,6 +1,6 @@
 """What chrony says of the host's clock: `chronyc -c` (comma-separated values, in the order of chronyc's manual).
 
-One chronyc stays and is asked again and again: an answer takes it some 0.1 ms of the processor, a start 10 ms and more.
+One chronyc stays and is asked again and again: it answers within 0.3 ms, and nothing has to be started for it.
 """
 
 from __future__ import annotations
