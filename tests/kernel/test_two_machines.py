@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.kernel.lane import clocks
 from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chronyd, wait_synchronised
-from tests.kernel.lane.driving import REPOSITORY, Drive, Loop, start_loop
+from tests.kernel.lane.driving import REPOSITORY, Drive, Loop, reasons_against, start_loop
 from tests.kernel.lane.machine import Machine, wait_until
 from tests.kernel.lane.netem import netem_on_ntp
 
@@ -24,6 +24,7 @@ DriveOnce = Callable[..., Drive]
 TrueOffset = Callable[[], int]
 Tell = Callable[[str], None]
 NTP_PORT = 11123
+CLIENT_NTP = "the NTP of the client "
 DRIVES = 3
 """At most, where the first was disturbed by other work on the host: then the median over all of them counts."""
 PAPER = ("L0", "L1", "L2", "L3", "L4", "L5")
@@ -103,19 +104,13 @@ def off_ms(measured: Mapping[str, Sequence[tuple[float, float]]], name: str, wan
     return float(np.max(np.abs(shift_ms - wanted_ms)))
 
 
-def clock_reasons(drive: Drive) -> list[str]:
-    """Reasons against a drive, but those of a machine too slow for it: a user-mode kernel has one processor."""
-    slow = ("the physics was", "the camera missed")
-    return [reason for reason in drive.result["invalid_because"] if not reason.startswith(slow)]
-
-
 @pytest.mark.usefixtures("chrony")
 def test_a_route_is_driven_and_its_latencies_are_true(drive: DriveOnce, truth: Truth, tell: Tell) -> None:
     """Over two machines the key part of route A is driven to its end; Delta is true to its bound; the loop closes."""
     driven = drive("route", server=("vehicle.route=a_key", "video.bit_rate_bps=1000000"), meanwhile=truth.note)
     tell(in_short(driven))
     assert driven.result["ending"] == "completed"
-    assert clock_reasons(driven) == []
+    assert reasons_against(driven) == []
     assert driven.result["delta"]["source"] == "chrony"
     assert driven.result["delta"]["drift_ppm"] == pytest.approx(30, abs=5)
     assert driven.measured.closure_p95_ms is not None
@@ -133,7 +128,7 @@ def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
     def median_ms(name: str) -> tuple[float, float]:
         driven = drive(name, server=(*SHORT, *SERVER), client=under(name), meanwhile=truth.note)
         tell(in_short(driven))
-        assert clock_reasons(driven) == [], name
+        assert reasons_against(driven) == [], name
         assert driven.measured.closure_p95_ms is not None
         assert driven.measured.closure_p95_ms < 1, name
         truth.hold_against(driven)
@@ -166,7 +161,7 @@ def test_delta_is_true_while_the_server_is_slewed_towards_a_third_clock(
     wait_synchronised(client_machine, updates=10)
     driven = drive("slewed", server=SHORT, client=SMALL, meanwhile=truth.note)
     assert abs(correction_s(server_machine)) > 0.005, "it slews still"
-    assert clock_reasons(driven) == []
+    assert reasons_against(driven) == []
     truth.hold_against(driven)
 
 
@@ -178,8 +173,8 @@ def test_delay_on_the_path_of_ntp_before_it_synchronised_is_told(
     with netem_on_ntp(client_machine):
         start_chronyd(client_machine, following(server_machine.address))
         wait_synchronised(client_machine, updates=10)
-        driven = drive("before", server=SHORT, client=SMALL)
-    [reason] = clock_reasons(driven)
+        driven = drive("before", server=SHORT, client=SMALL, about=CLIENT_NTP)
+    [reason] = reasons_against(driven)
     tell(reason)
     assert "the NTP of the client goes through injected delay" in reason
 
@@ -190,11 +185,11 @@ def test_delay_on_the_path_of_ntp_after_it_synchronised_is_told(
 ) -> None:
     """Where NTP is put through delay after it synchronised, the run is invalid because its samples stand still."""
     with netem_on_ntp(client_machine):
-        driven = drive("after", server=SHORT, client=SMALL)
-    reasons = clock_reasons(driven)
+        driven = drive("after", server=SHORT, client=SMALL, about=CLIENT_NTP)
+    reasons = reasons_against(driven)
     tell("; ".join(reasons))
     assert any("accepted no sample" in reason for reason in reasons)
-    assert all(reason.startswith("the NTP of the client ") for reason in reasons)
+    assert all(reason.startswith(CLIENT_NTP) for reason in reasons)
 
 
 @pytest.mark.usefixtures("chrony")
@@ -210,7 +205,7 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(
             stepped.append(loop)
             server_machine.call(clocks.step, step_s * NS_PER_S)
 
-    driven = drive("stepped", server=SHORT, client=SMALL, meanwhile=step)
+    driven = drive("stepped", server=SHORT, client=SMALL, about="the wall clock of the server stepped", meanwhile=step)
     events = driven.server.table("event")
     said = [
         detail for kind, detail in zip(events.texts("kind"), events.texts("detail"), strict=True) if kind == "safety"
@@ -220,7 +215,7 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(
     changes = ["disarmed -> arming", "arming -> driving", "driving -> safe_stop"]
     assert [each.partition(":")[0] for each in said] == changes
     assert said[-1].endswith("the drive is over")
-    reasons = clock_reasons(driven)
+    reasons = reasons_against(driven)
     assert len(reasons) == 1
     assert reasons[0].startswith(f"the wall clock of the server stepped by {step_s * 1000:+d}"[:-2])
 
@@ -232,7 +227,7 @@ def test_the_probe_alone_is_right_under_delay_of_the_control(
     server_machine.call(clocks.step, 250 * NS_PER_MS)
     driven = drive("probe", server=(*SHORT, *SERVER), client=under("L5"), meanwhile=truth.note)
     assert driven.result["delta"]["source"] == "probe"
-    assert clock_reasons(driven) == []
+    assert reasons_against(driven) == []
     truth.hold_against(driven)
 
 
