@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +8,16 @@ from hypothesis import strategies as st
 
 from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
-from lavt.transport.stamp import STAMP_PX, holds_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+from lavt.transport.stamp import (
+    STAMP_PX,
+    holds_stamp,
+    read_stamp,
+    rtp_timestamp,
+    stamp_agrees,
+    write_stamp,
+    write_stamp_i420,
+    write_stamp_luma,
+)
 
 STAMPS = st.integers(min_value=0, max_value=2**64 - 1)
 
@@ -73,10 +83,42 @@ def test_threshold() -> None:
     assert read_stamp(np.where(picture[..., 0] > 0, 129, 128).astype(np.uint8)) == 0x0123_4567_89AB_CDEF
 
 
+@given(STAMPS, st.sampled_from([(64, 64), (66, 130), (98, 134), (128, 160)]), st.integers(min_value=0, max_value=100))
+def test_i420(stamp_ns: int, size: tuple[int, int], seed: int) -> None:
+    """A stamp written into I420 gives the bytes that writing it into BGR and converting gives, at every even size."""
+    picture = stream(seed, "picture").integers(0, 256, (*size, 3), dtype=np.uint8)
+    planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
+    write_stamp_i420(planes, stamp_ns)
+    stamped = picture.copy()
+    write_stamp(stamped, stamp_ns)
+    assert np.array_equal(planes, cv2.cvtColor(stamped, cv2.COLOR_BGR2YUV_I420))
+    assert read_stamp(planes[: size[0]]) == stamp_ns
+
+
+def test_luma_alone() -> None:
+    """A stamp goes in place into a luma plane with gaps between its rows, 16 and 235, and changes only its corner."""
+    array = np.full((100, 200), 90, np.uint8)
+    write_stamp_luma(array[10:, 20:130], 1 << 63 | 1)
+    assert read_stamp(array[10:, 20:]) == 1 << 63 | 1
+    assert set(np.unique(array[10:74, 20:84])) == {16, 235}
+    array[10:74, 20:84] = 90
+    assert (array == 90).all()
+
+
+def test_i420_with_gaps() -> None:
+    """An I420 array with gaps is refused rather than left without neutral chroma."""
+    with pytest.raises(ValueError, match="one block"):
+        write_stamp_i420(np.zeros((96, 160), np.uint8)[:, :128], 1)
+
+
 def test_too_small() -> None:
     """A picture without room for the stamp is the user's error when written and the peer's when read."""
     with pytest.raises(UserError, match="64 x 64"):
         write_stamp(np.zeros((64, 63, 3), np.uint8), 1)
+    with pytest.raises(UserError, match="64 x 64"):
+        write_stamp_luma(np.zeros((63, 64), np.uint8), 1)
+    with pytest.raises(UserError, match="64 x 64"):
+        write_stamp_i420(np.zeros((93, 64), np.uint8), 1)
     with pytest.raises(BadPacket):
         read_stamp(np.zeros((63, 64), np.uint8))
 

@@ -24,6 +24,11 @@ _CENTRE_PIXELS = (_CELL_PX // 2) ** 2
 _THRESHOLD = 128
 _BLACK_BELOW, _WHITE_ABOVE = 64, 192  # far from both is what a codec makes of a cell
 
+_BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), what OpenCV makes of 0 and 255
+_BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
+_LUMA_OF_BYTE = np.where(_BITS_OF_BYTE, _WHITE, _BLACK).astype(np.uint8).repeat(_CELL_PX, axis=1)
+"""(256, STAMP_PX): one row of pixels for each byte of a stamp."""
+
 _RTP_CLOCK_HZ_BY_10000 = 9
 _NS_PER_S_BY_10000 = 100_000
 
@@ -33,13 +38,43 @@ def write_stamp(picture_bgr: Picture, stamp_ns: int) -> None:
 
     The picture is (height, width, 3) and at least `STAMP_PX` each way, else `UserError`; `stamp_ns` is in [0, 2^64).
     """
-    if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
-        raise UserError(f"a picture must be at least {STAMP_PX} x {STAMP_PX} pixels for the stamp; use a larger one")
+    _check_room(*picture_bgr.shape[:2])
     stamp_bytes = np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)
     cells = np.unpackbits(stamp_bytes) * np.uint8(255)
     rows = cells.repeat(_CELL_PX * 3).reshape(_CELLS, 1, STAMP_PX, 3)
     corner = picture_bgr[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, STAMP_PX, 3)
     corner[...] = rows
+
+
+def write_stamp_luma(luma: NDArray[np.uint8], stamp_ns: int) -> None:
+    """Write `stamp_ns` into the top left corner of a luma plane (height, width), 16 black and 235 white, in place.
+
+    The chroma there must be 128, or black and white have a colour. Raises `UserError` for a plane smaller than
+    `STAMP_PX` either way; `stamp_ns` is in [0, 2^64).
+    """
+    _check_room(*luma.shape)
+    rows = _LUMA_OF_BYTE[np.frombuffer(stamp_ns.to_bytes(8, "big"), np.uint8)]
+    luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, STAMP_PX)[...] = rows[:, None]
+
+
+def write_stamp_i420(planes: NDArray[np.uint8], stamp_ns: int) -> None:
+    """Write `stamp_ns` into the top left corner of an I420 picture, in place: what `write_stamp` and cv2 would make.
+
+    `planes` is (height * 3 // 2, width) as OpenCV has it, sides even: luma, then the U and the V plane, each
+    (height / 2, width / 2) without gaps between its rows. Raises `UserError` for a picture that is too small and
+    `ValueError` for an array with gaps.
+    """
+    if not planes.flags.c_contiguous:
+        raise ValueError("an I420 picture must be one block of memory: its chroma has rows of half the width")
+    height, width = planes.shape[0] * 2 // 3, planes.shape[1]
+    write_stamp_luma(planes[:height], stamp_ns)
+    planes[height:].reshape(2, height // 2, width // 2)[:, : STAMP_PX // 2, : STAMP_PX // 2] = _NEUTRAL
+
+
+def _check_room(height: int, width: int) -> None:
+    """Raise `UserError` where the stamp has no room."""
+    if height < STAMP_PX or width < STAMP_PX:
+        raise UserError(f"a picture must be at least {STAMP_PX} x {STAMP_PX} pixels for the stamp; use a larger one")
 
 
 def read_stamp(luma: NDArray[np.uint8]) -> int:
