@@ -20,7 +20,7 @@ from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
 from lavt.transport.channels import CHANNELS
 from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.messages import decode, encode
-from lavt.transport.pictures import VideoReceiver
+from lavt.transport.pictures import RenderedPicture, VideoReceiver
 from lavt.transport.stamp import rtp_timestamp, write_stamp
 
 FRAME_NS = NS_PER_S // 30
@@ -60,7 +60,7 @@ class Bench:
         self.detector = SeesALane()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
         self.node = DriverNode(
-            VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px, 3)),
+            VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px)),
             detector or self.detector,
             GoesStraight(),
             self.session,
@@ -76,7 +76,7 @@ class Bench:
 
     def view(self, picture: Picture | None = None) -> list[Command]:
         shown = noise(1) if picture is None else picture
-        return commands(self.take("view", View(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, shown)))
+        return commands(self.take("view", View(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown))))
 
     def go(self, duration_ns: int) -> list[tuple[int, Command]]:
         """Wake the node whenever it asked; give its commands with their times."""

@@ -42,6 +42,8 @@ def _video_sender(config: ServerConfig) -> VideoSender:
             rate_hz=camera.rate_hz,
             bit_rate_bps=video.bit_rate_bps,
             gop_frames=video.gop_frames,
+            preset=video.preset,
+            threads=video.encoder_threads,
             buffer_s=video.buffer_ms / 1000,
         )
     )
@@ -49,7 +51,7 @@ def _video_sender(config: ServerConfig) -> VideoSender:
 
 def _video_receiver(config: ClientConfig) -> VideoReceiver:
     camera = client_camera(config.camera)
-    return VideoReceiver(Decoder(), (camera.height_px, camera.width_px, 3))
+    return VideoReceiver(Decoder(), (camera.height_px, camera.width_px))
 
 
 def _lane_detector(config: ClientConfig) -> LaneDetector:

@@ -81,9 +81,19 @@ class VideoConfig(Section):
     """H.264 and RTP."""
 
     bit_rate_bps: int = Field(4_000_000, ge=50_000, le=50_000_000)
+    """Of the H.264, kept to over any `buffer_ms`; headers and repair packets come on top."""
     gop_frames: int = Field(30, ge=1, le=600)
+    """A keyframe at least so often; after a loss it comes on request."""
     buffer_ms: float = Field(100.0, gt=0, le=2000)
+    """The decoder's buffer (VBV): no frame is larger than what the bit rate carries in this time."""
+    preset: Literal["ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow"] = (
+        "ultrafast"
+    )
+    """libx264's: a slower one makes better pictures of the same bits, and takes longer."""
+    encoder_threads: int = Field(1, ge=1, le=16)
+    """Each encodes a slice of every picture."""
     reorder_hold_ms: float = Field(10.0, ge=0, le=500)
+    """So long a packet waits for those before it: at least the network's jitter."""
 
 
 class NetworkConfig(Section):

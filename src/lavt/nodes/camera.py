@@ -128,12 +128,12 @@ class CameraNode:
         """Take a frame with a camera that knows nothing of exposure and delay."""
         return self._take(number, begin_ns, newest_pose(poses, begin_ns))
 
-    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, int]:
-        """Take a checksum of the picture without its stamp, before the time of the stamp begins."""
-        return frame, self._pictures.checksum(frame.picture)
+    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, Sight, int]:
+        """Do what can be done before the time of the stamp begins, a checksum of the picture among it."""
+        return frame, *self._pictures.prepare(frame.picture)
 
-    def _stamp(self, checked: tuple[CapturedFrame, int], now: Now) -> Stamped:
-        frame, pixel_crc = checked
+    def _stamp(self, checked: tuple[CapturedFrame, Sight, int], now: Now) -> Stamped:
+        frame, prepared, pixel_crc = checked
         stamp_ns = now.wall_ns
         if stamp_ns > self._highest_stamp_ns:
             self._highest_stamp_ns = stamp_ns
@@ -142,7 +142,7 @@ class CameraNode:
                 stamp_ns += 1
             self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)
         self._stamps.append(stamp_ns)
-        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(frame.picture, stamp_ns))
+        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(prepared, stamp_ns))
 
     def _encode(self, stamped: Stamped, now: Now) -> Encoded:
         keyframe = self._keyframe_wanted and now.mono_ns - self._keyframe_ns >= KEYFRAME_PAUSE_NS

@@ -151,7 +151,7 @@ class DriverNode:
         if decoded.picture is None:
             sends.append(Send("picture_lost", None))
         elif readable:
-            sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture.picture)))
+            sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture)))
         return sends
 
     # A picture is looked at.
@@ -164,7 +164,7 @@ class DriverNode:
         # the times at which pictures were sent, as the car went on; of a clock put back nobody knows how long.
         if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
             self._detector.forget()
-        return Seen(view, view.stamp_ns, self._detector.detect(view.picture))
+        return Seen(view, view.stamp_ns, self._detector.detect(view.received.picture))
 
     def _decide(self, seen: Seen, now: Now) -> Seen:
         self._lane_says = self._watch.check(seen.lane.confidence, now.mono_ns)

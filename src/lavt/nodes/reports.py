@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lavt.domain import Lane, Sight
+from lavt.domain import Lane
+from lavt.transport.pictures import Received
 from lavt.value import value
 
 
@@ -15,7 +16,7 @@ class FrameWritten:
     stamped_mono_ns: int
     capture_ns: int | None
     pixel_crc: int
-    """CRC-32 of the pixels around the stamp."""
+    """Tells the picture, without its stamp, from the one before."""
     size_bytes: int
 
 
@@ -45,7 +46,7 @@ class View:
 
     stamp_ns: int
     read_wall_ns: int
-    picture: Sight
+    received: Received
 
 
 @value

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from lavt.domain import Picture
 from lavt.errors import UserError
 from lavt.transport.rtp import split_nal_units
-from lavt.value import value
 
 _MIN_SIDE_PX: Final = 64
 _MAX_DECODED_PX: Final = 4096 * 2304
@@ -39,7 +38,8 @@ class Encoder:
     """H.264 encoder of one stream of pictures (libx264); the same pictures give the same bytes.
 
     `bit_rate_bps` is kept over any `buffer_s`; a keyframe comes every `gop_frames` and on request, each with its
-    parameter sets in band. Raises `UserError` for what no stream can be made of.
+    parameter sets in band. With several `threads` each encodes a slice of every picture: no picture waits for another.
+    Raises `UserError` for what no stream can be made of.
     """
 
     def __init__(
@@ -52,48 +52,81 @@ class Encoder:
         gop_frames: int,
         preset: str = "ultrafast",
         buffer_s: float = 0.1,
+        threads: int = 1,
     ) -> None:
         _check_size(width_px, height_px)
         _check_rates(rate_hz, bit_rate_bps, gop_frames, buffer_s)
         if preset not in _PRESETS:
             raise UserError(f"preset {preset!r} is none of libx264's: choose one of {', '.join(_PRESETS)}")
+        if not 1 <= threads <= 16:
+            raise UserError(f"an encoder of {threads} threads: choose 1 to 16")
         self._shape = (height_px, width_px, 3)
         self._planes = np.empty((height_px * 3 // 2, width_px), np.uint8)
+        self._rate, self._gop_frames, self._buffer_s = Fraction(rate_hz).limit_denominator(1001), gop_frames, buffer_s
+        self._preset, self._threads = preset, threads
         self._next_pts = 0
-        context = av.CodecContext.create("libx264", "w")
-        context.width, context.height = width_px, height_px
-        context.pix_fmt = "yuv420p"
-        context.thread_count = 1
-        context.time_base = 1 / Fraction(rate_hz).limit_denominator(1001)
-        context.framerate = Fraction(rate_hz).limit_denominator(1001)
-        context.gop_size = gop_frames
-        context.max_b_frames = 0
-        context.bit_rate = bit_rate_bps
-        context.profile = "Constrained Baseline"
-        context.options = {
-            "preset": preset,
-            "tune": "zerolatency",
-            "maxrate": str(bit_rate_bps),
-            "bufsize": str(round(bit_rate_bps * buffer_s)),
-        }
-        context.open()
-        self._context = context
+        self._context = self._opened(bit_rate_bps)
+
+    @property
+    def bit_rate_bps(self) -> int:
+        """What is kept to now."""
+        return self._context.bit_rate or 0
+
+    def set_bit_rate(self, bit_rate_bps: int) -> None:
+        """Keep to another bit rate from the next picture on, which is a keyframe.
+
+        The codec is opened anew, in about 2 ms: libx264 cannot go beyond the rate it was opened with, nor change its
+        decoder buffer. Raises `UserError` for a rate that no stream can be made of.
+        """
+        _check_rates(float(self._rate), bit_rate_bps, self._gop_frames, self._buffer_s)
+        if bit_rate_bps != self.bit_rate_bps:
+            self._context = self._opened(bit_rate_bps)
+
+    def to_planes(self, picture_bgr: Picture) -> NDArray[np.uint8]:
+        """Convert a picture (height, width, 3) to I420, (height * 3 / 2, width), in a buffer that the next one reuses.
+
+        Raises `UserError` for a picture of another size.
+        """
+        if picture_bgr.shape != self._shape:
+            raise UserError(f"the encoder was made for pictures of {self._shape}, not of {picture_bgr.shape}")
+        return cast("NDArray[np.uint8]", cv2.cvtColor(picture_bgr, cv2.COLOR_BGR2YUV_I420, dst=self._planes))
 
     def encode(self, picture_bgr: Picture, keyframe: bool = False) -> bytes:
         """Encode one picture (height, width, 3) and return its access unit, annex B.
 
         `keyframe` makes it an IDR picture. Raises `UserError` for a picture of another size.
         """
-        if picture_bgr.shape != self._shape:
-            raise UserError(f"the encoder was made for pictures of {self._shape}, not of {picture_bgr.shape}")
-        cv2.cvtColor(picture_bgr, cv2.COLOR_BGR2YUV_I420, dst=self._planes)
-        frame = VideoFrame.from_numpy_buffer(self._planes, format="yuv420p")
+        return self.encode_planes(self.to_planes(picture_bgr), keyframe)
+
+    def encode_planes(self, planes: NDArray[np.uint8], keyframe: bool = False) -> bytes:
+        """Encode one picture in I420, as `to_planes` gives it; nothing of it is copied or kept."""
+        frame = VideoFrame.from_numpy_buffer(planes, format="yuv420p")
         frame.pts = self._next_pts
         frame.time_base = self._context.time_base
         self._next_pts += 1
         if keyframe:
             frame.pict_type = PictureType.I
         return b"".join(bytes(packet) for packet in self._context.encode(frame))
+
+    def _opened(self, bit_rate_bps: int) -> VideoCodecContext:
+        context = av.CodecContext.create("libx264", "w")
+        context.height, context.width, _ = self._shape
+        context.pix_fmt = "yuv420p"
+        context.thread_count = self._threads
+        context.time_base = 1 / self._rate
+        context.framerate = self._rate
+        context.gop_size = self._gop_frames
+        context.max_b_frames = 0
+        context.bit_rate = bit_rate_bps
+        context.profile = "Constrained Baseline"
+        context.options = {
+            "preset": self._preset,
+            "tune": "zerolatency",
+            "maxrate": str(bit_rate_bps),
+            "bufsize": str(round(bit_rate_bps * self._buffer_s)),
+        }
+        context.open()
+        return context
 
 
 def _check_size(width_px: int, height_px: int) -> None:
@@ -116,16 +149,27 @@ def _check_rates(rate_hz: float, bit_rate_bps: int, gop_frames: int, buffer_s: f
         raise UserError(f"a decoder buffer of {buffer_s} s: choose 0.001 to 10 s, and at least one frame")
 
 
-@value
 class DecodedPicture:
-    """A picture that came out of the decoder."""
+    """A picture that came out of the decoder, and is in its memory still: the next pictures leave it alone.
 
-    luma: NDArray[np.uint8]
-    """(height, width), 16 black to 235 white."""
-    picture: Picture
-    """The same in colour."""
-    corrupt: bool
-    """The decoder had to make up parts of this very picture. Later ones copy from it and say nothing."""
+    Attributes: `luma` is (height, width), 16 black to 235 white. `corrupt` says that the decoder had to make up parts
+    of this very picture; later ones copy from it and say nothing.
+    """
+
+    __slots__ = ("_frame", "corrupt", "luma")
+
+    def __init__(self, frame: VideoFrame, corrupt: bool) -> None:
+        self._frame = frame
+        plane = frame.planes[0]
+        rows = np.frombuffer(plane, np.uint8).reshape(frame.height, plane.line_size)  # type: ignore[call-overload]
+        self.luma: NDArray[np.uint8] = rows[:, : frame.width]
+        self.corrupt = corrupt
+
+    @property
+    def picture(self) -> Picture:
+        """The same in colour, made when it is asked for: most of the time of a decoded picture goes there."""
+        planes = cast("NDArray[np.uint8]", self._frame.to_ndarray())
+        return cast("Picture", cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420))
 
 
 class Decoder:
@@ -151,7 +195,7 @@ class Decoder:
             self._damaged = False
         try:
             frames = self._context.decode(av.Packet(access_unit))
-            decoded = _to_picture(frames[-1]) if frames else None
+            decoded = DecodedPicture(_in_i420(frames[-1]), frames[-1].is_corrupt) if frames else None
         except (av.FFmpegError, ValueError):
             decoded = None
         self._damaged = self._damaged or decoded is None or decoded.corrupt
@@ -174,12 +218,9 @@ def _stands_alone(access_unit: bytes) -> bool:
     return kinds >= _KEYFRAME_KINDS
 
 
-def _to_picture(frame: VideoFrame) -> DecodedPicture:
-    """Copy a frame out of the decoder's memory. Raises `ValueError` for odd sizes, which 4:2:0 planes cannot hold."""
+def _in_i420(frame: VideoFrame) -> VideoFrame:
+    """Give a frame in 4:2:0. Raises `ValueError` for odd sizes, which its planes cannot hold."""
     if frame.width % 2 or frame.height % 2:
         raise ValueError("odd size")
-    if frame.format.name != "yuv420p":
-        frame = frame.reformat(format="yuv420p")  # a foreign sender's full range or other chroma
-    planes = cast("NDArray[np.uint8]", frame.to_ndarray())
-    picture = cast("Picture", cv2.cvtColor(planes, cv2.COLOR_YUV2BGR_I420))
-    return DecodedPicture(planes[: frame.height], picture, frame.is_corrupt)
+    # A foreign sender's full range or other chroma.
+    return frame if frame.format.name == "yuv420p" else frame.reformat(format="yuv420p")

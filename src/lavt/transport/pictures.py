@@ -11,16 +11,19 @@ import zlib
 from typing import Any, Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lavt.domain import Lane, Picture, SeenLane, Sight
 from lavt.errors import BadPacket
 from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
-from lavt.transport.stamp import STAMP_PX, read_stamp, write_stamp
+from lavt.transport.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
 from lavt.value import value
 
 _STANDS_ALONE: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
 """An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
 _LANE: Final = struct.Struct("!Qq7d")
+Planes = NDArray[np.uint8]
+"""A picture in I420: (height * 3 / 2, width), the luma first."""
 KEPT_PICTURES: Final = 300
 """Pictures that are on their way at most: 10 s of them at 30 Hz, and 280 MB."""
 
@@ -30,23 +33,32 @@ class Received(Protocol):
 
     @property
     def picture(self) -> Sight:
-        """What a detector looks at."""
+        """What a detector looks at; it may be made only now."""
+        ...
+
+    @property
+    def corrupt(self) -> bool:
+        """Parts of it were made up."""
         ...
 
 
 class PictureSender(Protocol):
     """The camera's end."""
 
-    def checksum(self, picture: Sight) -> int:
-        """Give a number that tells a picture, without its stamp, from the one before."""
+    def prepare(self, picture: Sight) -> tuple[Sight, int]:
+        """Give what the stamp goes into, and a number that tells the picture, without it, from the one before."""
         ...
 
-    def write_stamp(self, picture: Sight, stamp_ns: int) -> Sight:
+    def write_stamp(self, prepared: Sight, stamp_ns: int) -> Sight:
         """Put the stamp into the picture, in place where it is pixels, and return it."""
         ...
 
-    def encode(self, picture: Sight, *, keyframe: bool) -> bytes:
+    def encode(self, stamped: Sight, *, keyframe: bool) -> bytes:
         """Make an access unit of a stamped picture; a keyframe where one is asked for."""
+        ...
+
+    def set_bit_rate(self, bit_rate_bps: int) -> None:
+        """Keep to another bit rate from the next picture on, where what is sent has one."""
         ...
 
 
@@ -63,29 +75,34 @@ class PictureReceiver(Protocol):
 
 
 class VideoSender:
-    """Stamps pixels and encodes them as H.264."""
+    """Converts pictures to I420 in a buffer that is used again, stamps them there, and encodes them as H.264."""
 
     def __init__(self, encoder: Encoder) -> None:
         self._encoder = encoder
 
-    def checksum(self, picture: Picture) -> int:
-        """CRC-32 of the pixels around the stamp: a camera that gives the same buffer again gives it with its stamp."""
-        return _pixel_crc(picture)
+    def prepare(self, picture: Picture) -> tuple[Planes, int]:
+        """Convert the picture; the number is a CRC-32 of its luma."""
+        planes = self._encoder.to_planes(picture)
+        return planes, zlib.crc32(planes[: picture.shape[0]].data)
 
-    def write_stamp(self, picture: Picture, stamp_ns: int) -> Picture:
-        """Write the stamp into the pixels."""
-        write_stamp(picture, stamp_ns)
-        return picture
+    def write_stamp(self, prepared: Planes, stamp_ns: int) -> Planes:
+        """Write the stamp into the planes."""
+        write_stamp_i420(prepared, stamp_ns)
+        return prepared
 
-    def encode(self, picture: Picture, *, keyframe: bool) -> bytes:
+    def encode(self, stamped: Planes, *, keyframe: bool) -> bytes:
         """Encode one picture."""
-        return self._encoder.encode(picture, keyframe=keyframe)
+        return self._encoder.encode_planes(stamped, keyframe=keyframe)
+
+    def set_bit_rate(self, bit_rate_bps: int) -> None:
+        """Open the encoder for another bit rate."""
+        self._encoder.set_bit_rate(bit_rate_bps)
 
 
 class VideoReceiver:
-    """Decodes H.264; pictures must be of the `shape` that was configured, (height, width, 3)."""
+    """Decodes H.264; pictures must be of the `shape` that was configured, (height, width)."""
 
-    def __init__(self, decoder: Decoder, shape: tuple[int, int, int]) -> None:
+    def __init__(self, decoder: Decoder, shape: tuple[int, int]) -> None:
         self._decoder = decoder
         self._shape = shape
 
@@ -95,10 +112,18 @@ class VideoReceiver:
 
     def read_stamp(self, received: DecodedPicture) -> int:
         """Read the stamp from the luma."""
-        if received.picture.shape != self._shape:
-            height_px, width_px, _ = received.picture.shape
+        if received.luma.shape != self._shape:
+            height_px, width_px = received.luma.shape
             raise BadPacket(f"a picture of {width_px} x {height_px} pixels, which is not what was configured")
         return read_stamp(received.luma)
+
+
+@value
+class RenderedPicture:
+    """A picture as it was rendered."""
+
+    picture: Picture
+    corrupt: bool = False
 
 
 class HandedOver:
@@ -111,23 +136,30 @@ class HandedOver:
         self._pictures: dict[int, Picture] = {}
         self._key = 0
 
-    def checksum(self, picture: Picture) -> int:
-        """CRC-32 of the pixels around the stamp."""
-        return _pixel_crc(picture)
+    def prepare(self, picture: Picture) -> tuple[Picture, int]:
+        """Take the picture itself: a camera that gives the same buffer again gives it with its stamp.
 
-    def write_stamp(self, picture: Picture, stamp_ns: int) -> Picture:
+        The number is a CRC-32 of the pixels around the stamp.
+        """
+        crc = zlib.crc32(np.ascontiguousarray(picture[STAMP_PX:]).data)
+        return picture, zlib.crc32(np.ascontiguousarray(picture[:STAMP_PX, STAMP_PX:]).data, crc)
+
+    def write_stamp(self, prepared: Picture, stamp_ns: int) -> Picture:
         """Write the stamp into the pixels."""
-        write_stamp(picture, stamp_ns)
-        return picture
+        write_stamp(prepared, stamp_ns)
+        return prepared
 
-    def encode(self, picture: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+    def encode(self, stamped: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
         """Keep a copy of the picture, as a camera may use its buffer again, and give its key."""
         self._key += 1
-        self._pictures[self._key] = picture.copy()
+        self._pictures[self._key] = stamped.copy()
         self._pictures.pop(self._key - KEPT_PICTURES, None)
         return _STANDS_ALONE + str(self._key).encode()
 
-    def decode(self, access_unit: bytes) -> DecodedPicture | None:
+    def set_bit_rate(self, bit_rate_bps: int) -> None:
+        """There is none."""
+
+    def decode(self, access_unit: bytes) -> RenderedPicture | None:
         """Give the picture of a key."""
         text = access_unit.removeprefix(_STANDS_ALONE)
         key = int(text) if text.isdigit() else 0
@@ -135,11 +167,11 @@ class HandedOver:
         if picture is None:
             return None
         self._pictures = {each: kept for each, kept in self._pictures.items() if each > key}
-        return DecodedPicture(picture[:, :, 1], picture, corrupt=False)
+        return RenderedPicture(picture)
 
-    def read_stamp(self, received: DecodedPicture) -> int:
+    def read_stamp(self, received: RenderedPicture) -> int:
         """Read the stamp: black and white are so in each colour, green is as good as luma."""
-        return read_stamp(received.luma)
+        return read_stamp(received.picture[:, :, 1])
 
 
 @value
@@ -147,22 +179,26 @@ class ReceivedLane:
     """A lane that came in the place of a picture."""
 
     picture: SeenLane
+    corrupt: bool = False
 
 
 class LaneSender:
     """Puts the lane itself into the access unit, with its stamp and time: no pixels."""
 
-    def checksum(self, picture: SeenLane) -> int:
-        """Give when the picture was taken: two of a car that stands differ by their noise, these by their time."""
-        return picture.at_ns & 0xFFFFFFFF
+    def prepare(self, picture: SeenLane) -> tuple[SeenLane, int]:
+        """Take its time for the number: the noise of two differs, even where the car stands; these differ by time."""
+        return picture, picture.at_ns & 0xFFFFFFFF
 
-    def write_stamp(self, picture: SeenLane, stamp_ns: int) -> SeenLane:
+    def write_stamp(self, prepared: SeenLane, stamp_ns: int) -> SeenLane:
         """Give the same with the stamp."""
-        return SeenLane(stamp_ns, picture.at_ns, picture.lane)
+        return SeenLane(stamp_ns, prepared.at_ns, prepared.lane)
 
-    def encode(self, picture: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
+    def encode(self, stamped: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
         """Write it in hexadecimal digits."""
-        return _STANDS_ALONE + _packed(picture).hex().encode()
+        return _STANDS_ALONE + _packed(stamped).hex().encode()
+
+    def set_bit_rate(self, bit_rate_bps: int) -> None:
+        """There is none."""
 
 
 class LaneReceiver:
@@ -185,8 +221,3 @@ class LaneReceiver:
 def _packed(seen: SeenLane) -> bytes:
     lane = seen.lane
     return _LANE.pack(seen.stamp_ns, seen.at_ns, *lane.centre, lane.width_m, lane.near_m, lane.far_m, lane.confidence)
-
-
-def _pixel_crc(picture: Picture) -> int:
-    crc = zlib.crc32(np.ascontiguousarray(picture[STAMP_PX:]).data)
-    return zlib.crc32(np.ascontiguousarray(picture[:STAMP_PX, STAMP_PX:]).data, crc)
