@@ -17,9 +17,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from video.clean import SIZES, clean_part
-from video.gstreamer import gstreamer
-from video.pictures import render_loop
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a program it finds only what is beside it
+
+from benchmarks.video.clean import SIZES, clean_part
+from benchmarks.video.gstreamer import gstreamer
+from benchmarks.video.pictures import render_loop
 
 from lavt.errors import LavtError, UserError
 

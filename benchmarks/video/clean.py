@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from video.run import Run
-from video.sides import Outcome, Side, floor_ms, frames_of, measure
+from benchmarks.video.run import Run
+from benchmarks.video.sides import Outcome, Side, floor_ms, frames_of, measure
 
 FLOOR_S = 6.0
 USUAL_JITTER_MS = 200

@@ -9,10 +9,10 @@ import numpy as np
 from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
+from benchmarks.video.pictures import picture_of, planes_loop
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, asked_run, freeze, tell, wall_ns
 
 from lavt.transport.stamp import write_stamp_i420
-from video.pictures import picture_of, planes_loop
-from video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, asked_run, freeze, tell, wall_ns
 
 
 def main() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
+
 from lavt.errors import UserError
-from video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 DEBIANS_PACKAGES = "/usr/lib/python3/dist-packages"
 NEEDED = (

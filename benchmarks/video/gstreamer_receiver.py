@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.video.gstreamer import gstreamer, receiving
+from benchmarks.video.run import Run, asked_run, freeze, tell, wait_for_line, wall_ns
+from benchmarks.video.watch import Watch
 
 from lavt.transport.stamp import read_stamp
-from video.gstreamer import gstreamer, receiving
-from video.run import Run, asked_run, freeze, tell, wait_for_line, wall_ns
-from video.watch import Watch
 
 
 def main() -> None:
@@ -25,11 +25,16 @@ def main() -> None:
     ended = threading.Event()
     freeze()
     tell({"port": pipeline.get_by_name("socket").get_property("port")})
-    threading.Thread(target=lambda: (wait_for_line(), ended.set()), daemon=True).start()
+    threading.Thread(target=_wait_for_end, args=(ended,), daemon=True).start()
     _receive(gst, run, pipeline.get_by_name("pictures"), watch, ended)
     pipeline.set_state(gst.State.NULL)
     watch.save(Path(run.folder) / "read.npz")
     tell({"counts": {}})
+
+
+def _wait_for_end(ended: threading.Event) -> None:
+    wait_for_line()
+    ended.set()
 
 
 def _receive(gst: Any, run: Run, pictures: Any, watch: Watch, ended: threading.Event) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from benchmarks.video.gstreamer import gstreamer, sending
+from benchmarks.video.pictures import picture_of, planes_loop
+from benchmarks.video.run import Pace, Run, asked_run, cpu_ns, freeze, save_units, tell, wait_for_line, wall_ns
 from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_S
 from lavt.transport.stamp import write_stamp_i420
-from video.gstreamer import gstreamer, sending
-from video.pictures import picture_of, planes_loop
-from video.run import Pace, Run, asked_run, cpu_ns, freeze, save_units, tell, wait_for_line, wall_ns
 
 
 def main() -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from benchmarks.video.product import LOOPBACK, Ends, WatchedPictures, receiver_nodes
+from benchmarks.video.run import TOKEN, asked_run, tell, wait_for_line
+from benchmarks.video.watch import Watch
+
 from lavt.domain import Now
 from lavt.nodes.reports import PathToken
-from video.product import LOOPBACK, Ends, WatchedPictures, receiver_nodes
-from video.run import TOKEN, asked_run, tell, wait_for_line
-from video.watch import Watch
 
 
 class ReadPictures:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+from benchmarks.video.product import Ends, sender_nodes
+from benchmarks.video.run import TOKEN, Run, Table, asked_run, cpu_ns, save_units, tell, wait_for_line
+
 from lavt.domain import Now
-from video.product import Ends, sender_nodes
-from video.run import TOKEN, Run, Table, asked_run, cpu_ns, save_units, tell, wait_for_line
 
 
 class SentFrames:

@@ -1,4 +1,4 @@
-"""The pictures that both sides send: the simulator's, a loop without a seam, in files that processes map into memory."""
+"""The pictures that both sides send: a loop of the simulator's without a seam, in files mapped into memory."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def squared_error(luma: NDArray[np.uint8], filmed: Planes) -> float:
     height_px, width_px = luma.shape
     below = cv2.norm(luma[STAMP_PX:], filmed[STAMP_PX:height_px], cv2.NORM_L2SQR)
     beside = cv2.norm(luma[:STAMP_PX, STAMP_PX:], filmed[:STAMP_PX, STAMP_PX:], cv2.NORM_L2SQR)
-    return float(below + beside) / (height_px * width_px - STAMP_PX**2)
+    return (float(below) + float(beside)) / (height_px * width_px - STAMP_PX**2)
 
 
 def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:

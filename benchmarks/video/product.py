@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
+from benchmarks.video.pictures import LOOP_FRAMES, colour_loop
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
+
 from lavt.build.entropy import MachineEntropy
 from lavt.build.fidelity import VIDEO
 from lavt.build.sides import build_client, build_server
@@ -20,8 +23,6 @@ from lavt.runtime.realtime import RealRuntime
 from lavt.transport.pictures import PictureReceiver
 from lavt.transport.udp_link import UdpLink
 from lavt.vehicle.camera import CapturedFrame
-from video.pictures import LOOP_FRAMES, colour_loop
-from video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 LOOPBACK = "127.0.0.1"
 

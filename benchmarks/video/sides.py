@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from benchmarks.video.run import RATE_HZ, Run, new_table, told
 from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_MS
 from lavt.errors import WorkError
-from video.run import RATE_HZ, Run, new_table, told
 
 Side = Literal["ours", "gstreamer"]
 
@@ -27,7 +27,7 @@ LONGEST_WAIT_S = 60.0
 """Beyond the run itself."""
 DRAIN_S = 0.5
 """What is on its way at the end has so long to arrive."""
-FOLDER = Path(__file__).parents[1]
+FOLDER = Path(__file__).parents[2]
 
 
 class Process:
@@ -37,7 +37,7 @@ class Process:
         paths = os.pathsep.join([str(FOLDER), *sys.path[1:]])
         self._name = name
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"video.{name}", told(run), *more],
+            [sys.executable, "-m", f"benchmarks.video.{name}", told(run), *more],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths},
         )  # fmt: skip
 

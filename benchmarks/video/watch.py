@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from benchmarks.video.pictures import picture_of, planes_loop, squared_error
+from benchmarks.video.run import Run, cpu_ns
 from numpy.typing import NDArray
-
-from video.pictures import picture_of, planes_loop, squared_error
-from video.run import Run, cpu_ns
 
 
 class Watch:
