@@ -50,7 +50,8 @@ def squared_error(luma: NDArray[np.uint8], filmed: Planes) -> float:
     height_px, width_px = luma.shape
     below = cv2.norm(luma[STAMP_PX:], filmed[STAMP_PX:height_px], cv2.NORM_L2SQR)
     beside = cv2.norm(luma[:STAMP_PX, STAMP_PX:], filmed[:STAMP_PX, STAMP_PX:], cv2.NORM_L2SQR)
-    return (float(below) + float(beside)) / (height_px * width_px - STAMP_PX**2)
+    error: float = (below + beside) / (height_px * width_px - STAMP_PX**2)
+    return error
 
 
 def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:
