@@ -177,12 +177,13 @@ def test_jitter_by_hand() -> None:
     """Jitter moves by a sixteenth of each change of transit, over all packets, also those of one frame."""
     stream = Stream()
     stream.arrive(1, 0, timestamp=0)
-    stream.arrive(2, NS_PER_MS, timestamp=0)  # 90 ticks later in one frame
-    stream.arrive(3, 34 * NS_PER_MS + 333_334, timestamp=3000)  # 33.33 ms and a frame later: on time again, at 3090
+    stream.arrive(2, 1_100_000, timestamp=0)  # 99 ticks later in the same frame
+    stream.arrive(3, 34_433_334, timestamp=3000)  # a frame later than that, to the tick
     report = stream.reception.report(0)
     assert report is not None
-    assert report.jitter == int(90 / 16 * 15 / 16) == 5
-    assert stream.reception.sample(NS_PER_S).jitter_us == round(90 / 16 * 15 / 16 * 1e6 / 90_000) == 59
+    ticks = 99 / 16 * 15 / 16
+    assert report.jitter == 5 == int(ticks)
+    assert stream.reception.sample(NS_PER_S).jitter_us == 64 == round(ticks * 1e6 / 90_000)
 
 
 @given(

@@ -54,7 +54,13 @@ ANSWERS = st.builds(ReferenceAnswer, WORD, WORD, DELAY_NS)
 REPORT = ReceptionReport(2, 3, 0.25, 5, 6, 0xB44DB705, 5 * NS_PER_S + 250 * NS_PER_MS)
 SOME_REPORT = receiver_report(1, REPORT, clock_ns=NS_PER_S // 2, cname="ab")
 SOME_SENDER_REPORT = sender_report(
-    9, wall_ns=0, rtp_timestamp=7, packets=8, octets=2**32 + 9, cname="a", answers=[ReferenceAnswer(1, 0x8000, 2**20)]
+    9,
+    wall_ns=0,
+    rtp_timestamp=7,
+    packets=2**32 + 8,
+    octets=2**32 + 9,
+    cname="a",
+    answers=[ReferenceAnswer(1, 0x8000, 2**20)],
 )
 
 # By hand, from the figures of the RFCs.
@@ -111,6 +117,12 @@ def test_max_bit_rate_as_in_the_rfc(bit_rate_bps: int, exponent: int, mantissa: 
     assert datagram == bytes.fromhex(EMPTY_REPORT + DESCRIPTION + LIMIT) + word.to_bytes(4, "big")
     limit = BitRateLimit(2, mantissa * 2**exponent, 40)
     assert parse_feedback(datagram) == Feedback(limits=(limit,))
+
+
+def test_overhead_beyond_its_field() -> None:
+    """An overhead above 511 bytes is said to be 511, and the bit rate stays as it is."""
+    (limit,) = parse_feedback(max_bit_rate(1, 2, 1000, overhead_bytes=600)).limits
+    assert limit == BitRateLimit(2, 1000, 511)
 
 
 @given(WORD, WORD, st.integers(0, 2**80), st.integers(0, 511))

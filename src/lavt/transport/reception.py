@@ -85,7 +85,7 @@ class Reception:
         return ReceptionReport(
             self._ssrc,
             self._reorder.highest_sequence,
-            lost_since / expected_since if lost_since > 0 and expected_since > 0 else 0.0,
+            lost_since / expected_since if lost_since > 0 else 0.0,
             lost - self._lost_before_stream,
             int(self._jitter),
             last,
