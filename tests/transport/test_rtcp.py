@@ -60,7 +60,7 @@ SOME_SENDER_REPORT = sender_report(
     packets=2**32 + 8,
     octets=2**32 + 9,
     cname="a",
-    answers=[ReferenceAnswer(1, 0x8000, 2**20)],
+    answered=[ReferenceAnswer(1, 0x8000, 2**20)],
 )
 
 # By hand, from the figures of the RFCs.
@@ -151,7 +151,7 @@ def test_sender_report_round_trip(
     """A sender report that is written is read back as it was, with its answers."""
     timestamp, packets, octets = counts
     datagram = sender_report(
-        ssrc, wall_ns=wall_ns, rtp_timestamp=timestamp, packets=packets, octets=octets, cname=cname, answers=answers
+        ssrc, wall_ns=wall_ns, rtp_timestamp=timestamp, packets=packets, octets=octets, cname=cname, answered=answers
     )
     assert is_rtcp(datagram)
     report = SenderReport(ssrc, ntp_of_wall(wall_ns), timestamp, packets, octets)

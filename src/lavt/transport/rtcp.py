@@ -132,9 +132,9 @@ def sender_report(
     packets: int,
     octets: int,
     cname: str,
-    answers: Sequence[ReferenceAnswer] = (),
+    answered: Sequence[ReferenceAnswer] = (),
 ) -> bytes:
-    """Write a sender report, with the answers to the reference times that receivers have sent.
+    """Write a sender report, with the reference times of receivers that it answers.
 
     `rtp_timestamp` is that of the moment `wall_ns` (ns since 1970). Counts wrap at 2^32.
     """
@@ -142,8 +142,8 @@ def sender_report(
         ssrc, ntp_of_wall(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32
     )  # fmt: skip
     datagram = _packet(_SENDER_REPORT, 0, information) + _description(ssrc, cname)
-    if answers:
-        datagram += _packet(_EXTENDED_REPORT, 0, write_answers(ssrc, answers))
+    if answered:
+        datagram += _packet(_EXTENDED_REPORT, 0, write_answers(ssrc, answered))
     return datagram
 
 
