@@ -91,9 +91,8 @@ def impaired_part(folder: Path, case: Case, *, frames: int) -> dict[str, float]:
     law = f"loss {case.loss:.0%}" if case.loss else f"U(0, {case.jitter_ms:g}) ms, reordering"
     bursts = f", bursts of {case.burst_packets:g} packets" if case.burst_packets else ""
     print(f"\n## {case.name}: {size.name}, 20 ms each way, {law}{bursts}, {frames} frames\n")
-    print(
-        "| run | median ms | p95 ms | shown | undamaged | overhead | lost | link late by, p99 ms |\n|---|---|---|---|---|---|---|---|"
-    )
+    print("| run | median ms | p95 ms | shown | undamaged | overhead | lost | link late by, p99 ms |")
+    print("|---|---|---|---|---|---|---|---|")
     ours = _judged("ours", run, case)
     _print_row("ours", ours)
     theirs = []
