@@ -74,24 +74,20 @@ def grown_ms(latency_ms: NDArray[np.float64]) -> tuple[float, float]:
 
 
 class Sampler:
-    """Looks at both processes of a run, from a thread of its own, until they end."""
+    """Looks at both processes of a run, from a thread of its own, for as long as the run lasts."""
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float) -> None:
         self.samples: dict[str, list[Sample]] = {}
-        self._ended = threading.Event()
+        self._looks = max(2, int(seconds / SAMPLE_S))
+        self._pause = threading.Event()
 
     def watch(self, processes: Sequence[Process]) -> None:
         """Begin to look."""
         threading.Thread(target=self._look, args=(list(processes),), daemon=True).start()
 
-    def end(self) -> None:
-        """Look no more."""
-        self._ended.set()
-
     def _look(self, processes: list[Process]) -> None:
-        number = 0
-        while not self._ended.wait(SAMPLE_S):
-            number += 1
+        for number in range(self._looks):
+            self._pause.wait(SAMPLE_S)
             for each in processes:
                 self.samples.setdefault(each.name, []).append(sample(each.process_id, number * SAMPLE_S))
 
@@ -118,12 +114,11 @@ def main() -> int:
     asked = parser.parse_args()
     if not 0 < asked.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
-    sampler = Sampler()
+    sampler = Sampler(asked.minutes * 60)  # the run has a warm-up besides
     with tempfile.TemporaryDirectory() as name:
         run = clean_run(Path(name), SIZES[0], asked.minutes * 60)
         render_loop(run.loop, run.width_px, run.height_px)
         outcome = measure("ours", run, when_started=sampler.watch)
-        sampler.end()
     print("| process | memory MB, begin | end | kB a minute | threads, begin | end |\n|---|---|---|---|---|---|")
     for name, samples in sampler.samples.items():
         kept = later(samples)
@@ -138,7 +133,7 @@ def main() -> int:
     )
     print(f"Frames shown: {len(outcome.latency_ms)} of {outcome.sent}.")
     found = verdicts(sampler.samples, outcome)
-    print("; ".join(found).capitalize() + "." if found else "Nothing grew.")
+    print(f"Something grew: {'; '.join(found)}." if found else "Nothing grew.")
     return 1 if found else 0
 
 
