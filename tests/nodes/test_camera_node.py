@@ -11,7 +11,7 @@ from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
 from lavt.transport.h264 import Encoder
 from lavt.transport.pictures import VideoSender
-from lavt.transport.rtcp import picture_loss, receiver_report
+from lavt.transport.rtcp import ReceptionReport, picture_loss, receiver_report
 from lavt.transport.rtp import Packetizer, parse_packet
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathClient, PathServer
@@ -19,7 +19,7 @@ from lavt.transport.video_path import PathClient, PathServer
 FRAME_NS = NS_PER_S // 30
 TOKEN = bytes(range(16))
 HOME, ELSEWHERE = ("198.51.100.2", 4000), ("203.0.113.9", 4000)
-REPORT = receiver_report(1, 2, highest_sequence=1, lost_fraction=0.0, cumulative_lost=0, jitter=0)
+REPORT = receiver_report(1, ReceptionReport(2, 1, 0.0, 0, 0), clock_ns=0)
 PLEASE = picture_loss(1, 2)
 
 

@@ -15,6 +15,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, Decision, Lan
 from lavt.node import WAKE, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
+from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.reports import PathToken, PictureRead, ReceivedUnit, View
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
 from lavt.transport.channels import CHANNELS
@@ -60,7 +61,7 @@ class Bench:
         self.detector = SeesALane()
         self.session = ClientSession("alice", 1, rearm=False, start_ns=MONO_NS)
         self.node = DriverNode(
-            VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px)),
+            PictureReader(VideoReceiver(Decoder(), (SMALL.height_px, SMALL.width_px))),
             detector or self.detector,
             GoesStraight(),
             self.session,

@@ -219,3 +219,30 @@ def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
     buffer.push(packet(0, ssrc=9), now_ns)
     buffer.expire(now_ns + HOLD_NS)
     assert numbers(buffer.push(packet(1, ssrc=9), now_ns + HOLD_NS)) == [1]
+
+
+def test_recovered() -> None:
+    """A packet made again closes its gap like one that came, and counts as recovered only."""
+    buffer = started()
+    assert buffer.push(packet(2), STARTED_NS) == []
+    ordered = buffer.push_recovered(packet(1), STARTED_NS + 1)
+    assert (numbers(ordered), gaps(ordered)) == ([1, 2], [])
+    assert numbers(buffer.push_recovered(packet(3), STARTED_NS + 2)) == [3]
+    assert buffer.highest_sequence == 3
+    assert (buffer.recovered, buffer.reordered, buffer.lost, buffer.late, buffer.duplicate) == (2, 0, 0, 0, 0)
+    assert buffer.push(packet(1), STARTED_NS + 3) == []
+    assert buffer.duplicate == 1
+
+
+def test_recovered_that_nobody_waits_for() -> None:
+    """A packet made again changes nothing when it is there, was given up, is far away or is of another stream."""
+    buffer = started()
+    assert buffer.push(packet(2), STARTED_NS) == []
+    assert buffer.push_recovered(packet(2), STARTED_NS) == []
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
+    for one in (packet(1), packet(2), packet(3, ssrc=8), packet(3 + MAX_JUMP)):
+        assert buffer.push_recovered(one, STARTED_NS + HOLD_NS) == []
+    counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
+    assert counts == (0, 1, 0, 0, 0)
+    assert numbers(buffer.push(packet(3), STARTED_NS + HOLD_NS)) == [3]
+    assert ReorderBuffer().push_recovered(packet(0), 0) == []

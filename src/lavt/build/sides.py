@@ -25,6 +25,7 @@ from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
@@ -171,7 +172,7 @@ def build_client(
     return ClientNodes(
         ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
         DriverNode(
-            pictures,
+            PictureReader(pictures),
             detector,
             drive_controller,
             session,

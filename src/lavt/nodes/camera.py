@@ -162,9 +162,8 @@ class CameraNode:
             stamped.frame.number, encoded.stamp_ns, stamped.stamped_mono_ns, stamped.frame.capture_ns,
             stamped.pixel_crc, len(unit),
         )  # fmt: skip
-        sends = [Send("frame", frame)]
-        sends += [Send("rtp", packet, address) for address in addresses for packet in packets]
-        return [*sends, Send("video", VideoUnit(encoded.stamp_ns, unit))]
+        sends = [Send("rtp", packet, address) for address in addresses for packet in packets]
+        return [*sends, Send("frame", frame), Send("video", VideoUnit(encoded.stamp_ns, unit))]
 
     def _note_pose(self, message: Message, _now: Now) -> None:
         self._poses.append(message.payload)

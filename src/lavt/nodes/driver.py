@@ -1,4 +1,4 @@
-"""Steps 7 to 10 of the life of a frame: picture, stamp, lane, command."""
+"""Steps 7 to 10 of the life of a frame: picture and stamp (`picture_reader`), lane, command."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from lavt.control.drive_controller import DriveController
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.control.limits import ClientLimits
 from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
-from lavt.errors import BadMessage, BadPacket
+from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.reports import LaneSeen, PathToken, PictureRead, ReceivedUnit, VideoUnit, View
+from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.reports import LaneSeen, PathToken, View
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
-from lavt.transport.pictures import PictureReceiver, Received
-from lavt.transport.stamp import stamp_agrees
 from lavt.value import value
 
 
@@ -31,24 +30,6 @@ class Detector(Protocol):
     def detect(self, picture: Sight, /) -> Lane:
         """Give the lane in the next picture."""
         ...
-
-
-@value
-class Decoded:
-    """A received access unit and the picture that came of it."""
-
-    unit: ReceivedUnit
-    picture: Received | None
-    decoded_mono_ns: int
-
-
-@value
-class StampRead:
-    """A decoded picture with its stamp; 0 where it could not be read."""
-
-    decoded: Decoded
-    stamp_ns: int
-    reason: str
 
 
 @value
@@ -71,20 +52,19 @@ class DriverNode:
 
     def __init__(
         self,
-        pictures: PictureReceiver,
+        reader: PictureReader,
         detector: Detector,
         controller: DriveController,
         session: ClientSession,
         limits: ClientLimits,
     ) -> None:
-        self.counts: Counter[str] = Counter()
         self.session = session
-        self._pictures = pictures
+        self._counts: Counter[str] = Counter()
+        self._reader = reader
         self._detector = detector
         self._controller = controller
         self._watch = LaneWatch()
         self._limits = limits
-        self._in_doubt = True
         self._sequence = 0
         self._view: View | None = None
         self._view_ns = 0
@@ -95,7 +75,7 @@ class DriverNode:
         self._state_ns = 0
         self._command_ns: int | None = None
         self.chains: Mapping[str, Sequence[Hop]] = {
-            "access_unit": (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show)),
+            "access_unit": reader.hops,
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),
             "session_reply": (("note", self._note_reply),),
@@ -104,55 +84,17 @@ class DriverNode:
             WAKE: (("command", self._wake),),
         }
 
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was counted here and of the pictures."""
+        return {**self._reader.counts, **self._counts}
+
     def next_wake_ns(self) -> int | None:
         """When the next command or session query is due."""
         asks_ns = self.session.next_wake_ns()
         if asks_ns is None or self._command_ns is None:
             return asks_ns if self._command_ns is None else self._command_ns
         return min(asks_ns, self._command_ns)
-
-    # A picture comes.
-
-    def _decode(self, message: Message, now: Now) -> Decoded:
-        unit: ReceivedUnit = message.payload
-        self._in_doubt = not unit.complete or (self._in_doubt and not unit.keyframe)
-        return Decoded(unit, self._pictures.decode(unit.data), now.mono_ns)
-
-    def _read_stamp(self, decoded: Decoded, now: Now) -> StampRead:
-        decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
-        if decoded.picture is None:
-            return StampRead(decoded, 0, "no picture")
-        try:
-            stamp_ns = self._pictures.read_stamp(decoded.picture)
-        except BadPacket as error:
-            return StampRead(decoded, 0, str(error))
-        if not stamp_agrees(stamp_ns, decoded.unit.rtp_timestamp):
-            return StampRead(decoded, 0, "stamp and RTP timestamp disagree")
-        return StampRead(decoded, stamp_ns, "")
-
-    def _show(self, read: StampRead, now: Now) -> list[Send]:
-        decoded, unit = read.decoded, read.decoded.unit
-        readable = read.reason == ""
-        self.counts["frames_decoded"] += decoded.picture is not None
-        self.counts["frames_unreadable"] += not readable
-        picture = PictureRead(
-            read.stamp_ns if readable else None,
-            readable,
-            read.reason,
-            self._in_doubt,
-            decoded.picture is not None,
-            unit.rtp_timestamp,
-            unit.packet_mono_ns,
-            decoded.decoded_mono_ns,
-            now.mono_ns,
-            now.wall_ns,
-        )
-        sends = [Send("video", VideoUnit(read.stamp_ns, unit.data)), Send("picture", picture)]
-        if decoded.picture is None:
-            sends.append(Send("picture_lost", None))
-        elif readable:
-            sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture)))
-        return sends
 
     # A picture is looked at.
 
@@ -233,7 +175,7 @@ class DriverNode:
         try:
             state = decode(State, message.payload)
         except BadMessage:
-            self.counts["states_unreadable"] += 1
+            self._counts["states_unreadable"] += 1
             return
         self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
         self.session.note_state(state, now.mono_ns)
@@ -245,7 +187,7 @@ class DriverNode:
         try:
             reply = decode(SessionReply, message.payload)
         except BadMessage:
-            self.counts["session_replies_unreadable"] += 1
+            self._counts["session_replies_unreadable"] += 1
             return []
         self.session.note_reply(reply, now.mono_ns)
         return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted and reply.token else []

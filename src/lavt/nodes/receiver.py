@@ -10,7 +10,7 @@ from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.reports import PathToken, ReceivedUnit
 from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import picture_loss, receiver_report
+from lavt.transport.rtcp import ReceptionReport, picture_loss, receiver_report
 from lavt.transport.rtp import Depacketizer, RtpPacket, parse_packet
 from lavt.transport.video_path import PathClient, is_path_datagram
 
@@ -94,7 +94,7 @@ class ReceiverNode:
         if self._path is not None and now.mono_ns >= self._path.next_hello_ns():
             sends.append(self._feedback(self._path.hello(now.mono_ns)))
         if self._media_ssrc is not None and now.mono_ns >= self._report_ns:
-            sends.append(self._report(self._media_ssrc))
+            sends.append(self._report(self._media_ssrc, now.mono_ns))
             self._report_ns = now.mono_ns + REPORT_PERIOD_NS
         return self._reorder.expire(now.mono_ns), message.arrived, sends
 
@@ -118,22 +118,16 @@ class ReceiverNode:
         self._counts["picture_loss_requests"] += 1
         return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
 
-    def _report(self, media_ssrc: int) -> Send:
+    def _report(self, media_ssrc: int, now_ns: int) -> Send:
         lost_in_all = self._reorder.lost - self._reorder.late
         lost = max(0, lost_in_all - self._lost_at_report)
         expected = self._packets_since_report + lost
         fraction = lost / expected if expected else 0.0
         self._packets_since_report, self._lost_at_report = 0, lost_in_all
-        return self._feedback(
-            receiver_report(
-                SSRC,
-                media_ssrc,
-                highest_sequence=self._reorder.highest_sequence,
-                lost_fraction=fraction,
-                cumulative_lost=lost_in_all,
-                jitter=round(self._jitter),
-            )
-        )
+        report = ReceptionReport(
+            media_ssrc, self._reorder.highest_sequence, fraction, lost_in_all, round(self._jitter)
+        )  # fmt: skip
+        return self._feedback(receiver_report(SSRC, report, clock_ns=now_ns))
 
     def _note_transit(self, arrived_ns: int, timestamp: int) -> None:
         """Keep the interarrival jitter, in units of the RTP clock (RFC 3550, section 6.4.1)."""

@@ -122,43 +122,82 @@ class RealRuntime:
 
 
 class _Worker:
-    """A node's thread: wakes it when it asked, hands it what waits, sleeps in between."""
+    """A node's thread: wakes it when it asked, hands it what waits, sleeps in between.
+
+    What is to be walked at once is walked by whoever brings it, unless the node is busy: no thread has to wake up for
+    it. Who walks has the turn.
+    """
 
     def __init__(self, runtime: RealRuntime, node: Node) -> None:
         self.node = node
         self.inbox = Inbox()
         self.thread = threading.Thread(target=self._work, name=node.name, daemon=True)
         self._runtime = runtime
+        self._turn = threading.Lock()
+        self._wake_ns: int | None = 0
+        """When the node wants to be woken, as it said when it was walked last; written by who has the turn."""
         self._condition = threading.Condition()
+        self._sleeps_until_ns: int | None = 0
+        """When the thread wakes by itself; None: only when it is told to; 0: it is awake."""
 
     def put(self, message: Message) -> None:
         with self._condition:
             self.inbox.put(message)
-            self._condition.notify()
+        if CHANNELS[message.channel].at_once and self._turn.acquire(blocking=False):
+            try:
+                while self._walk_next():
+                    pass
+            finally:
+                self._turn.release()
+        with self._condition:
+            if self.inbox.waiting or _is_before(self._wake_ns, self._sleeps_until_ns):
+                self._condition.notify()
 
     def notify(self) -> None:
         with self._condition:
             self._condition.notify()
 
     def _work(self) -> None:
+        while not self._runtime.stopped.is_set():
+            with self._turn:
+                walked = self._walk_next()
+            if not walked:
+                self._sleep()
+
+    def _walk_next(self) -> bool:
+        """Walk what comes next through the node; False where nothing does. Needs the turn."""
         try:
-            while not self._runtime.stopped.is_set():
-                message = self._next()
-                if message is not None:
-                    self._runtime.run_chain(self.node, message)
-        except BaseException as error:  # whatever ends a node's thread must end the run, not leave half of it alive
+            message = None if self._runtime.stopped.is_set() else self._next()
+            if message is not None:
+                self._runtime.run_chain(self.node, message)
+                self._wake_ns = self.node.next_wake_ns()
+        except BaseException as error:  # whatever ends a node must end the run, not leave half of it alive
             self._runtime.fail(error)
+            return False
+        return message is not None
 
     def _next(self) -> Message | None:
-        """What the node does next: a wake that is due comes first, then what waits; else sleep until either."""
-        now = self._runtime.now()
-        wake_ns = self.node.next_wake_ns()
-        if wake_ns is not None and wake_ns <= now.mono_ns:
-            return Message(WAKE, None, now)
+        """What the node does next: a wake that is due comes first, then what waits."""
+        self._wake_ns = self.node.next_wake_ns()
+        if self._wake_ns is not None:
+            now = self._runtime.now()
+            if self._wake_ns <= now.mono_ns:
+                return Message(WAKE, None, now)
         with self._condition:
-            message = self.inbox.take()
-            if message is None:
-                pause_s = None if wake_ns is None else (wake_ns - now.mono_ns) / NS_PER_S
-                if not self._runtime.stopped.is_set():
-                    self._condition.wait(pause_s)
-            return message
+            return self.inbox.take()
+
+    def _sleep(self) -> None:
+        """Sleep until the node wants to be woken, or somebody says that there is something to do."""
+        with self._condition:
+            if self.inbox.waiting or self._runtime.stopped.is_set():
+                return
+            self._sleeps_until_ns = wake_ns = self._wake_ns
+            pause_s = None if wake_ns is None else (wake_ns - self._runtime.now().mono_ns) / NS_PER_S
+            if pause_s is None or pause_s > 0:
+                self._condition.wait(pause_s)
+            self._sleeps_until_ns = 0
+
+
+def _is_before(one_ns: int | None, other_ns: int | None) -> bool:
+    """Compare two times, of which None is never."""
+    return one_ns is not None and (other_ns is None or one_ns < other_ns)

@@ -31,6 +31,8 @@ class Channel:
     waiting: Waiting = "queue"
     length: int = QUEUE_LENGTH
     """How many may wait in the queue."""
+    at_once: bool = False
+    """In real time the thread that brings it walks it through its receiver: for short chains that come often."""
 
 
 CHANNELS: dict[str, Channel] = {
@@ -47,7 +49,7 @@ CHANNELS: dict[str, Channel] = {
     "path_token": Channel("local", "driver", ("receiver",)),
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # across the network
-    "rtp": Channel("video", "camera", ("receiver",)),  # RTP, sender reports, challenges: server to client
+    "rtp": Channel("video", "camera", ("receiver",), at_once=True),  # RTP, sender reports, challenges: server to client
     "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
     "control": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
     "state": Channel("zenoh", "actuator", ("driver",), "newest"),

@@ -75,15 +75,18 @@ class PictureReceiver(Protocol):
 
 
 class VideoSender:
-    """Converts pictures to I420 in a buffer that is used again, stamps them there, and encodes them as H.264."""
+    """Converts pictures to I420 in a buffer that is used again, stamps them there, and encodes them as H.264.
+
+    Those of a camera that gives I420 itself are stamped and encoded where they are.
+    """
 
     def __init__(self, encoder: Encoder) -> None:
         self._encoder = encoder
 
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
-        """Convert the picture; the number is a CRC-32 of its luma."""
-        planes = self._encoder.to_planes(picture)
-        return planes, zlib.crc32(planes[: picture.shape[0]].data)
+        """Convert the picture where it is not in I420 already; the number is a CRC-32 of its luma below the stamp."""
+        planes = picture if picture.ndim == 2 else self._encoder.to_planes(picture)
+        return planes, zlib.crc32(planes[STAMP_PX : planes.shape[0] * 2 // 3].data)
 
     def write_stamp(self, prepared: Planes, stamp_ns: int) -> Planes:
         """Write the stamp into the planes."""

@@ -28,7 +28,7 @@ class ReorderBuffer:
 
     Repair packets have another SSRC and must not come in here. Public counters, in packets: `late` came after they had
     been given up, `duplicate` came twice, `lost` were given up (late ones included), `reordered` came late but in
-    time, `stray` were far from all others and alone.
+    time, `stray` were far from all others and alone, `recovered` did not come in time but were made again in time.
     """
 
     def __init__(self, hold_ns: int = HOLD_NS) -> None:
@@ -37,6 +37,7 @@ class ReorderBuffer:
         self.lost = 0
         self.reordered = 0
         self.stray = 0
+        self.recovered = 0
         self._hold_ns = hold_ns
         self._stray: RtpPacket | None = None
         self._after_loss = False
@@ -67,6 +68,16 @@ class ReorderBuffer:
         self._stray = None
         self._insert(packet, number, now_ns)
         return released + self._drain() + self.expire(now_ns)
+
+    def push_recovered(self, packet: RtpPacket, now_ns: int) -> Ordered:
+        """Take a packet that was made again; one that is not missing, or no longer waited for, changes nothing."""
+        number = self._extend(packet.sequence)
+        waited_for = number not in self._held and (self._next is None or number >= self._next)
+        if packet.ssrc != self._ssrc or abs(number - self._highest) > MAX_JUMP or not waited_for:
+            return []
+        self.recovered += 1
+        self._hold(packet, number, now_ns)
+        return self._drain() + self.expire(now_ns)
 
     def expire(self, now_ns: int) -> Ordered:
         """Give up the gaps whose hold is over at `now_ns`; return the packets that are in order now."""
@@ -114,8 +125,12 @@ class ReorderBuffer:
                 self.duplicate += 1
         else:
             self.reordered += number < self._highest
-            self._highest = max(self._highest, number)
-            self._held[number] = packet, now_ns
+            self._hold(packet, number, now_ns)
+
+    def _hold(self, packet: RtpPacket, number: int, now_ns: int) -> None:
+        """Keep a packet that is waited for."""
+        self._highest = max(self._highest, number)
+        self._held[number] = packet, now_ns
 
     def _drain(self) -> Ordered:
         """Let go the packets that are next, up to the first gap."""

@@ -1,32 +1,79 @@
-"""What a receiver of video tells its sender: receiver reports (RFC 3550) and picture-loss indications (RFC 4585).
+"""RTCP: what the sender and the receiver of a video tell each other beside it.
 
-RTCP shares the port with RTP; which of the two a datagram is shows in its second byte (RFC 5761).
+Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
+receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
+time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the highest bit rate that the
+receiver wants (RFC 5104, section 4.2.1). So both know the round trip without a clock in common.
+
+Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
+with RTP; which of the two a datagram is shows in its second byte (RFC 5761).
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from lavt.errors import BadPacket
+from lavt.transport.extended_reports import (
+    ReferenceAnswer,
+    ReferenceTime,
+    read_answers,
+    read_reference_times,
+    write_answers,
+    write_reference_time,
+)
+from lavt.transport.ntp_time import delay_ns_of, ntp_of_wall, round_trip_ns, short_delay, short_time
 from lavt.value import value
+
+RECEIVER_CNAME: Final = "receiver@lavt"
+OVERHEAD_BYTES: Final = 40
+"""Of each packet before its payload: IPv4 20, UDP 8, RTP 12."""
 
 _HEADER = struct.Struct("!BBH")
 _SSRC = struct.Struct("!I")
 _REPORT = struct.Struct("!IIIIII")
+_SENDER_INFORMATION = struct.Struct("!IQIII")
+_FEEDBACK = struct.Struct("!II")
+_BIT_RATE = struct.Struct("!II")
+
 _VERSION_2: Final = 0x80
 _PADDING: Final = 0x20
 _COUNT: Final = 0x1F
 
 _SENDER_REPORT: Final = 200
 _RECEIVER_REPORT: Final = 201
+_SOURCE_DESCRIPTION: Final = 202
+_TRANSPORT_FEEDBACK: Final = 205
 _PAYLOAD_FEEDBACK: Final = 206
-_PICTURE_LOSS: Final = 1
-_SENDER_INFORMATION_BYTES: Final = 20
+_EXTENDED_REPORT: Final = 207
 
+_CNAME: Final = 1
+_MAX_BIT_RATE: Final = 3
+_PICTURE_LOSS: Final = 1
+
+_BEFORE_BLOCKS: Final = {_SENDER_REPORT: _SENDER_INFORMATION.size, _RECEIVER_REPORT: _SSRC.size}
+"""Bytes of a report's body before its report blocks."""
 _MAX_LOST: Final = 2**23 - 1
+_MAX_WORD: Final = 2**32 - 1
+_MAX_BIT_RATE_BPS: Final = (2**17 - 1) << 63
 _RTP_HEADER_BYTES: Final = 12
 _RTCP_HEADER_BYTES: Final = 8
+
+
+@value
+class SenderReport:
+    """When a sender wrote its report, and what it had sent until then (RFC 3550, section 6.4.1)."""
+
+    ssrc: int
+    ntp_time: int
+    """64 bits, by the sender's wall clock."""
+    rtp_timestamp: int
+    """Of the same moment."""
+    packets: int
+    octets: int
+    """Of payload."""
 
 
 @value
@@ -42,58 +89,150 @@ class ReceptionReport:
     """Packets lost since the beginning; duplicates can make it negative."""
     jitter: int
     """Mean deviation of the arrival spacing, in ticks of the RTP clock (90 kHz)."""
+    last_report: int = 0
+    """Middle 32 bits of the NTP time in the last sender report that came; 0: none came."""
+    last_report_age_ns: int = 0
+    """How long before this report that one had come, in steps of 1/65536 s."""
+
+
+@value
+class BitRateLimit:
+    """The highest bit rate that a receiver wants of one stream (RFC 5104, section 4.2.1.1)."""
+
+    media_ssrc: int
+    bit_rate_bps: int
+    """With `overhead_bytes` of headers before each packet's payload."""
+    overhead_bytes: int
 
 
 @value
 class Feedback:
-    """What one RTCP datagram says."""
+    """What one RTCP datagram says that a sender hears."""
 
-    reports: tuple[ReceptionReport, ...]
-    picture_loss: bool
+    reports: tuple[ReceptionReport, ...] = ()
+    picture_loss: bool = False
     """The receiver asks for a keyframe."""
+    limits: tuple[BitRateLimit, ...] = ()
+    reference_times: tuple[ReferenceTime, ...] = ()
 
 
-def receiver_report(
-    ssrc: int, media_ssrc: int, *, highest_sequence: int, lost_fraction: float, cumulative_lost: int, jitter: int
+@value
+class Announcement:
+    """What one RTCP datagram says that a receiver hears."""
+
+    reports: tuple[SenderReport, ...] = ()
+    answers: tuple[ReferenceAnswer, ...] = ()
+
+
+def sender_report(
+    ssrc: int,
+    *,
+    wall_ns: int,
+    rtp_timestamp: int,
+    packets: int,
+    octets: int,
+    cname: str,
+    answered: Sequence[ReferenceAnswer] = (),
 ) -> bytes:
-    """Write the receiver report of receiver `ssrc` about the stream `media_ssrc`; values beyond their field are cut."""
-    fraction = min(max(int(lost_fraction * 256), 0), 255)
-    lost = min(max(cumulative_lost, -_MAX_LOST - 1), _MAX_LOST) % 2**24
-    block = _REPORT.pack(media_ssrc, fraction << 24 | lost, highest_sequence % 2**32, min(jitter, 2**32 - 1), 0, 0)
-    return _packet(_RECEIVER_REPORT, 1, _SSRC.pack(ssrc) + block)
+    """Write a sender report, with the reference times of receivers that it answers.
 
-
-def picture_loss(ssrc: int, media_ssrc: int) -> bytes:
-    """Write the request of receiver `ssrc` for a keyframe of the stream `media_ssrc` (RFC 4585, section 6.3.1).
-
-    It follows an empty receiver report, since every RTCP datagram begins with a report (RFC 3550, section 6.1).
+    `rtp_timestamp` is that of the moment `wall_ns` (ns since 1970). Counts wrap at 2^32.
     """
-    request = _SSRC.pack(ssrc) + _SSRC.pack(media_ssrc)
-    return _packet(_RECEIVER_REPORT, 0, _SSRC.pack(ssrc)) + _packet(_PAYLOAD_FEEDBACK, _PICTURE_LOSS, request)
+    information = _SENDER_INFORMATION.pack(
+        ssrc, ntp_of_wall(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32
+    )  # fmt: skip
+    datagram = _packet(_SENDER_REPORT, 0, information) + _description(ssrc, cname)
+    if answered:
+        datagram += _packet(_EXTENDED_REPORT, 0, write_answers(ssrc, answered))
+    return datagram
+
+
+def receiver_report(ssrc: int, report: ReceptionReport, *, clock_ns: int, cname: str = RECEIVER_CNAME) -> bytes:
+    """Write the receiver report of receiver `ssrc` with its reference time; values beyond their field are cut.
+
+    `clock_ns` is any clock of the receiver that is never set: `answered_round_trip_ns` is asked with the same.
+    """
+    fraction = min(max(int(report.lost_fraction * 256), 0), 255)
+    lost = min(max(report.cumulative_lost, -_MAX_LOST - 1), _MAX_LOST) % 2**24
+    block = _REPORT.pack(
+        report.media_ssrc, fraction << 24 | lost, report.highest_sequence % 2**32, min(report.jitter, _MAX_WORD),
+        report.last_report, short_delay(report.last_report_age_ns),
+    )  # fmt: skip
+    return (
+        _packet(_RECEIVER_REPORT, 1, _SSRC.pack(ssrc) + block)
+        + _description(ssrc, cname)
+        + _packet(_EXTENDED_REPORT, 0, write_reference_time(ssrc, clock_ns))
+    )
+
+
+def picture_loss(ssrc: int, media_ssrc: int, *, cname: str = RECEIVER_CNAME) -> bytes:
+    """Write the request of receiver `ssrc` for a keyframe of the stream `media_ssrc` (RFC 4585, section 6.3.1)."""
+    return _empty_report(ssrc, cname) + _packet(_PAYLOAD_FEEDBACK, _PICTURE_LOSS, _FEEDBACK.pack(ssrc, media_ssrc))
+
+
+def max_bit_rate(
+    ssrc: int,
+    media_ssrc: int,
+    bit_rate_bps: int,
+    *,
+    overhead_bytes: int = OVERHEAD_BYTES,
+    cname: str = RECEIVER_CNAME,
+) -> bytes:
+    """Write the request of receiver `ssrc` that `media_ssrc` be sent with at most `bit_rate_bps` (RFC 5104, 4.2.1).
+
+    The bit rate counts `overhead_bytes` (at most 511) for each packet. It travels with 17 significant bits, rounded
+    down; values beyond their field are cut.
+    """
+    rate = min(max(bit_rate_bps, 0), _MAX_BIT_RATE_BPS)
+    exponent = max(rate.bit_length() - 17, 0)
+    word = exponent << 26 | rate >> exponent << 9 | min(overhead_bytes, 511)
+    # The stream is named with its limit, and not in the header (RFC 5104, section 4.2.1.2).
+    body = _FEEDBACK.pack(ssrc, 0) + _BIT_RATE.pack(media_ssrc, word)
+    return _empty_report(ssrc, cname) + _packet(_TRANSPORT_FEEDBACK, _MAX_BIT_RATE, body)
 
 
 def parse_feedback(datagram: bytes) -> Feedback:
-    """Read an RTCP datagram; kinds of packets that say nothing of interest are passed over.
+    """Read an RTCP datagram as a sender does; what says nothing of interest to it is passed over.
 
-    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a packet shorter than its own contents.
+    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
     """
-    if len(datagram) < _RTCP_HEADER_BYTES or datagram[1] not in {_SENDER_REPORT, _RECEIVER_REPORT}:
-        raise BadPacket("an RTCP datagram begins with a report")
     reports: list[ReceptionReport] = []
+    limits: list[BitRateLimit] = []
+    references: list[ReferenceTime] = []
     lost = False
-    begin = 0
-    while begin < len(datagram):
-        count, kind, body = _next_packet(datagram, begin)
-        begin += _HEADER.size + len(body)
-        if kind == _RECEIVER_REPORT:
-            reports += _blocks(body, _SSRC.size, count)
-        elif kind == _SENDER_REPORT:
-            reports += _blocks(body, _SSRC.size + _SENDER_INFORMATION_BYTES, count)
-        elif kind == _PAYLOAD_FEEDBACK and count == _PICTURE_LOSS:
-            if len(body) < 2 * _SSRC.size:
-                raise BadPacket("picture-loss indication cut off")
+    for count, kind, body in _packets(datagram):
+        if kind in _BEFORE_BLOCKS:
+            reports += _report_blocks(kind, count, body)
+        elif (kind, count) == (_PAYLOAD_FEEDBACK, _PICTURE_LOSS):
+            _check(len(body) == _FEEDBACK.size, "picture-loss indication of a wrong length")
             lost = True
-    return Feedback(tuple(reports), lost)
+        elif (kind, count) == (_TRANSPORT_FEEDBACK, _MAX_BIT_RATE):
+            limits += _limits(body)
+        elif kind == _EXTENDED_REPORT:
+            references += read_reference_times(body)
+    return Feedback(tuple(reports), lost, tuple(limits), tuple(references))
+
+
+def parse_announcement(datagram: bytes) -> Announcement:
+    """Read an RTCP datagram as a receiver does; what says nothing of interest to it is passed over.
+
+    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
+    """
+    reports: list[SenderReport] = []
+    answers: list[ReferenceAnswer] = []
+    for count, kind, body in _packets(datagram):
+        if kind in _BEFORE_BLOCKS:
+            _report_blocks(kind, count, body)  # for their lengths
+        if kind == _SENDER_REPORT:
+            reports.append(SenderReport(*_SENDER_INFORMATION.unpack_from(body)))
+        elif kind == _EXTENDED_REPORT:
+            answers += read_answers(body)
+    return Announcement(tuple(reports), tuple(answers))
+
+
+def reported_round_trip_ns(report: ReceptionReport, arrived_wall_ns: int) -> int | None:
+    """Give the sender the round trip from a reception report that came at `arrived_wall_ns`; None: it says none."""
+    return round_trip_ns(short_time(ntp_of_wall(arrived_wall_ns)), report.last_report, report.last_report_age_ns)
 
 
 def is_rtcp(datagram: bytes) -> bool:
@@ -111,27 +250,63 @@ def _packet(kind: int, count: int, body: bytes) -> bytes:
     return _HEADER.pack(_VERSION_2 | count, kind, len(body) // 4) + body
 
 
-def _next_packet(datagram: bytes, begin: int) -> tuple[int, int, bytes]:
-    """Take count, type and body of the RTCP packet at `begin`."""
-    if begin + _HEADER.size > len(datagram):
-        raise BadPacket("RTCP header cut off")
-    first, kind, words = _HEADER.unpack_from(datagram, begin)
-    end = begin + _HEADER.size + 4 * words
-    if first >> 6 != 2 or end > len(datagram):
-        raise BadPacket("not RTCP version 2, or cut off")
-    if first & _PADDING and end != len(datagram):
-        raise BadPacket("padding before the last RTCP packet")
-    return first & _COUNT, kind, datagram[begin + _HEADER.size : end]
+def _empty_report(ssrc: int, cname: str) -> bytes:
+    """Write what stands before a request, since every RTCP datagram begins so (RFC 4585, section 3.1)."""
+    return _packet(_RECEIVER_REPORT, 0, _SSRC.pack(ssrc)) + _description(ssrc, cname)
 
 
-def _blocks(body: bytes, begin: int, count: int) -> list[ReceptionReport]:
-    """Read the `count` report blocks of a report, which begin at `begin`."""
-    if begin + count * _REPORT.size > len(body):
-        raise BadPacket("fewer report blocks than announced")
+def _description(ssrc: int, cname: str) -> bytes:
+    """Write the source description with the CNAME, its first 255 bytes (RFC 3550, section 6.5)."""
+    text = cname.encode()[:255]
+    item = bytes([_CNAME, len(text)]) + text
+    return _packet(_SOURCE_DESCRIPTION, 1, _SSRC.pack(ssrc) + item + bytes(4 - len(item) % 4))
+
+
+def _check(right: bool, wrong: str) -> None:
+    if not right:
+        raise BadPacket(wrong)
+
+
+def _packets(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Give count, type and body without padding of each RTCP packet in a datagram (RFC 3550, A.2)."""
+    begins_with_report = len(datagram) >= _RTCP_HEADER_BYTES and datagram[1] in {_SENDER_REPORT, _RECEIVER_REPORT}
+    _check(begins_with_report, "an RTCP datagram begins with a report")
+    begin = 0
+    while begin < len(datagram):
+        _check(begin + _HEADER.size <= len(datagram), "RTCP header cut off")
+        first, kind, words = _HEADER.unpack_from(datagram, begin)
+        end = begin + _HEADER.size + 4 * words
+        _check(first >> 6 == 2 and end <= len(datagram), "not RTCP version 2, or cut off")
+        body = datagram[begin + _HEADER.size : end]
+        if first & _PADDING:
+            _check(end == len(datagram), "padding before the last RTCP packet")
+            padding = datagram[-1]
+            _check(padding % 4 == 0 and 0 < padding <= len(body), "padding of a wrong length")
+            body = body[:-padding]
+        yield first & _COUNT, kind, body
+        begin = end
+
+
+def _report_blocks(kind: int, count: int, body: bytes) -> list[ReceptionReport]:
+    """Read the `count` report blocks of a report; extensions may follow them."""
+    begin = _BEFORE_BLOCKS[kind]
+    end = begin + count * _REPORT.size
+    _check(end <= len(body), "fewer report blocks than announced")
     reports = []
-    for at in range(begin, begin + count * _REPORT.size, _REPORT.size):
-        media_ssrc, loss, highest, jitter, _, _ = _REPORT.unpack_from(body, at)
+    for media_ssrc, loss, highest, jitter, last, age in _REPORT.iter_unpack(body[begin:end]):
         lost = loss & 0xFF_FFFF
         signed = lost - 2**24 if lost > _MAX_LOST else lost
-        reports.append(ReceptionReport(media_ssrc, highest, (loss >> 24) / 256, signed, jitter))
+        reports.append(
+            ReceptionReport(media_ssrc, highest, (loss >> 24) / 256, signed, jitter, last, delay_ns_of(age))
+        )  # fmt: skip
     return reports
+
+
+def _limits(body: bytes) -> list[BitRateLimit]:
+    """Read the entries of a request for a bit rate: exponent 6 bits, mantissa 17, overhead 9."""
+    entries = body[_FEEDBACK.size :]
+    _check(bool(entries) and len(entries) % _BIT_RATE.size == 0, "bit rate limits of a wrong length")
+    return [
+        BitRateLimit(media_ssrc, (word >> 9 & 0x1_FFFF) << (word >> 26), word & 0x1FF)
+        for media_ssrc, word in _BIT_RATE.iter_unpack(entries)
+    ]

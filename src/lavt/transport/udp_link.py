@@ -20,6 +20,8 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_DATAGRAM = 65_535
+TAKEN_AT_ONCE = 256
+"""Datagrams in a row, before somebody who wants the link closed is heard."""
 
 
 class UdpLink:
@@ -92,8 +94,17 @@ class UdpLink:
             ready, _, _ = select.select((self._socket, self._wake_reader), (), ())
             if self._wake_reader in ready:
                 return
+            self._take_all()
+
+    def _take_all(self) -> None:
+        """Deliver what has come: a frame's packets come together."""
+        for _ in range(TAKEN_AT_ONCE):
             try:
-                datagram, ancillary, _flags, address = self._socket.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
+                datagram, ancillary, _flags, address = self._socket.recvmsg(
+                    LONGEST_DATAGRAM, ANCILLARY_BYTES, socket.MSG_DONTWAIT
+                )
+            except BlockingIOError:
+                return
             except OSError:  # an ICMP error of an earlier datagram
                 self.counts["datagrams_refused"] += 1
                 continue

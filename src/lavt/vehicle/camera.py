@@ -11,7 +11,11 @@ from lavt.value import value
 
 @value
 class CapturedFrame:
-    """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known."""
+    """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known.
+
+    The picture is (height, width, 3), blue green red, or what the camera gives in I420, (height * 3 / 2, width): that
+    goes into the encoder as it is.
+    """
 
     number: int
     capture_ns: int | None

@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from tests.require import need
+
+from lavt.domain import NS_PER_S
+from lavt.transport.ntp_time import short_time
+from lavt.transport.rtcp import (
+    ReceptionReport,
+    parse_announcement,
+    parse_feedback,
+    picture_loss,
+    receiver_report,
+    sender_report,
+)
+from lavt.transport.rtp import RtpPacket
+
+SYSTEM_PYTHON = "/usr/bin/python3"
+"""Debian's gi is for Debian's interpreter only."""
+OURS, THEIRS, RECEIVER = 77, 99, 88
+
+SESSION = """
+import json, sys
+import gi
+gi.require_version("Gst", "1.0")
+from gi.repository import Gst
+Gst.init(None)
+CAPS = "application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96,rtcp-fb-nack-pli=true,ssrc=(uint)"
+SOURCE = "is-live=true do-timestamp=true format=time"
+pipeline = Gst.parse_launch(
+    "rtpsession name=session rtp-profile=avpf"
+    f' appsrc name=rtp {SOURCE} caps="{CAPS}77" ! session.recv_rtp_sink session.recv_rtp_src ! fakesink async=false'
+    f' appsrc name=send {SOURCE} caps="{CAPS}99" ! session.send_rtp_sink session.send_rtp_src ! fakesink async=false'
+    f" appsrc name=rtcp {SOURCE} caps=application/x-rtcp ! session.recv_rtcp_sink"
+    " session.send_rtcp_src ! appsink name=out async=false sync=false emit-signals=true"
+)
+session, out = pipeline.get_by_name("session"), pipeline.get_by_name("out")
+session.get_property("internal-session").set_property("rtcp-min-interval", 100_000_000)
+
+def say(kind, what):
+    print(json.dumps([kind, what]), flush=True)
+
+def tell_rtcp(_sink):
+    buffer = out.emit("pull-sample").get_buffer()
+    say("rtcp", buffer.extract_dup(0, buffer.get_size()).hex())
+    return Gst.FlowReturn.OK
+
+def tell_event(_pad, info):
+    structure = info.get_event().get_structure()
+    if structure is not None:
+        say("event", structure.get_name())
+    return Gst.PadProbeReturn.OK
+
+out.connect("new-sample", tell_rtcp)
+pad = pipeline.get_by_name("send").get_static_pad("src")
+pad.add_probe(Gst.PadProbeType.EVENT_UPSTREAM, tell_event)
+pipeline.set_state(Gst.State.PLAYING)
+NAMES = ("ssrc", "have-sr", "sr-ntptime", "sr-rtptime", "sr-octet-count", "sr-packet-count",
+         "have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter", "rb-round-trip")
+for line in sys.stdin:
+    kind, *rest = line.split()
+    if kind == "stats":
+        stats = session.get_property("stats")
+        sources = stats.get_value("source-stats")
+        say("stats", [{name: source.get_value(name) for name in NAMES if source.has_field(name)} for source in sources])
+    else:
+        pipeline.get_by_name(kind).emit("push-buffer", Gst.Buffer.new_wrapped(bytes.fromhex(rest[0])))
+pipeline.set_state(Gst.State.NULL)
+"""
+
+
+class Session:
+    """GStreamer's rtpsession in a process of its own: it receives our stream 77 and sends a stream 99 of its own."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def tell(self, kind: str, datagram: bytes = b"") -> None:
+        """Give it RTP, RTCP, or RTP to send (`rtp`, `rtcp`, `send`)."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{kind} {datagram.hex()}\n")
+        self._process.stdin.flush()
+
+    def hear(self, kind: str) -> Any:
+        """Wait for the next thing of a kind that it says."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            said, what = json.loads(line)
+            if said == kind:
+                return what
+        raise AssertionError("GStreamer has ended")
+
+
+@contextmanager
+def gstreamer() -> Iterator[Session]:
+    packages = "needs GStreamer for Python: apt-get install python3-gst-1.0 gstreamer1.0-plugins-good"
+    probe = "import gi; gi.require_version('Gst', '1.0'); from gi.repository import Gst; Gst.init(None); " + (
+        "raise SystemExit(Gst.ElementFactory.find('rtpsession') is None)"
+    )
+    python = shutil.which(SYSTEM_PYTHON)
+    if python is None or subprocess.run([python, "-c", probe], check=False, capture_output=True).returncode:
+        need("gstreamer", packages)
+    pipe = subprocess.PIPE
+    with subprocess.Popen([python, "-c", SESSION], stdin=pipe, stdout=pipe, text=True) as process:
+        try:
+            yield Session(process)
+        finally:
+            process.kill()
+
+
+def packet(sequence: int, ssrc: int) -> bytes:
+    return RtpPacket(96, sequence % 2**16, 3000 * sequence, ssrc, True, b"\x41abc").to_bytes()
+
+
+@pytest.mark.realtime
+@pytest.mark.timeout(60)
+def test_gstreamer_hears_our_sender() -> None:
+    """GStreamer's receiver reads our sender report to the last bit and sends the middle of its time back."""
+    with gstreamer() as session:
+        for number in range(65_530, 65_540):
+            session.tell("rtp", packet(number, OURS))
+        wall_ns = 1_700_000_000_123_456_789
+        report = sender_report(OURS, wall_ns=wall_ns, rtp_timestamp=123, packets=10, octets=40, cname="camera@lavt")
+        session.tell("rtcp", report)
+        (sent,) = parse_announcement(report).reports
+        while True:
+            blocks = parse_feedback(bytes.fromhex(session.hear("rtcp"))).reports
+            if any(block.last_report for block in blocks):
+                break
+        (block,) = blocks
+        assert (block.media_ssrc, block.highest_sequence) == (OURS, 65_539)
+        assert block.last_report == short_time(sent.ntp_time)
+        assert 0 < block.last_report_age_ns < 30 * NS_PER_S
+        session.tell("stats")
+        (source,) = (each for each in session.hear("stats") if each["ssrc"] == OURS)
+        names = ("have-sr", "sr-ntptime", "sr-rtptime", "sr-packet-count", "sr-octet-count")
+        assert [source[name] for name in names] == [True, sent.ntp_time, 123, 10, 40]
+
+
+@pytest.mark.realtime
+@pytest.mark.timeout(60)
+def test_gstreamer_hears_our_receiver() -> None:
+    """GStreamer's sender reads our receiver report, knows the round trip that we made, and obeys a picture loss."""
+    with gstreamer() as session:
+        for number in range(5):
+            session.tell("send", packet(number, THEIRS))
+        while True:
+            reports = parse_announcement(bytes.fromhex(session.hear("rtcp"))).reports
+            if reports:
+                break
+        (sent,) = reports
+        assert (sent.ssrc, sent.packets, sent.octets) == (THEIRS, 5, 20)
+        six_seconds_ago = (short_time(sent.ntp_time) - 6 * 65_536) % 2**32
+        report = ReceptionReport(THEIRS, 65_541, 0.25, 3, 17, six_seconds_ago, 5 * NS_PER_S)
+        session.tell("rtcp", receiver_report(RECEIVER, report, clock_ns=NS_PER_S))
+        session.tell("rtcp", picture_loss(RECEIVER, THEIRS))
+        while session.hear("event") != "GstForceKeyUnit":
+            pass
+        session.tell("stats")
+        (source,) = (each for each in session.hear("stats") if each["ssrc"] == RECEIVER)
+        names = ("have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter")
+        assert [source[name] for name in names] == [True, THEIRS, 64, 3, 65_541, 17]
+        assert 65_536 <= source["rb-round-trip"] < 30 * 65_536
