@@ -5,7 +5,8 @@
 The simulator's pictures, with its sensor noise (2.2 LSB), at 30 Hz: a drive of 2 s there and back again and again.
 Encoder, packets, reorder buffer, depacketizer, decoder and reader are the product's; packets are lost independently;
 after a loss a keyframe comes two frames later (a round trip of 40 ms), at most one in 100 ms. A frame is intact when
-all its packets arrived or were made again, and in doubt as `nodes/driver.py` says: from a loss to the next keyframe.
+all its packets arrived or were made again, and in doubt from a loss to the next whole keyframe, as in
+`nodes/picture_reader.py`.
 
 Each stamp is checked by its RTP timestamp, as ours are, and a second time as a foreign sender's would be: against
 timestamps with a base of their own, of pictures taken up to 4 ms before they were stamped.
@@ -30,9 +31,10 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Pose
 from lavt.errors import BadPacket
 from lavt.streams import stream
+from lavt.transport.fec import RepairReceiver, RepairSender
 from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.reorder import HOLD_NS, Ordered, ReorderBuffer
-from lavt.transport.rtp import AccessUnit, Depacketizer, Packetizer, RtpPacket, parse_packet
+from lavt.transport.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
 from lavt.transport.stamp import read_clear_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp_i420
 from lavt.transport.stamp_check import LearnedBase
 from lavt.vehicle.sim.renderer import Renderer
@@ -46,7 +48,7 @@ BUFFER_S = 0.1
 
 ROUTE, FROM_M, SPEED_MPS, SCENE_FRAMES = "b", 150.0, 8.33, 60
 
-LINKS = ((0.0, 0), (0.01, 0), (0.05, 0))
+LINKS = ((0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2))
 """Share of packets lost, and repair packets for each block of a frame."""
 ROUND_TRIP_FRAMES = 2
 PAUSE_FRAMES = 3
@@ -82,8 +84,7 @@ class Worst:
         self.largest_error_us = max(self.largest_error_us, other.largest_error_us)
 
 
-CHECKS = ("own", "foreign", "foreign clear", "foreign clear undoubted")
-"""Ours; a learned base alone; with clear cells only; and with pictures that are not in doubt only."""
+CHECKS = ("own", "own, not in doubt", "foreign", "foreign, clear cells", "foreign, clear cells, not in doubt")
 
 
 @dataclass
@@ -142,6 +143,7 @@ class Sender:
             buffer_s=BUFFER_S,
         )
         self.packetizer = Packetizer(ssrc=1, first_sequence=65_000)
+        self.repair = RepairSender(ssrc=2, first_sequence=65_000)
         self.asked_for: int | None = None
         self.answered = self.asked = -PAUSE_FRAMES
 
@@ -161,22 +163,31 @@ class Sender:
 
 
 class Receiver:
-    """Puts packets in order and together."""
+    """Makes lost packets again, and puts packets in order and together."""
 
     def __init__(self) -> None:
+        self.repair = RepairReceiver()
         self.reorder = ReorderBuffer()
         self.depacketizer = Depacketizer()
         self.gaps = 0
 
-    def receive(self, datagrams: Sequence[bytes], now_ns: int) -> tuple[list[RtpPacket], list[AccessUnit]]:
-        """Take what arrived of a frame; give the media packets, and the access units that are over within the hold."""
-        packets = [parse_packet(datagram) for datagram in datagrams]
+    def receive(self, datagrams: Sequence[bytes], now_ns: int) -> tuple[int, list[AccessUnit]]:
+        """Take what arrived of a frame; give the number of media packets that came of it and the access units over.
+
+        That is after the hold of the reorder buffer, which is shorter than a frame.
+        """
+        media = 0
         ordered: Ordered = []
-        for packet in packets:
-            ordered += self.reorder.push(packet, now_ns)
+        for packet in map(parse_packet, datagrams):
+            if packet.payload_type == VIDEO_PAYLOAD_TYPE:
+                ordered += self.reorder.push(packet, now_ns)
+                media += 1
+            for recovered in self.repair.push(packet, now_ns):
+                ordered += self.reorder.push_recovered(recovered, now_ns)
+                media += 1
         ordered += self.reorder.expire(now_ns + HOLD_NS)
         self.gaps += sum(lost_before for _, lost_before in ordered)
-        return packets, [unit for each in ordered for unit in self.depacketizer.push(*each)]
+        return media, [unit for each in ordered for unit in self.depacketizer.push(*each)]
 
 
 class Reader:
@@ -192,21 +203,23 @@ class Reader:
         self.in_doubt = True
 
     def read(self, unit: AccessUnit) -> bool:
-        """Read one; tell whether there was a picture."""
-        self.in_doubt = not unit.complete or (self.in_doubt and not unit.keyframe)
+        """Read one; tell whether there was a picture of which nothing had to be made up."""
         picture = self.decoder.decode(unit.data)
+        sound = picture is not None and not picture.corrupt
+        self.in_doubt = not (unit.complete and sound) or (self.in_doubt and not unit.keyframe)
         if picture is not None:
             accepted = self._accepted(picture, unit.timestamp)
             intact = self.missing[unit.timestamp] == 0
             self.found.counts.update(accepted=accepted, intact_good=accepted and intact and not self.in_doubt)
             self._read_as_foreign(picture, unit.timestamp)
-        return picture is not None
+        return sound
 
     def _accepted(self, picture: DecodedPicture, timestamp: int) -> bool:
         read_ns = read_stamp(picture.luma)
         accepted = stamp_agrees(read_ns, timestamp)
-        if accepted:
-            self.found.checks["own"].note(read_ns, self.sent_ns[timestamp])
+        for name in ("own",) if self.in_doubt else ("own", "own, not in doubt"):
+            if accepted:
+                self.found.checks[name].note(read_ns, self.sent_ns[timestamp])
         return accepted
 
     def _read_as_foreign(self, picture: DecodedPicture, timestamp: int) -> None:
@@ -220,9 +233,9 @@ class Reader:
         except BadPacket:
             return
         if self.learned_clear.agrees(read_ns, foreign):
-            checks["foreign clear"].note(read_ns, sent_ns)
+            checks["foreign, clear cells"].note(read_ns, sent_ns)
             if not self.in_doubt:
-                checks["foreign clear undoubted"].note(read_ns, sent_ns)
+                checks["foreign, clear cells, not in doubt"].note(read_ns, sent_ns)
 
 
 def study(found: Found, frames: int) -> Found:
@@ -234,17 +247,18 @@ def study(found: Found, frames: int) -> Found:
         now_ns = number * FRAME_NS
         stamp_ns = START_NS + now_ns + int(chance.integers(STAMP_JITTER_NS))
         datagrams = sender.send(number, pictures[number % len(pictures)], stamp_ns)
-        arrived = [datagram for datagram in datagrams if chance.random() >= found.loss]
+        repair = sender.repair.repair(datagrams, found.repair)
+        arrived = [datagram for datagram in (*datagrams, *repair) if chance.random() >= found.loss]
         timestamp = rtp_timestamp(stamp_ns)
         taken_ns = stamp_ns - int(chance.integers(FOREIGN_JITTER_NS))
         reader.sent_ns[timestamp] = stamp_ns
         reader.foreign_timestamp[timestamp] = (rtp_timestamp(taken_ns) + FOREIGN_BASE) % 2**32
         gaps_before = receiver.gaps
         media, units = receiver.receive(arrived, now_ns)
-        reader.missing[timestamp] = len(datagrams) - len(media)
+        reader.missing[timestamp] = len(datagrams) - media
         found.counts.update(frames=1, intact=reader.missing[timestamp] == 0)
-        undecoded = [unit for unit in units if not reader.read(unit)]
-        if receiver.gaps > gaps_before or undecoded:
+        unsound = [unit for unit in units if not reader.read(unit)]
+        if receiver.gaps > gaps_before or unsound:
             sender.ask(number)
     return found
 
@@ -315,10 +329,12 @@ def main() -> None:
     parser.add_argument("--rates-kbps", nargs="+", type=int, default=list(RATES_KBPS))
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--json", action="store_true", help="print one line of JSON instead of tables")
+    parser.add_argument("--json", action="store_true", help="print everything on one last line, too")
     asked = parser.parse_args()
     found = study_all(asked.sizes, asked.rates_kbps, asked.frames, asked.processes)
-    print(as_json(found) if asked.json else "\n".join(tables(found)))
+    print("\n".join(tables(found)))
+    if asked.json:
+        print(as_json(found))
 
 
 if __name__ == "__main__":
