@@ -32,3 +32,20 @@ def test_the_benchmark_of_the_onset_runs() -> None:
     assert header == "| lookahead | frame rate | speed | theory | measured | difference |"
     assert row.startswith("| 0.74 s | 15 Hz | 6 m/s | 177.3 ms | ")
     assert abs(float(row.split("|")[-2].removesuffix(" ms "))) < 10
+
+
+def test_the_study_of_the_stamp_runs() -> None:
+    """`benchmarks/stamp_reading.py` prints a table for each size and one of the checks, and last, if asked, JSON."""
+    asked = ["--sizes", "320x240", "--rates-kbps", "460", "--frames", "40", "--processes", "1", "--json"]
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / "stamp_reading.py", *asked],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert "| 460 | 0.200 | 0.0 % | " in lines[4]
+    last = json.loads(lines[-1])
+    assert [(cell["loss"], cell["repair"]) for cell in last["cells"]] == [
+        (0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2),
+    ]  # fmt: skip
+    assert last["cells"][0]["accepted"] == last["cells"][0]["frames"] == 40
+    assert last["checks"]["own"]["largest_error_us"] < 12

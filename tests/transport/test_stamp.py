@@ -11,6 +11,7 @@ from lavt.streams import stream
 from lavt.transport.stamp import (
     STAMP_PX,
     holds_stamp,
+    read_clear_stamp,
     read_stamp,
     rtp_timestamp,
     stamp_agrees,
@@ -123,6 +124,36 @@ def test_too_small() -> None:
         read_stamp(np.zeros((63, 64), np.uint8))
 
 
+SHAPES = st.lists(st.sampled_from([0, 1, 2, 63, 64, 65, 128]), max_size=4)
+
+
+@given(SHAPES)
+def test_any_shape(shape: list[int]) -> None:
+    """An array of any shape is read as a stamp or is a bad packet, and nothing else."""
+    readable = len(shape) == 2 and min(shape) >= STAMP_PX
+    for read in (read_stamp, read_clear_stamp):
+        try:
+            assert read(np.zeros(shape, np.uint8)) == 0
+        except BadPacket:
+            assert not readable
+        else:
+            assert readable
+
+
+def test_clear_stamp() -> None:
+    """A clear stamp has each cell in the outer thirds between black and white; one in the middle makes it none."""
+    luma = np.zeros((64, 80), np.uint8)
+    write_stamp_luma(luma, 0x0123_4567_89AB_CDEF)
+    assert read_clear_stamp(luma) == 0x0123_4567_89AB_CDEF
+    for grey, cell in ((88, 0x0123_4567_89AB_CDEF), (163, 0x0123_4567_89AB_CDEF | 1 << 63)):
+        luma[:8, :8] = grey
+        assert read_clear_stamp(luma) == cell
+    for grey in (89, 128, 162):
+        luma[:8, :8] = grey
+        with pytest.raises(BadPacket, match="neither"):
+            read_clear_stamp(luma)
+
+
 def test_rtp_timestamp() -> None:
     """The RTP timestamp counts 90 kHz ticks of the stamp and wraps at 32 bits."""
     assert rtp_timestamp(1_000_000_000) == 90_000
@@ -137,6 +168,40 @@ def test_agreement(stamp_ns: int, bit: int) -> None:
     assert stamp_agrees(stamp_ns, rtp_timestamp(stamp_ns))
     if bit > 13:
         assert not stamp_agrees(stamp_ns ^ 1 << bit, rtp_timestamp(stamp_ns))
+
+
+def off_ns(read_ns: int, true_ns: int) -> float:
+    """How far a stamp is off, where wraps of the RTP timestamp (2^32 ticks, 13.3 h) count as nothing."""
+    ninths = abs(read_ns - true_ns) * 9 % (2**32 * 100_000)
+    return min(ninths, 2**32 * 100_000 - ninths) / 9
+
+
+@given(st.binary(min_size=64, max_size=64), st.integers(min_value=0, max_value=100), st.integers(-60_000, 60_000))
+def test_any_picture(greys: bytes, seed: int, away_ns: int) -> None:
+    """Whatever the pixels are, and whatever was sent, a stamp that is accepted is within 12 us of the one sent."""
+    cells = np.frombuffer(greys, np.uint8).reshape(8, 8).repeat(8, axis=0).repeat(8, axis=1)
+    noise = stream(seed, "noise").integers(0, 256, cells.shape, dtype=np.uint8)
+    for luma in (cells, noise, cells // 2 + noise // 2):
+        read_ns = read_stamp(luma)
+        for sent_ns in (abs(read_ns + away_ns), int.from_bytes(greys[:8], "big")):
+            assert not stamp_agrees(read_ns, rtp_timestamp(sent_ns)) or off_ns(read_ns, sent_ns) < 12_000
+
+
+@given(STAMPS, st.lists(st.integers(min_value=0, max_value=63), max_size=4), st.integers(min_value=0, max_value=2**14))
+def test_any_damage(stamp_ns: int, wrong_bits: list[int], low_bits: int) -> None:
+    """Whichever cells of a stamp a decoder got wrong, one that is accepted is within 12 us of the one that was sent."""
+    damaged_ns = stamp_ns ^ low_bits
+    for bit in wrong_bits:
+        damaged_ns ^= 1 << bit
+    luma = np.full((STAMP_PX, STAMP_PX), 90, np.uint8)
+    write_stamp_luma(luma, damaged_ns)
+    assert not stamp_agrees(read_stamp(luma), rtp_timestamp(stamp_ns)) or off_ns(damaged_ns, stamp_ns) < 12_000
+
+
+@given(STAMPS, st.integers(min_value=0, max_value=2**32 - 1))
+def test_any_timestamp(stamp_ns: int, timestamp: int) -> None:
+    """No stamp agrees with two timestamps."""
+    assert stamp_agrees(stamp_ns, timestamp) == (timestamp == rtp_timestamp(stamp_ns))
 
 
 def test_a_picture_with_a_stamp_is_told_from_one_without() -> None:

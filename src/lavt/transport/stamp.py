@@ -25,6 +25,7 @@ _THRESHOLD = 128
 _BLACK_BELOW, _WHITE_ABOVE = 64, 192  # far from both is what a codec makes of a cell
 
 _BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), what OpenCV makes of 0 and 255
+_CLEARLY_BLACK, _CLEARLY_WHITE = _BLACK + (_WHITE - _BLACK) // 3, _WHITE - (_WHITE - _BLACK) // 3
 _BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _LUMA_OF_BYTE = np.where(_BITS_OF_BYTE, _WHITE, _BLACK).astype(np.uint8).repeat(_CELL_PX, axis=1)
 """(256, STAMP_PX): one row of pixels for each byte of a stamp."""
@@ -81,13 +82,35 @@ def read_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp from the luma plane (height, width) of a decoded picture: mean of each cell's centre half.
 
     What it returns is only a claim until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too
-    small to hold a stamp.
+    small to hold a stamp, and for what is no plane.
     """
-    if luma.shape[0] < STAMP_PX or luma.shape[1] < STAMP_PX:
-        raise BadPacket(f"a picture of {luma.shape[1]} x {luma.shape[0]} pixels holds no stamp")
+    return _number(_cell_sums(luma) > _THRESHOLD * _CENTRE_PIXELS)
+
+
+def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
+    """Read the stamp as `read_stamp` does, but only where each cell is clearly black or clearly white.
+
+    For a check that is weaker than `stamp_agrees`: a cell that is half old and half new is no cell. Raises `BadPacket`
+    where a cell is in the middle third between black and white, too.
+    """
+    sums = _cell_sums(luma)
+    white = sums > _CLEARLY_WHITE * _CENTRE_PIXELS
+    if not (white | (sums < _CLEARLY_BLACK * _CENTRE_PIXELS)).all():
+        raise BadPacket("a cell of the stamp is neither black nor white")
+    return _number(white)
+
+
+def _cell_sums(luma: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Sum the pixels in the centre half of each cell, (8, 8)."""
+    if luma.ndim != 2 or min(luma.shape) < STAMP_PX:
+        raise BadPacket(f"a picture of shape {luma.shape} holds no stamp")
     cells = luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
-    sums = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
-    return int.from_bytes(np.packbits(sums > _THRESHOLD * _CENTRE_PIXELS).tobytes(), "big")
+    sums: NDArray[np.uint16] = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
+    return sums
+
+
+def _number(white: NDArray[np.bool_]) -> int:
+    return int.from_bytes(np.packbits(white).tobytes(), "big")
 
 
 def holds_stamp(picture_bgr: Picture) -> bool:
