@@ -12,7 +12,7 @@ import argparse
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a program it finds only
 from benchmarks.video.clean import SIZES, clean_run
 from benchmarks.video.pictures import render_loop
 from benchmarks.video.run import RATE_HZ
-from benchmarks.video.sides import Outcome, Process, measure
+from benchmarks.video.sides import Process, measure
 
 SAMPLE_S = 0.5
 STRETCH_S = 10
@@ -92,7 +92,7 @@ class Sampler:
                 self.samples.setdefault(each.name, []).append(sample(each.process_id, number * SAMPLE_S))
 
 
-def verdicts(samples: dict[str, list[Sample]], outcome: Outcome) -> list[str]:
+def verdicts(samples: Mapping[str, Sequence[Sample]], latency_ms: NDArray[np.float64]) -> list[str]:
     """Say in sentences what has grown; empty: nothing has."""
     found = []
     for name, all_samples in samples.items():
@@ -101,7 +101,7 @@ def verdicts(samples: dict[str, list[Sample]], outcome: Outcome) -> list[str]:
             found.append(f"the memory of {name} grew by {slope:.0f} kB a minute")
         if kept[-1].threads > kept[0].threads:
             found.append(f"the threads of {name} grew from {kept[0].threads} to {kept[-1].threads}")
-    first_ms, last_ms = grown_ms(outcome.latency_ms)
+    first_ms, last_ms = grown_ms(latency_ms)
     if last_ms - first_ms > max(GROWN_MS, first_ms / 4):
         found.append(f"latency grew from {first_ms:.2f} to {last_ms:.2f} ms")
     return found
@@ -132,7 +132,7 @@ def main() -> int:
         f"\nLatency, median of each 10 s: {medians} ms; of the first quarter {first_ms:.2f}, the last {last_ms:.2f} ms."
     )
     print(f"Frames shown: {len(outcome.latency_ms)} of {outcome.sent}.")
-    found = verdicts(sampler.samples, outcome)
+    found = verdicts(sampler.samples, outcome.latency_ms)
     print(f"Something grew: {'; '.join(found)}." if found else "Nothing grew.")
     return 1 if found else 0
 
