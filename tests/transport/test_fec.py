@@ -85,6 +85,13 @@ def test_blocks(packets: int, blocks: int) -> None:
         assert len(repairs_of(media, count)) == blocks * count
 
 
+def test_order() -> None:
+    """The second repair packets of all blocks follow the first ones, so that a burst hits few of one block."""
+    repairs = repairs_of(frame([b"x"] * 33), 2)
+    assert [tuple(repair.payload[10:12]) for repair in repairs] == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
+    assert [repair.sequence for repair in repairs] == [0, 1, 2, 3, 4, 5]
+
+
 @pytest.mark.parametrize("count", [-1, 3])
 def test_count_that_is_none(count: int) -> None:
     """Another number of repair packets than the wire format has room for is refused."""
@@ -192,26 +199,39 @@ def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first:
     assert receiver.malformed == 0
 
 
+WRONG_HEADERS = [
+    with_payload(REPAIRS[0], b""),
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
+    changed(REPAIRS[0], _0=2),
+    changed(REPAIRS[0], _1=0xE0),
+    changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
+    changed(REPAIRS[0], _7=5),
+    changed(REPAIRS[0], _8=0, _9=0),
+    changed(REPAIRS[0], _8=0xFF, _9=0xFF),
+    changed(REPAIRS[0], _10=1),
+    changed(REPAIRS[0], _11=2),
+]
+
+
+@pytest.mark.parametrize("repair", WRONG_HEADERS)
+def test_malformed_header(repair: RtpPacket) -> None:
+    """A repair packet that is not ours, cut off or of another stream is counted also when nothing was lost."""
+    receiver = RepairReceiver()
+    assert push_all(receiver, [*EIGHT, repair]) == []
+    assert counters(receiver) == (0, 1, 0)
+
+
 @pytest.mark.parametrize(
     "repair",
     [
-        with_payload(REPAIRS[0], b""),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
-        changed(REPAIRS[0], _0=2),
-        changed(REPAIRS[0], _1=0xE0),
-        changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
-        changed(REPAIRS[0], _7=5),
-        changed(REPAIRS[0], _8=0, _9=0),
-        changed(REPAIRS[0], _8=0xFF, _9=0xFF),
-        changed(REPAIRS[0], _10=1),
-        changed(REPAIRS[0], _11=2),
+        *WRONG_HEADERS,
         # Shorter than the media of its block: cut off.
         with_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
-        # What would come out is longer than the packet, empty, or has something behind its end.
+        # What would come out is longer than the packet, has something behind its end, or is empty.
         changed(REPAIRS[0], _12=REPAIRS[0].payload[12] ^ 1),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:12] + bytes(29)),
         changed(REPAIRS[0], _40=REPAIRS[0].payload[40] ^ 1),
+        repairs_of([*EIGHT[:3], with_payload(EIGHT[3], b""), *EIGHT[4:]], 1)[0],
     ],
 )
 def test_malformed(repair: RtpPacket) -> None:
@@ -313,7 +333,23 @@ def test_same_numbers_of_another_frame() -> None:
     """Media packets with the sequence numbers of a block but another timestamp are not of it."""
     receiver = RepairReceiver()
     stale = frame((b"stale" for _ in range(8)), timestamp=1)
-    assert push_all(receiver, [*stale, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+    later = frame((b"later" for _ in range(8)), timestamp=2)
+    assert push_all(receiver, [*stale, *EIGHT[:6], REPAIRS[0], later[7]]) == []
+    assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
+
+
+def test_same_numbers_of_another_stream() -> None:
+    """Media packets of the stream before are not of a block, though they have its sequence numbers and timestamp."""
+    receiver = RepairReceiver()
+    other = frame((b"other" for _ in range(8)), ssrc=9)
+    assert push_all(receiver, [*other, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+
+
+def test_same_place_among_those_kept() -> None:
+    """Media packets as far apart as packets are kept are not taken for one another."""
+    receiver = RepairReceiver()
+    before = frame((b"before" for _ in range(8)), first=(100 - MEDIA_KEPT) % 2**16)
+    assert push_all(receiver, [*before, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
 
 
 def test_access_unit() -> None:

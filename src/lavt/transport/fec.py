@@ -170,7 +170,7 @@ class RepairReceiver:
         key = shape.ssrc, shape.timestamp, shape.block
         block = self._open.get(key)
         if block is None:
-            packets = {sequence: self._find(shape, sequence) for sequence in shape.sequences}
+            packets = {sequence: self._find(shape.ssrc, shape.timestamp, sequence) for sequence in shape.sequences}
             if None not in packets.values() or any(self._passed(shape, sequence) for sequence in packets):
                 return []
             block = self._open[key] = _Block(shape, now_ns, packets, {})
@@ -199,28 +199,15 @@ class RepairReceiver:
 
     def _keep(self, packet: RtpPacket) -> bool:
         """Keep a media packet; False: it was there already."""
-        place = packet.sequence % MEDIA_KEPT
-        kept = self._media[place]
-        if (
-            kept is not None
-            and kept.sequence == packet.sequence
-            and kept.timestamp == packet.timestamp
-            and kept.ssrc == packet.ssrc
-        ):
+        if self._find(packet.ssrc, packet.timestamp, packet.sequence) is not None:
             return False
-        self._media[place] = packet
+        self._media[packet.sequence % MEDIA_KEPT] = packet
         return True
 
-    def _find(self, shape: _Shape, sequence: int) -> RtpPacket | None:
-        """Give the media packet of a block's frame, if it is kept."""
+    def _find(self, ssrc: int, timestamp: int, sequence: int) -> RtpPacket | None:
+        """Give a media packet if it is kept."""
         kept = self._media[sequence % MEDIA_KEPT]
-        if (
-            kept is not None
-            and kept.sequence == sequence
-            and kept.timestamp == shape.timestamp
-            and kept.ssrc == shape.ssrc
-            and kept.payload_type == shape.payload_type
-        ):
+        if kept is not None and (kept.sequence, kept.timestamp, kept.ssrc) == (sequence, timestamp, ssrc):
             return kept
         return None
 
