@@ -75,6 +75,12 @@ def test_bytes_of_a_repair_packet() -> None:
     ]
 
 
+def test_bytes_of_p_and_q() -> None:
+    """Of the frame in docs/wire.md the first repair packet carries P and the second one Q."""
+    repairs = repairs_of(frame([b"\x61\x62\x63", b"\xc4"]), 2)
+    assert [repair.payload[12:].hex(" ") for repair in repairs] == ["00 02 a5 62 63", "00 01 f4 62 63"]
+
+
 @pytest.mark.parametrize(
     ("packets", "blocks"), [(0, 0), (1, 1), (16, 1), (17, 2), (32, 2), (33, 3), (4080, 255), (4081, 0)]
 )
