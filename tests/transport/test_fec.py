@@ -12,6 +12,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.fec import (
     BLOCK_LIFE_NS,
+    MAX_SYMBOL_BYTES,
     MEDIA_KEPT,
     OPEN_BLOCKS,
     REPAIR_PAYLOAD_TYPE,
@@ -109,6 +110,15 @@ def test_repair_packets_are_small() -> None:
     """A repair packet of packets of 1200 bytes is 14 bytes longer than these."""
     media = frame([b"x" * 1188] * 8)
     assert [len(repair.to_bytes()) for repair in repairs_of(media, 2)] == [1214, 1214]
+
+
+@pytest.mark.parametrize(("payload_bytes", "repairs"), [(1498, 2), (1499, 0)])
+def test_long_packets(payload_bytes: int, repairs: int) -> None:
+    """A frame with a payload of more than 1498 bytes gets no repair packets, one of 1498 bytes is repaired."""
+    media = frame([b"short", b"x" * payload_bytes])
+    assert len(repairs_of(media, 2)) == repairs
+    receiver = RepairReceiver()
+    assert push_all(receiver, [media[0], *repairs_of(media, 2)]) == media[1:][:repairs]
 
 
 def test_burst() -> None:
@@ -209,6 +219,7 @@ WRONG_HEADERS = [
     with_payload(REPAIRS[0], b""),
     with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
     with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
+    with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
     changed(REPAIRS[0], _0=2),
     changed(REPAIRS[0], _1=0xE0),
     changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
@@ -222,7 +233,7 @@ WRONG_HEADERS = [
 
 @pytest.mark.parametrize("repair", WRONG_HEADERS)
 def test_malformed_header(repair: RtpPacket) -> None:
-    """A repair packet that is not ours, cut off or of another stream is counted also when nothing was lost."""
+    """A repair packet that is not ours, cut off, too long or of another stream is counted also if nothing was lost."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT, repair]) == []
     assert counters(receiver) == (0, 1, 0)
@@ -310,6 +321,13 @@ def test_bounded_memory() -> None:
     push_all(receiver, (RtpPacket(96, number % 2**16, 7, MEDIA_SSRC, False, b"") for number in range(70_000)))
     assert sys.getsizeof(receiver._media) == size
     assert len(receiver._media) == MEDIA_KEPT
+
+
+def test_bounded_memory_of_long_packets() -> None:
+    """Media packets longer than any that are repaired are not kept."""
+    receiver = RepairReceiver()
+    push_all(receiver, frame(b"x" * size for size in (1498, 1499, 65_000)))
+    assert [kept.sequence for kept in receiver._media if kept] == [100]
 
 
 def test_repair_packet_from_long_ago() -> None:

@@ -25,6 +25,8 @@ MAX_REPAIR_PACKETS: Final = 2
 MAX_BLOCK_PACKETS: Final = 16
 MAX_BLOCKS: Final = 255
 """In one frame; a frame of more than 16 * 255 packets gets no repair packets."""
+MAX_SYMBOL_BYTES: Final = 1500
+"""Of a payload with its length: more than a packet on Ethernet has, so that what is kept stays small."""
 MEDIA_KEPT: Final = 4096
 """Media packets kept to make lost ones from: more than the largest frame has, some seconds of any stream."""
 OPEN_BLOCKS: Final = 64
@@ -50,7 +52,8 @@ class RepairSender:
         """Make `count` repair packets for each block of a frame, to be sent after it.
 
         `datagrams` are all RTP packets of the frame, in order, as the `Packetizer` gave them; a frame of more than
-        `MAX_BLOCKS` blocks gets none. Raises `UserError` for another `count` than 0, 1 or 2.
+        `MAX_BLOCKS` blocks or with a packet too long for `MAX_SYMBOL_BYTES` gets none. Raises `UserError` for another
+        `count` than 0, 1 or 2.
         """
         if not 0 <= count <= MAX_REPAIR_PACKETS:
             raise UserError(f"{count} repair packets for a block: choose 0, 1 or {MAX_REPAIR_PACKETS}")
@@ -59,6 +62,8 @@ class RepairSender:
             return []
         first = parse_packet(datagrams[0])
         symbols = [_symbol(datagram[_RTP_HEADER_BYTES:]) for datagram in datagrams]
+        if max(map(len, symbols)) > MAX_SYMBOL_BYTES:
+            return []
         coded = [parity(symbols[block::blocks], count) for block in range(blocks)]
         repairs = []
         # The second packets of all blocks follow the first ones, so that a burst at the end does not hit both of one.
@@ -121,10 +126,10 @@ class _Block:
 class RepairReceiver:
     """Makes lost media packets again from the other packets of their block and its repair packets.
 
-    It never raises and holds `MEDIA_KEPT` packets and `OPEN_BLOCKS` blocks at most. Public counters: `recovered`,
-    media packets made again, also such as come later themselves; `malformed`, repair packets that cannot be right, do
-    not fit the others of their block or are of another stream than the media; `unrepaired`, blocks given up that lacked
-    more than could be made again.
+    It never raises and holds `MEDIA_KEPT` packets and `OPEN_BLOCKS` blocks at most, none with symbols longer than
+    `MAX_SYMBOL_BYTES`. Public counters: `recovered`, media packets made again, also such as come later themselves;
+    `malformed`, repair packets that cannot be right, do not fit the others of their block or are of another stream than
+    the media; `unrepaired`, blocks given up that lacked more than could be made again.
     """
 
     def __init__(self) -> None:
@@ -151,7 +156,8 @@ class RepairReceiver:
                 return []
         if packet.ssrc != self._ssrc:
             self._change_stream(packet.ssrc)
-        if not self._keep(packet) or not self._open:
+        too_long = len(packet.payload) + _LENGTH_BYTES > MAX_SYMBOL_BYTES
+        if too_long or not self._keep(packet) or not self._open:
             return []
         recovered: list[RtpPacket] = []
         for key, block in list(self._open.items()):
@@ -281,8 +287,8 @@ def _blocks_of(packets: int) -> int:
 def _parse(packet: RtpPacket) -> tuple[_Shape, int, bytes]:
     """Read a repair packet: its block, which one of the block it is, and its coded bytes."""
     symbol = packet.payload[_HEADER.size :]
-    if len(symbol) <= _LENGTH_BYTES:
-        raise BadPacket("repair packet cut off")
+    if not _LENGTH_BYTES < len(symbol) <= MAX_SYMBOL_BYTES:
+        raise BadPacket("repair packet cut off, or longer than any of ours")
     version, payload_type, first_sequence, ssrc, packets, block, which = _HEADER.unpack_from(packet.payload)
     if version != _VERSION or payload_type > 0x7F or payload_type == REPAIR_PAYLOAD_TYPE:
         raise BadPacket("not a repair packet of ours")
