@@ -80,8 +80,8 @@ def _forget(_message: Message, _now: Now) -> None: ...
 class Nowhere:
     """A link that leads nowhere."""
 
-    def send(self, send: Send) -> None:
-        """Forget a message."""
+    def send(self, *sends: Send) -> None:
+        """Forget messages."""
 
 
 class Note(Protocol):

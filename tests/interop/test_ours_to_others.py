@@ -57,8 +57,8 @@ class Stamps:
 class Nowhere:
     """A link to a client that is not there."""
 
-    def send(self, send: Send) -> None:
-        """Forget a message."""
+    def send(self, *sends: Send) -> None:
+        """Forget messages."""
 
 
 def changes(port: int) -> list[str]:

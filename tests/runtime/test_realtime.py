@@ -37,9 +37,9 @@ class Kept:
         """Write one entry."""
         self.entries.append((topic, payload))
 
-    def send(self, send: Send) -> None:
-        """Carry a message."""
-        self.sent.append(send)
+    def send(self, *sends: Send) -> None:
+        """Carry messages."""
+        self.sent += sends
 
 
 class Ticker:

@@ -12,6 +12,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.fec import (
     BLOCK_LIFE_NS,
+    MAX_SYMBOL_BYTES,
     MEDIA_KEPT,
     OPEN_BLOCKS,
     REPAIR_PAYLOAD_TYPE,
@@ -75,6 +76,12 @@ def test_bytes_of_a_repair_packet() -> None:
     ]
 
 
+def test_bytes_of_p_and_q() -> None:
+    """Of the frame in docs/wire.md the first repair packet carries P and the second one Q."""
+    repairs = repairs_of(frame([b"\x61\x62\x63", b"\xc4"]), 2)
+    assert [repair.payload[12:].hex(" ") for repair in repairs] == ["00 02 a5 62 63", "00 01 f4 62 63"]
+
+
 @pytest.mark.parametrize(
     ("packets", "blocks"), [(0, 0), (1, 1), (16, 1), (17, 2), (32, 2), (33, 3), (4080, 255), (4081, 0)]
 )
@@ -83,6 +90,13 @@ def test_blocks(packets: int, blocks: int) -> None:
     media = frame([b"x"] * packets)
     for count in (0, 1, 2):
         assert len(repairs_of(media, count)) == blocks * count
+
+
+def test_order() -> None:
+    """The second repair packets of all blocks follow the first ones, so that a burst hits few of one block."""
+    repairs = repairs_of(frame([b"x"] * 33), 2)
+    assert [tuple(repair.payload[10:12]) for repair in repairs] == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
+    assert [repair.sequence for repair in repairs] == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("count", [-1, 3])
@@ -96,6 +110,15 @@ def test_repair_packets_are_small() -> None:
     """A repair packet of packets of 1200 bytes is 14 bytes longer than these."""
     media = frame([b"x" * 1188] * 8)
     assert [len(repair.to_bytes()) for repair in repairs_of(media, 2)] == [1214, 1214]
+
+
+@pytest.mark.parametrize(("payload_bytes", "repairs"), [(1498, 2), (1499, 0)])
+def test_long_packets(payload_bytes: int, repairs: int) -> None:
+    """A frame with a payload of more than 1498 bytes gets no repair packets, one of 1498 bytes is repaired."""
+    media = frame([b"short", b"x" * payload_bytes])
+    assert len(repairs_of(media, 2)) == repairs
+    receiver = RepairReceiver()
+    assert push_all(receiver, [media[0], *repairs_of(media, 2)]) == media[1:][:repairs]
 
 
 def test_burst() -> None:
@@ -192,26 +215,40 @@ def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first:
     assert receiver.malformed == 0
 
 
+WRONG_HEADERS = [
+    with_payload(REPAIRS[0], b""),
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
+    with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
+    with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
+    changed(REPAIRS[0], _0=2),
+    changed(REPAIRS[0], _1=0xE0),
+    changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
+    changed(REPAIRS[0], _7=5),
+    changed(REPAIRS[0], _8=0, _9=0),
+    changed(REPAIRS[0], _8=0xFF, _9=0xFF),
+    changed(REPAIRS[0], _10=1),
+    changed(REPAIRS[0], _11=2),
+]
+
+
+@pytest.mark.parametrize("repair", WRONG_HEADERS)
+def test_malformed_header(repair: RtpPacket) -> None:
+    """A repair packet that is not ours, cut off, too long or of another stream is counted also if nothing was lost."""
+    receiver = RepairReceiver()
+    assert push_all(receiver, [*EIGHT, repair]) == []
+    assert counters(receiver) == (0, 1, 0)
+
+
 @pytest.mark.parametrize(
     "repair",
     [
-        with_payload(REPAIRS[0], b""),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:12]),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
-        changed(REPAIRS[0], _0=2),
-        changed(REPAIRS[0], _1=0xE0),
-        changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
-        changed(REPAIRS[0], _7=5),
-        changed(REPAIRS[0], _8=0, _9=0),
-        changed(REPAIRS[0], _8=0xFF, _9=0xFF),
-        changed(REPAIRS[0], _10=1),
-        changed(REPAIRS[0], _11=2),
+        *WRONG_HEADERS,
         # Shorter than the media of its block: cut off.
         with_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
-        # What would come out is longer than the packet, empty, or has something behind its end.
+        # What would come out is longer than the packet, has something behind its end, or is empty.
         changed(REPAIRS[0], _12=REPAIRS[0].payload[12] ^ 1),
-        with_payload(REPAIRS[0], REPAIRS[0].payload[:12] + bytes(29)),
         changed(REPAIRS[0], _40=REPAIRS[0].payload[40] ^ 1),
+        repairs_of([*EIGHT[:3], with_payload(EIGHT[3], b""), *EIGHT[4:]], 1)[0],
     ],
 )
 def test_malformed(repair: RtpPacket) -> None:
@@ -286,6 +323,13 @@ def test_bounded_memory() -> None:
     assert len(receiver._media) == MEDIA_KEPT
 
 
+def test_bounded_memory_of_long_packets() -> None:
+    """Media packets longer than any that are repaired are not kept."""
+    receiver = RepairReceiver()
+    push_all(receiver, frame(b"x" * size for size in (1498, 1499, 65_000)))
+    assert [kept.sequence for kept in receiver._media if kept] == [100]
+
+
 def test_repair_packet_from_long_ago() -> None:
     """A repair packet that comes again when its media packets are no longer kept gives nothing again."""
     receiver = RepairReceiver()
@@ -313,7 +357,23 @@ def test_same_numbers_of_another_frame() -> None:
     """Media packets with the sequence numbers of a block but another timestamp are not of it."""
     receiver = RepairReceiver()
     stale = frame((b"stale" for _ in range(8)), timestamp=1)
-    assert push_all(receiver, [*stale, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+    later = frame((b"later" for _ in range(8)), timestamp=2)
+    assert push_all(receiver, [*stale, *EIGHT[:6], REPAIRS[0], later[7]]) == []
+    assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
+
+
+def test_same_numbers_of_another_stream() -> None:
+    """Media packets of the stream before are not of a block, though they have its sequence numbers and timestamp."""
+    receiver = RepairReceiver()
+    other = frame((b"other" for _ in range(8)), ssrc=9)
+    assert push_all(receiver, [*other, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
+
+
+def test_same_place_among_those_kept() -> None:
+    """Media packets as far apart as packets are kept are not taken for one another."""
+    receiver = RepairReceiver()
+    before = frame((b"before" for _ in range(8)), first=(100 - MEDIA_KEPT) % 2**16)
+    assert push_all(receiver, [*before, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
 
 
 def test_access_unit() -> None:

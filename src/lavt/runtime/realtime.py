@@ -7,6 +7,7 @@ import logging
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from typing import Any, Protocol
 
 from lavt.clock import Clock
@@ -15,7 +16,7 @@ from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
 from lavt.runtime.recording import Recorder
-from lavt.transport.channels import CHANNELS
+from lavt.transport.channels import CHANNELS, Carrier
 from lavt.transport.clock_offset import ClockReport
 
 SWITCH_INTERVAL_S = 0.0005
@@ -27,8 +28,8 @@ log = logging.getLogger(__name__)
 class Link(Protocol):
     """What carries messages to the other side."""
 
-    def send(self, send: Send) -> None:
-        """Carry a message; never waits, never raises for what the network does."""
+    def send(self, *sends: Send) -> None:
+        """Carry messages, in order; never waits, never raises for what the network does."""
         ...
 
 
@@ -94,8 +95,8 @@ class RealRuntime:
         """Walk a message through its hops and send what comes out."""
         readings = iter(self._clock.now, None)
         walked = walk(node.name, node.chains[message.channel], message, next(readings), readings)
-        for send in walked.sends:
-            self._send(send)
+        for carrier, sends in groupby(walked.sends, lambda send: CHANNELS[send.channel].carrier):
+            self._send(carrier, tuple(sends))
         if walked.timeline is not None:
             self._recorder.write("timeline", walked.timeline, walked.end)
 
@@ -103,16 +104,18 @@ class RealRuntime:
         """Read the clocks."""
         return self._clock.now()
 
-    def _send(self, send: Send) -> None:
+    def _send(self, carrier: Carrier, sends: Sequence[Send]) -> None:
+        """Send what goes the same way: the packets of a frame leave one right after the other."""
         now = self._clock.now()
-        carrier = CHANNELS[send.channel].carrier
         if carrier == "local":
-            self.deliver(send.channel, send.payload, now)
+            for send in sends:
+                self.deliver(send.channel, send.payload, now)
         elif carrier == "clock":
             threading.Thread(target=self._report_clock, name="clock source", daemon=True).start()
         elif carrier != "record":
-            self.links[carrier].send(send)
-        self._recorder.write(send.channel, send.payload, now)
+            self.links[carrier].send(*sends)
+        for send in sends:
+            self._recorder.write(send.channel, send.payload, now)
 
     def _report_clock(self) -> None:
         """Asking chrony takes a process of its own and some milliseconds: no node waits for it."""
@@ -141,17 +144,17 @@ class _Worker:
         """When the thread wakes by itself; None: only when it is told to; 0: it is awake."""
 
     def put(self, message: Message) -> None:
-        with self._condition:
-            self.inbox.put(message)
-        if CHANNELS[message.channel].at_once and self._turn.acquire(blocking=False):
+        if CHANNELS[message.channel].at_once and not self.inbox.waiting and self._turn.acquire(blocking=False):
             try:
-                while self._walk_next():
-                    pass
+                self._walk(message)
             finally:
                 self._turn.release()
-        with self._condition:
-            if self.inbox.waiting or _is_before(self._wake_ns, self._sleeps_until_ns):
-                self._condition.notify()
+            if not self.inbox.waiting and not _is_before(self._wake_ns, self._sleeps_until_ns):
+                return
+        else:
+            with self._condition:
+                self.inbox.put(message)
+        self.notify()
 
     def notify(self) -> None:
         with self._condition:
@@ -166,15 +169,20 @@ class _Worker:
 
     def _walk_next(self) -> bool:
         """Walk what comes next through the node; False where nothing does. Needs the turn."""
+        message = self._next()
+        if message is not None:
+            self._walk(message)
+        return message is not None
+
+    def _walk(self, message: Message) -> None:
+        """Walk a message through the node. Needs the turn."""
+        if self._runtime.stopped.is_set():
+            return
         try:
-            message = None if self._runtime.stopped.is_set() else self._next()
-            if message is not None:
-                self._runtime.run_chain(self.node, message)
-                self._wake_ns = self.node.next_wake_ns()
+            self._runtime.run_chain(self.node, message)
+            self._wake_ns = self.node.next_wake_ns()
         except BaseException as error:  # whatever ends a node must end the run, not leave half of it alive
             self._runtime.fail(error)
-            return False
-        return message is not None
 
     def _next(self) -> Message | None:
         """What the node does next: a wake that is due comes first, then what waits."""

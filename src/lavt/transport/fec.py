@@ -1,8 +1,8 @@
 """Forward error correction of the video: repair packets from which a receiver makes lost packets of a frame again.
 
 A frame's packets are cut into blocks of at most 16, packet i into block i mod blocks, so that a burst is shared out.
-Each block has 0, 1 or 2 repair packets (Reed-Solomon, `zfec`), and as many lost packets of it come back. They leave
-after the frame's last packet, so they delay nothing. Every byte of them: docs/wire.md, "Repair packets".
+Each block has 0, 1 or 2 repair packets (`erasure.py`), and as many lost packets of it come back. They leave after the
+frame's last packet, so they delay nothing. Every byte of them: docs/wire.md, "Repair packets".
 """
 
 from __future__ import annotations
@@ -11,22 +11,22 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Final
-
-import zfec
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import BadPacket, UserError
+from lavt.transport.erasure import missing, parity
 from lavt.transport.rtp import RtpPacket, parse_packet
 from lavt.value import value
 
 REPAIR_PAYLOAD_TYPE: Final = 97
 MAX_REPAIR_PACKETS: Final = 2
-"""For one block. It is part of the wire format: share k + 1 of k + 2 is not that of k + 3."""
+"""For one block: P, and Q where a second one is asked for."""
 MAX_BLOCK_PACKETS: Final = 16
 MAX_BLOCKS: Final = 255
 """In one frame; a frame of more than 16 * 255 packets gets no repair packets."""
+MAX_SYMBOL_BYTES: Final = 1500
+"""Of a payload with its length: more than a packet on Ethernet has, so that what is kept stays small."""
 MEDIA_KEPT: Final = 4096
 """Media packets kept to make lost ones from: more than the largest frame has, some seconds of any stream."""
 OPEN_BLOCKS: Final = 64
@@ -52,7 +52,8 @@ class RepairSender:
         """Make `count` repair packets for each block of a frame, to be sent after it.
 
         `datagrams` are all RTP packets of the frame, in order, as the `Packetizer` gave them; a frame of more than
-        `MAX_BLOCKS` blocks gets none. Raises `UserError` for another `count` than 0, 1 or 2.
+        `MAX_BLOCKS` blocks or with a packet too long for `MAX_SYMBOL_BYTES` gets none. Raises `UserError` for another
+        `count` than 0, 1 or 2.
         """
         if not 0 <= count <= MAX_REPAIR_PACKETS:
             raise UserError(f"{count} repair packets for a block: choose 0, 1 or {MAX_REPAIR_PACKETS}")
@@ -61,7 +62,9 @@ class RepairSender:
             return []
         first = parse_packet(datagrams[0])
         symbols = [_symbol(datagram[_RTP_HEADER_BYTES:]) for datagram in datagrams]
-        coded = [_encode(symbols[block::blocks], count) for block in range(blocks)]
+        if max(map(len, symbols)) > MAX_SYMBOL_BYTES:
+            return []
+        coded = [parity(symbols[block::blocks], count) for block in range(blocks)]
         repairs = []
         # The second packets of all blocks follow the first ones, so that a burst at the end does not hit both of one.
         for which in range(count):
@@ -113,7 +116,7 @@ class _Block:
     packets: dict[int, RtpPacket | None]
     """All of the block by sequence number, in order; None is missing."""
     symbols: dict[int, bytes]
-    """Of the repair packets, by which one of the block it is."""
+    """Of parity: what the repair packets carry, by which one of the block it is."""
 
     def lacks(self, packet: RtpPacket) -> bool:
         """Tell whether a packet of the same SSRC is one that is missing here."""
@@ -123,10 +126,10 @@ class _Block:
 class RepairReceiver:
     """Makes lost media packets again from the other packets of their block and its repair packets.
 
-    It never raises and holds `MEDIA_KEPT` packets and `OPEN_BLOCKS` blocks at most. Public counters: `recovered`,
-    media packets made again, also such as come later themselves; `malformed`, repair packets that cannot be right, do
-    not fit the others of their block or are of another stream than the media; `unrepaired`, blocks given up that lacked
-    more than could be made again.
+    It never raises and holds `MEDIA_KEPT` packets and `OPEN_BLOCKS` blocks at most, none with symbols longer than
+    `MAX_SYMBOL_BYTES`. Public counters: `recovered`, media packets made again, also such as come later themselves;
+    `malformed`, repair packets that cannot be right, do not fit the others of their block or are of another stream than
+    the media; `unrepaired`, blocks given up that lacked more than could be made again.
     """
 
     def __init__(self) -> None:
@@ -153,7 +156,8 @@ class RepairReceiver:
                 return []
         if packet.ssrc != self._ssrc:
             self._change_stream(packet.ssrc)
-        if not self._keep(packet) or not self._open:
+        too_long = len(packet.payload) + _LENGTH_BYTES > MAX_SYMBOL_BYTES
+        if too_long or not self._keep(packet) or not self._open:
             return []
         recovered: list[RtpPacket] = []
         for key, block in list(self._open.items()):
@@ -170,7 +174,7 @@ class RepairReceiver:
         key = shape.ssrc, shape.timestamp, shape.block
         block = self._open.get(key)
         if block is None:
-            packets = {sequence: self._find(shape, sequence) for sequence in shape.sequences}
+            packets = {sequence: self._find(shape.ssrc, shape.timestamp, sequence) for sequence in shape.sequences}
             if None not in packets.values() or any(self._passed(shape, sequence) for sequence in packets):
                 return []
             block = self._open[key] = _Block(shape, now_ns, packets, {})
@@ -184,12 +188,12 @@ class RepairReceiver:
 
     def _settle(self, key: tuple[int, int, int], block: _Block) -> list[RtpPacket]:
         """Make the missing packets of a block when there is enough of it, and be done with it."""
-        missing = sum(packet is None for packet in block.packets.values())
-        if missing > len(block.symbols):
+        lost = sum(packet is None for packet in block.packets.values())
+        if lost > len(block.symbols):
             return []
         del self._open[key]
         try:
-            made = _decode(block)
+            made = _missing_packets(block)
         except BadPacket:
             self.malformed += 1
             return []
@@ -199,28 +203,15 @@ class RepairReceiver:
 
     def _keep(self, packet: RtpPacket) -> bool:
         """Keep a media packet; False: it was there already."""
-        place = packet.sequence % MEDIA_KEPT
-        kept = self._media[place]
-        if (
-            kept is not None
-            and kept.sequence == packet.sequence
-            and kept.timestamp == packet.timestamp
-            and kept.ssrc == packet.ssrc
-        ):
+        if self._find(packet.ssrc, packet.timestamp, packet.sequence) is not None:
             return False
-        self._media[place] = packet
+        self._media[packet.sequence % MEDIA_KEPT] = packet
         return True
 
-    def _find(self, shape: _Shape, sequence: int) -> RtpPacket | None:
-        """Give the media packet of a block's frame, if it is kept."""
+    def _find(self, ssrc: int, timestamp: int, sequence: int) -> RtpPacket | None:
+        """Give a media packet if it is kept."""
         kept = self._media[sequence % MEDIA_KEPT]
-        if (
-            kept is not None
-            and kept.sequence == sequence
-            and kept.timestamp == shape.timestamp
-            and kept.ssrc == shape.ssrc
-            and kept.payload_type == shape.payload_type
-        ):
+        if kept is not None and (kept.sequence, kept.timestamp, kept.ssrc) == (sequence, timestamp, ssrc):
             return kept
         return None
 
@@ -296,8 +287,8 @@ def _blocks_of(packets: int) -> int:
 def _parse(packet: RtpPacket) -> tuple[_Shape, int, bytes]:
     """Read a repair packet: its block, which one of the block it is, and its coded bytes."""
     symbol = packet.payload[_HEADER.size :]
-    if len(symbol) <= _LENGTH_BYTES:
-        raise BadPacket("repair packet cut off")
+    if not _LENGTH_BYTES < len(symbol) <= MAX_SYMBOL_BYTES:
+        raise BadPacket("repair packet cut off, or longer than any of ours")
     version, payload_type, first_sequence, ssrc, packets, block, which = _HEADER.unpack_from(packet.payload)
     if version != _VERSION or payload_type > 0x7F or payload_type == REPAIR_PAYLOAD_TYPE:
         raise BadPacket("not a repair packet of ours")
@@ -311,53 +302,20 @@ def _symbol(payload: bytes) -> bytes:
     return len(payload).to_bytes(_LENGTH_BYTES, "big") + payload
 
 
-def _encode(symbols: list[bytes], count: int) -> list[bytes]:
-    """Code the packets of one block: the first `count` shares after theirs."""
-    size = max(map(len, symbols))
-    shares = tuple(symbol.ljust(size, b"\x00") for symbol in symbols)
-    coded: list[bytes] = _encoder(len(shares)).encode(shares, tuple(range(len(shares), len(shares) + count)))
-    return coded
-
-
-def _decode(block: _Block) -> list[RtpPacket]:
+def _missing_packets(block: _Block) -> list[RtpPacket]:
     """Make the missing packets of a block that has symbols enough.
 
     Raises `BadPacket` when the symbols cannot be of these packets.
     """
-    shape = block.shape
-    symbols = iter(block.symbols.items())
-    shares, numbers = [], []
-    for place, packet in enumerate(block.packets.values()):
-        if packet is None:
-            which, share = next(symbols)
-            number = len(block.packets) + which
-        else:
-            number, share = place, _symbol(packet.payload).ljust(shape.symbol_bytes, b"\x00")
-        if len(share) != shape.symbol_bytes:
-            raise BadPacket("a media packet longer than its repair packet")
-        shares.append(share)
-        numbers.append(number)
-    decoded = _decoder(len(shares)).decode(shares, numbers)
-    missing = [sequence for sequence, packet in block.packets.items() if packet is None]
-    places = list(block.packets)
-    return [shape.packet(sequence, _payload(decoded[places.index(sequence)])) for sequence in missing]
+    symbols = [None if packet is None else _symbol(packet.payload) for packet in block.packets.values()]
+    sequences = [sequence for sequence, packet in block.packets.items() if packet is None]
+    made = zip(sequences, missing(symbols, block.symbols), strict=True)
+    return [block.shape.packet(sequence, _payload(symbol)) for sequence, symbol in made]
 
 
 def _payload(symbol: bytes) -> bytes:
-    """Take the payload out of what was decoded; there is always one, and nothing but zeros after it."""
+    """Take the payload out of what was made; there is always one, and nothing but zeros after it."""
     end = _LENGTH_BYTES + int.from_bytes(symbol[:_LENGTH_BYTES], "big")
     if not _LENGTH_BYTES < end <= len(symbol) or symbol.count(0, end) != len(symbol) - end:
         raise BadPacket("repair that gives no packet")
     return symbol[_LENGTH_BYTES:end]
-
-
-@cache
-def _encoder(packets: int) -> zfec.Encoder:
-    """Give the coder of blocks of this size: making it inverts a matrix."""
-    return zfec.Encoder(packets, packets + MAX_REPAIR_PACKETS)
-
-
-@cache
-def _decoder(packets: int) -> zfec.Decoder:
-    """Give the decoder of blocks of this size."""
-    return zfec.Decoder(packets, packets + MAX_REPAIR_PACKETS)

@@ -89,9 +89,10 @@ class Injector:
         self._thread = threading.Thread(target=self._work, name="injector", daemon=True)
         self._thread.start()
 
-    def send(self, send: Send) -> None:
-        """Take an order."""
-        self._orders.put(send.payload)
+    def send(self, *sends: Send) -> None:
+        """Take orders."""
+        for send in sends:
+            self._orders.put(send.payload)
 
     def close(self) -> None:
         """Put everything back."""

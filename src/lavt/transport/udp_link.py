@@ -71,15 +71,16 @@ class UdpLink:
         """Begin to receive."""
         self._thread.start()
 
-    def send(self, send: Send) -> None:
-        """Send a datagram; what the network refuses is counted."""
-        address = send.peer
-        if self._remote is not None:
-            address = self._server = (self._remote[0], self._remote[1] or send.peer)
-        try:
-            self._socket.sendto(send.payload, address)
-        except OSError:
-            self.counts["datagrams_not_sent"] += 1
+    def send(self, *sends: Send) -> None:
+        """Send datagrams; what the network refuses is counted."""
+        for send in sends:
+            address = send.peer
+            if self._remote is not None:
+                address = self._server = (self._remote[0], self._remote[1] or send.peer)
+            try:
+                self._socket.sendto(send.payload, address)
+            except OSError:
+                self.counts["datagrams_not_sent"] += 1
 
     def close(self) -> None:
         """Stop receiving and close the socket."""

@@ -170,8 +170,12 @@ class ZenohLink:
             self._declared.append(self._session.declare_queryable(f"{self._base}/{channel}", asked))
         self._declared.append(self._session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
-    def send(self, send: Send) -> None:
-        """Carry a message of this side; what cannot be sent now is counted, for there is always a newer one."""
+    def send(self, *sends: Send) -> None:
+        """Carry messages of this side; what cannot be sent now is counted, for there is always a newer one."""
+        for send in sends:
+            self._send(send)
+
+    def _send(self, send: Send) -> None:
         try:
             if send.channel in ANSWERS:
                 self._ask(send.channel, send.payload)
