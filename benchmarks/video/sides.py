@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.video.run import RATE_HZ, Run, new_table, told
 from numpy.typing import NDArray
 
+import lavt
 from lavt.domain import NS_PER_MS
 from lavt.errors import WorkError
 
@@ -23,8 +24,6 @@ Side = Literal["ours", "gstreamer"]
 
 WARM_UP_FRAMES = 3 * RATE_HZ
 """Sent first, and not counted."""
-LONGEST_WAIT_S = 60.0
-"""Beyond the run itself."""
 DRAIN_S = 0.5
 """What is on its way at the end has so long to arrive."""
 FOLDER = Path(__file__).parents[2]
@@ -34,7 +33,7 @@ class Process:
     """A process of a run: begins when told to, and tells things by lines of JSON."""
 
     def __init__(self, name: str, run: Run, *more: str) -> None:
-        paths = os.pathsep.join([str(FOLDER), *sys.path[1:]])
+        paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self.name = name
         self._process = subprocess.Popen(
             [sys.executable, "-m", f"benchmarks.video.{name}", told(run), *more],
