@@ -37,7 +37,8 @@ class Process:
         self.name = name
         self._process = subprocess.Popen(
             [sys.executable, "-m", f"benchmarks.video.{name}", told(run), *more],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=FOLDER,
+            env={**os.environ, "PYTHONPATH": paths},
         )  # fmt: skip
 
     @property
