@@ -18,8 +18,8 @@ def test_needy():
 """
 
 
-def outcome(folder: Path, required: str | None, tests: str) -> tuple[int, str]:
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("LAVT_")}
+def outcome(folder: Path, required: str | None, tests: str, **variables: str) -> tuple[int, str]:
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("LAVT_")} | variables
     if required is not None:
         environment["LAVT_REQUIRE"] = required
     done = subprocess.run(
@@ -63,3 +63,18 @@ def test_the_lane_skips_on_an_ordinary_machine(tmp_path: Path, required: str | N
 
     assert exit_code == code, output
     assert said in output
+
+
+@pytest.mark.parametrize(
+    ("required", "code", "said"),
+    [(None, 0, "apt-get install gstreamer1.0-tools"), ("gstreamer", 1, "LAVT_REQUIRE names gstreamer: needs gst")],
+)
+def test_the_tests_with_foreign_tools_skip_where_there_are_none(
+    tmp_path: Path, required: str | None, code: int, said: str
+) -> None:
+    """Without GStreamer and ffmpeg their tests skip and name the packages; where these are required they fail."""
+    exit_code, output = outcome(tmp_path, required, "tests/interop", PATH=str(tmp_path))
+
+    assert exit_code == code, output
+    assert said in output
+    assert "passed" not in output

@@ -369,6 +369,7 @@ COMMANDS = [
     "report",
     "server",
     "client",
+    "sdp",
     "stop",
     "router",
     "relay",

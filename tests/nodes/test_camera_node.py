@@ -9,10 +9,19 @@ from lavt.control.written import WrittenStamps
 from lavt.domain import NS_PER_MS, NS_PER_S, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
+from lavt.transport.fec import RepairSender
 from lavt.transport.h264 import Encoder
 from lavt.transport.pictures import VideoSender
-from lavt.transport.rtcp import ReceptionReport, picture_loss, receiver_report
+from lavt.transport.rtcp import (
+    ReceptionReport,
+    is_rtcp,
+    max_bit_rate,
+    parse_announcement,
+    picture_loss,
+    receiver_report,
+)
 from lavt.transport.rtp import Packetizer, parse_packet
+from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathClient, PathServer
 
@@ -29,7 +38,14 @@ def node_with(camera: NoiseCamera | None = None, *, send_to: tuple[tuple[str, in
         Encoder(SMALL.width_px, SMALL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
     )
     path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
-    return CameraNode(camera or NoiseCamera(), pictures, Packetizer(2, 0), path, start_ns=MONO_NS, send_to=send_to)
+    return CameraNode(
+        camera or NoiseCamera(),
+        pictures,
+        StreamSender(Packetizer(2, 0), RepairSender(3, 0)),
+        path,
+        start_ns=MONO_NS,
+        send_to=send_to,
+    )
 
 
 def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:
@@ -51,7 +67,8 @@ def test_a_frame_is_told_sent_and_kept() -> None:
     assert (frame.number, frame.stamped_mono_ns, frame.capture_ns) == (0, MONO_NS, MONO_NS)
     assert frame.stamp_ns == unit.stamp_ns == at(0, 123_456_789).wall_ns
     assert frame.size_bytes == len(unit.data)
-    assert {parse_packet(packet).timestamp for packet in of(sends, "rtp")} == {rtp_timestamp(frame.stamp_ns)}
+    packets = [packet for packet in of(sends, "rtp") if not is_rtcp(packet)]
+    assert {parse_packet(packet).timestamp for packet in packets} == {rtp_timestamp(frame.stamp_ns)}
 
 
 def test_a_late_wake_skips_frames_and_counts_them() -> None:
@@ -183,3 +200,63 @@ def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
     assert node.counts["feedback_unreadable"] == 10
     give(node, "video_token", None, at(5 * NS_PER_S))
     assert of(wake(node, 5 * NS_PER_S + 1), "rtp") == []
+
+
+def heavy_loss(node: CameraNode, at_ns: int) -> None:
+    """Let the receiver report that 30 of 100 packets were lost."""
+    for highest, lost in ((1000, 0), (1100, 30)):
+        report = receiver_report(1, ReceptionReport(2, highest, lost / 100, lost, 0), clock_ns=at_ns)
+        give(node, "feedback", report, at(at_ns), HOME)
+
+
+def test_repair_packets_go_to_the_proven_receiver_only() -> None:
+    """Where the receiver reports loss, frames get repair packets; plain receivers get what every tool understands."""
+    node = node_with(send_to=(ELSEWHERE,))
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    heavy_loss(node, NS_PER_MS)
+    kinds: dict[object, list[int]] = {HOME: [], ELSEWHERE: []}
+    for send in wake(node, 2 * NS_PER_MS):
+        if send.channel == "rtp" and not is_rtcp(send.payload):
+            kinds[send.peer].append(parse_packet(send.payload).payload_type)
+    repairs = node.counts["packets_of_repair"]
+    assert repairs in {2, 4}, "two for each block of 16"
+    assert kinds[HOME] == [*kinds[ELSEWHERE], *[97] * repairs]
+    assert set(kinds[ELSEWHERE]) == {96}
+
+
+def test_a_sender_report_goes_with_a_frame_every_500_ms() -> None:
+    """Every receiver is told what was sent, and which wall time belongs to which RTP timestamp."""
+    node = node_with(send_to=(ELSEWHERE,))
+    reports = []
+    for number in range(46):
+        sends = wake(node, number * (FRAME_NS + 1))
+        packets = [packet for packet in of(sends, "rtp") if not is_rtcp(packet)]
+        for datagram in of(sends, "rtp"):
+            if is_rtcp(datagram):
+                (report,) = parse_announcement(datagram).reports
+                reports.append((number, report.rtp_timestamp == parse_packet(packets[0]).timestamp))
+    assert reports == [(0, True), (15, True), (30, True), (45, True)]
+
+
+def test_the_receiver_may_ask_for_a_lower_bit_rate() -> None:
+    """A limit that the receiver asks for is kept to; one above the own rate, or of a stranger, changes nothing."""
+    node = node_with()
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+
+    def mean_bytes(begin: int) -> float:
+        """Of frames once the rate has settled; REPORT keeps the path open."""
+        sizes: list[int] = []
+        for number in range(begin, begin + 40):
+            give(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
+            sizes += [each.size_bytes for each in of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")]
+        return sum(sizes[10:]) / 30
+
+    own = mean_bytes(0)
+    give(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(41 * FRAME_NS), HOME)
+    assert mean_bytes(42) < 0.5 * own
+    give(node, "feedback", max_bit_rate(1, 2, 9_000_000, overhead_bytes=0), at(90 * FRAME_NS), HOME)
+    assert mean_bytes(91) == pytest.approx(own, rel=0.2)
+    give(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
+    assert mean_bytes(141) == pytest.approx(own, rel=0.2)

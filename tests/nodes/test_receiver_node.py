@@ -5,11 +5,13 @@ from hypothesis import strategies as st
 from tests.nodes.stand_ins import at, give, of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.node import WAKE
+from lavt.node import WAKE, Send
 from lavt.nodes.receiver import ReceiverNode
 from lavt.nodes.reports import PathToken
+from lavt.transport.extended_reports import ReferenceAnswer
+from lavt.transport.fec import RepairSender
 from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import parse_feedback
+from lavt.transport.rtcp import parse_feedback, sender_report
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.video_path import HELLO_INTERVAL_NS, PathServer, is_path_datagram
 
@@ -98,18 +100,99 @@ def test_reports_go_out_every_500_ms() -> None:
     assert reports[3][1].lost_fraction == 0
 
 
-def test_a_loss_asks_for_a_keyframe_at_most_every_100_ms() -> None:
+def asks(sends: list[Send]) -> bool:
+    datagrams = [each for each in of(sends, "feedback") if not is_path_datagram(each)]
+    return any(parse_feedback(each).picture_loss for each in datagrams)
+
+
+def test_a_loss_asks_for_a_keyframe() -> None:
     """After a loss, and when the decoder has no picture, a keyframe is asked for, but once in 100 ms at most."""
     node = new_node()
     assert give(node, "picture_lost", None, at(0)) == []
-    first, second, third = packets()
-    for packet in [*first, *second[1:], *third]:
+    first, second, _ = packets()
+    for packet in [*first, *second[1:]]:
         give(node, "rtp", packet, at(0))
-    asked = of(give(node, WAKE, None, at(10 * NS_PER_MS)), "feedback")
-    assert any(not is_path_datagram(each) and parse_feedback(each).picture_loss for each in asked)
+    assert asks(give(node, WAKE, None, at(10 * NS_PER_MS)))
     times = [ms for ms in range(10, 400) if give(node, "picture_lost", None, at(ms * NS_PER_MS))]
     assert times == [110, 210, 310]
     assert node.counts["picture_loss_requests"] == 4
+
+
+def answered(node: ReceiverNode, round_trip_ns: int) -> None:
+    """Let the node report, and the sender answer 30 ms after it heard."""
+    (report,) = [each for each in of(give(node, WAKE, None, at(0)), "feedback") if not is_path_datagram(each)]
+    (reference,) = parse_feedback(report).reference_times
+    answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
+    datagram = sender_report(
+        77, wall_ns=at(0).wall_ns, rtp_timestamp=0, packets=1, octets=1, cname="x", answered=[answer]
+    )
+    assert give(node, "rtp", datagram, at(round_trip_ns + 30 * NS_PER_MS)) == []
+
+
+def test_it_asks_each_round_trip_until_the_keyframe_comes() -> None:
+    """Once the round trip is known, a request that brought no keyframe is made again after it and an encoding."""
+    node = new_node()
+    first, second, third = packets()
+    for packet in first:
+        give(node, "rtp", packet, at(0))
+    answered(node, 100 * NS_PER_MS)
+    for packet in second[1:]:
+        give(node, "rtp", packet, at(200 * NS_PER_MS))
+    times = [ms for ms in range(200, 700) if asks(give(node, WAKE, None, at(ms * NS_PER_MS)))]
+    assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), "100 ms to 1/65536 s, and 50 ms"
+    for packet in third:
+        give(node, "rtp", packet, at(700 * NS_PER_MS))
+    assert not any(asks(give(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
+    assert node.counts["picture_loss_requests"] == 4
+
+
+def test_a_repaired_loss_costs_nothing() -> None:
+    """A lost packet that a repair packet brings back leaves the access unit whole, and no keyframe is asked for."""
+    node = new_node()
+    first, second, _ = packets()
+    repairs = RepairSender(78, 0).repair(second, 1)
+    for packet in first:
+        give(node, "rtp", packet, at(0))
+    give(node, WAKE, None, at(10 * NS_PER_MS))
+    for packet in [*second[:2], *second[3:]]:
+        assert of(give(node, "rtp", packet, at(20 * NS_PER_MS)), "access_unit") == []
+    sends = give(node, "rtp", repairs[0], at(25 * NS_PER_MS))
+    assert [(unit.data, unit.complete) for unit in of(sends, "access_unit")] == [(UNIT, True)]
+    assert not asks([*sends, *give(node, WAKE, None, at(50 * NS_PER_MS))])
+    assert [node.counts[f"packets_{name}"] for name in ("recovered", "lost", "of_repair")] == [1, 0, 1]
+    (report,) = [r for s in of(give(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(s)
+                 for r in parse_feedback(s).reports]  # fmt: skip
+    assert report.cumulative_lost == 1, "as it is before repair"
+
+
+def test_each_second_is_written_down() -> None:
+    """The record has a line a second of how the stream arrived."""
+    node = new_node()
+    first, second, third = packets()
+    samples = []
+    for at_ms in range(0, 3001, 5):
+        for number, frame in enumerate((first, second[1:], third)):
+            if at_ms == 700 * number:
+                for packet in frame:
+                    give(node, "rtp", packet, at(at_ms * NS_PER_MS))
+        samples += of(give(node, WAKE, None, at(at_ms * NS_PER_MS)), "reception")
+    assert [sample.duration_ns for sample in samples] == [0, NS_PER_S, NS_PER_S, NS_PER_S]
+    assert [sample.packets for sample in samples] == [len(first), len(second) - 1, len(third), 0]
+    assert [sample.lost_after_repair for sample in samples] == [0, 1, 0, 0]
+
+
+def test_a_bit_rate_is_asked_for_with_each_report() -> None:
+    """The highest bit rate that is configured goes out with every report."""
+    node = ReceiverNode(ReorderBuffer(), Depacketizer(), 700_000)
+    give(node, "path_token", PathToken(TOKEN, PORT), at(0))
+    first, *_ = packets()
+    for packet in first:
+        give(node, "rtp", packet, at(0))
+    for number in range(3):
+        sends = of(give(node, WAKE, None, at(number * NS_PER_S // 2)), "feedback")
+        limits = [limit for each in sends if not is_path_datagram(each) for limit in parse_feedback(each).limits]
+        assert [(limit.media_ssrc, limit.overhead_bytes) for limit in limits] == [(77, 0)]
+        assert 699_990 <= limits[0].bit_rate_bps <= 700_000
 
 
 @given(st.one_of(st.binary(max_size=80), st.binary(max_size=80).map(lambda tail: b"LAVT" + tail)))

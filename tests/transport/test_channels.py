@@ -37,6 +37,10 @@ def nodes() -> Sequence[Node]:
     return [*server.all, *client.all]
 
 
+PART_OF = {"picture_reader": "driver"}
+"""Modules of which a node is made."""
+
+
 def sent_channels() -> set[tuple[str, str]]:
     """Read from the nodes' source what they send: (module, channel)."""
     found = set()
@@ -45,7 +49,7 @@ def sent_channels() -> set[tuple[str, str]]:
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Send":
                 channel = call.args[0]
                 assert isinstance(channel, ast.Constant), f"{path.name}:{call.lineno} sends on a channel without a name"
-                found.add((path.stem, str(channel.value)))
+                found.add((PART_OF.get(path.stem, path.stem), str(channel.value)))
     return found
 
 

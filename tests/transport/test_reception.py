@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.transport.extended_reports import ReferenceAnswer
+from lavt.transport.ntp_time import ntp_of_elapsed, short_time
 from lavt.transport.reception import Reception, ReceptionSample
 from lavt.transport.reorder import HOLD_NS, ReorderBuffer
-from lavt.transport.rtcp import SenderReport
+from lavt.transport.rtcp import Announcement, SenderReport
 from lavt.transport.rtp import RtpPacket
 
 SSRC = 7
@@ -46,14 +48,14 @@ def losses(stream: Stream, at_ns: int) -> tuple[int, float, int]:
 
 def sample(stream: Stream, at_ns: int) -> tuple[int, ...]:
     """Give packets, lost before repair, recovered, lost after it, reordered, late and duplicate."""
-    return astuple(stream.reception.sample(at_ns))[1:-1]
+    return astuple(stream.reception.sample(at_ns))[1:-2]
 
 
 def test_nothing_yet() -> None:
     """Before the first packet there is nothing to report, and a sample is empty and has no duration."""
     stream = Stream()
     assert stream.reception.report(NS_PER_S) is None
-    assert stream.reception.sample(NS_PER_S) == ReceptionSample(0, 0, 0, 0, 0, 0, 0, 0, 0)
+    assert stream.reception.sample(NS_PER_S) == ReceptionSample(0, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
 def test_samples_follow_each_other() -> None:
@@ -62,7 +64,7 @@ def test_samples_follow_each_other() -> None:
     stream.reception.sample(NS_PER_S)
     stream.arrive(1, 2 * NS_PER_S)
     assert stream.reception.sample(3 * NS_PER_S).duration_ns == NS_PER_S
-    assert stream.reception.sample(5 * NS_PER_S) == ReceptionSample(2 * NS_PER_S, 0, 0, 0, 0, 0, 0, 0, 0)
+    assert stream.reception.sample(5 * NS_PER_S) == ReceptionSample(2 * NS_PER_S, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
 def test_loss_without_repair() -> None:
@@ -221,14 +223,31 @@ def test_sender_report_comes_back() -> None:
     report = stream.reception.report(NS_PER_S)
     assert report is not None
     assert (report.last_report, report.last_report_age_ns) == (0, 0)
-    stream.reception.note_sender_report(SenderReport(SSRC, 0x0123_4567_89AB_CDEF, 0, 0, 0), NS_PER_S)
+    stream.reception.note_announcement(Announcement((SenderReport(SSRC, 0x0123_4567_89AB_CDEF, 0, 0, 0),)), 1, NS_PER_S)
     report = stream.reception.report(NS_PER_S + 250 * NS_PER_MS)
     assert report is not None
     assert (report.last_report, report.last_report_age_ns) == (0x4567_89AB, 250 * NS_PER_MS)
-    stream.reception.note_sender_report(SenderReport(SSRC + 1, 0x0123_4567_89AB_CDEF, 0, 0, 0), NS_PER_S)
+    stream.reception.note_announcement(
+        Announcement((SenderReport(SSRC + 1, 0x0123_4567_89AB_CDEF, 0, 0, 0),)), 1, NS_PER_S
+    )
     report = stream.reception.report(2 * NS_PER_S)
     assert report is not None
     assert report.last_report == 0
+
+
+def test_an_answer_tells_the_round_trip() -> None:
+    """The sender's answer to a reference time of ours gives the round trip; that to another receiver's does not."""
+    stream = Stream()
+    stream.arrive(1, 0)
+    sent_ns, kept_ns = 100 * NS_PER_S, 300 * NS_PER_MS
+    middle = short_time(ntp_of_elapsed(sent_ns))
+    arrived_ns = sent_ns + kept_ns + 80 * NS_PER_MS
+    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(6, middle, kept_ns),)), 5, arrived_ns)
+    assert stream.reception.round_trip_ns is None
+    stream.reception.note_announcement(Announcement((), (ReferenceAnswer(5, middle, kept_ns),)), 5, arrived_ns)
+    assert stream.reception.round_trip_ns is not None
+    assert abs(stream.reception.round_trip_ns - 80 * NS_PER_MS) < 50_000, "three steps of 1/65536 s"
+    assert stream.reception.sample(arrived_ns).round_trip_us == stream.reception.round_trip_ns // 1000
 
 
 def test_another_stream_begins_anew() -> None:

@@ -27,8 +27,10 @@ from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
+from lavt.transport.fec import RepairSender
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
+from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
 
 
@@ -134,7 +136,11 @@ def build_server(
         CameraNode(
             plant.camera,
             pictures,
-            Packetizer(entropy.number(32), entropy.number(16)),
+            StreamSender(
+                Packetizer(entropy.number(32), entropy.number(16)),
+                RepairSender(entropy.number(32), entropy.number(16)),
+                None if config.video.repair_packets == "auto" else config.video.repair_packets,
+            ),
             PathServer(lambda: entropy.token(32)),
             start_ns=start.mono_ns,
             send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
@@ -170,7 +176,11 @@ def build_client(
         waits=config.injection.condition != "",
     )
     return ClientNodes(
-        ReceiverNode(ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)), Depacketizer()),
+        ReceiverNode(
+            ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)),
+            Depacketizer(),
+            config.video.max_bit_rate_bps,
+        ),
         DriverNode(
             PictureReader(pictures),
             detector,

@@ -92,6 +92,8 @@ class VideoConfig(Section):
     """libx264's: a slower one makes better pictures of the same bits, and takes longer."""
     encoder_threads: int = Field(1, ge=1, le=16)
     """Each encodes a slice of every picture."""
+    repair_packets: Literal["auto", 0, 1, 2] = "auto"
+    """For each frame (for each 16 packets of a large one); auto: as many as the reported loss asks for."""
     reorder_hold_ms: float = Field(10.0, ge=0, le=500)
     """So long a packet waits for those before it: at least the network's jitter."""
 
@@ -316,6 +318,8 @@ class ClientVideoConfig(Section):
     server: str = "127.0.0.1"
     port: int = Field(0, ge=0, le=65535)
     """0: the port that the server names in the session."""
+    max_bit_rate_bps: int | None = Field(None, ge=50_000, le=50_000_000)
+    """What the server is asked to keep to, where that is less than its own bit rate."""
     reorder_hold_ms: float = Field(10.0, ge=0, le=500)
 
 

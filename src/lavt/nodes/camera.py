@@ -11,8 +11,7 @@ from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.reports import FrameWritten, VideoUnit
 from lavt.transport.pictures import PictureSender
 from lavt.transport.rtcp import is_rtcp, parse_feedback
-from lavt.transport.rtp import Packetizer
-from lavt.transport.stamp import rtp_timestamp
+from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.video_path import PathServer
 from lavt.value import value
 from lavt.vehicle.camera import Camera, CapturedFrame, FrameTimes, TimedCamera, newest_pose
@@ -59,7 +58,7 @@ class CameraNode:
         self,
         camera: Camera,
         pictures: PictureSender,
-        packetizer: Packetizer,
+        stream: StreamSender,
         path: PathServer,
         *,
         start_ns: int,
@@ -71,7 +70,7 @@ class CameraNode:
         self._there_after_ns, self._expose = 0, self._take_at_once
         if isinstance(camera, TimedCamera):
             self._there_after_ns, self._expose = camera.exposure_ns + camera.sensor_delay_ns, camera.expose
-        self._packetizer = packetizer
+        self._stream = stream
         self._path = path
         self._opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
         self._send_to = tuple(send_to)
@@ -149,20 +148,25 @@ class CameraNode:
         if keyframe:
             self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
             self._counts["keyframes_on_request"] += 1
+        self._pictures.limit_bit_rate(self._stream.bit_rate_limit_bps)
         return Encoded(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
 
     def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit
-        packets = self._packetizer.packetize(unit, rtp_timestamp(encoded.stamp_ns))
+        packets = self._stream.packets(unit, encoded.stamp_ns, now)
         proven = self._path.open_address(now.mono_ns)
-        addresses = self._send_to if proven is None else (proven, *self._send_to)
         self._counts["frames_sent"] += 1
-        self._counts["frames_without_receiver"] += not addresses
+        self._counts["frames_without_receiver"] += proven is None and not self._send_to
+        self._counts["packets_of_repair"] += 0 if proven is None else len(packets.repair)
         frame = FrameWritten(
             stamped.frame.number, encoded.stamp_ns, stamped.stamped_mono_ns, stamped.frame.capture_ns,
             stamped.pixel_crc, len(unit),
         )  # fmt: skip
-        sends = [Send("rtp", packet, address) for address in addresses for packet in packets]
+        sends = []
+        if proven is not None:
+            sends += [Send("rtp", each, proven) for each in (*packets.media, *packets.repair, *packets.report)]
+        plain = [*packets.media, *packets.report]
+        sends += [Send("rtp", each, address) for address in self._send_to for each in plain]
         return [*sends, Send("frame", frame), Send("video", VideoUnit(encoded.stamp_ns, unit))]
 
     def _note_pose(self, message: Message, _now: Now) -> None:
@@ -170,6 +174,7 @@ class CameraNode:
 
     def _note_token(self, message: Message, _now: Now) -> None:
         self._path.set_token(message.payload)
+        self._stream.forget_receiver()
 
     def _hear(self, message: Message, now: Now) -> list[Send] | None:
         """A datagram from somewhere: part of proving the path, or RTCP, which counts from an open path only."""
@@ -185,5 +190,6 @@ class CameraNode:
             self._counts["feedback_unreadable"] += 1
             return None
         self._path.report(message.peer, now.mono_ns)
+        self._stream.hear(feedback, now.mono_ns)
         self._keyframe_wanted |= feedback.picture_loss
         return None

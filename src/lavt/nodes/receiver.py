@@ -5,63 +5,82 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from lavt.domain import NS_PER_MS, Now
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.reports import PathToken, ReceivedUnit
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import ReceptionReport, picture_loss, receiver_report
-from lavt.transport.rtp import Depacketizer, RtpPacket, parse_packet
+from lavt.transport.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
+from lavt.transport.reception import Reception
+from lavt.transport.reorder import Ordered, ReorderBuffer
+from lavt.transport.rtcp import is_rtcp, max_bit_rate, parse_announcement, picture_loss, receiver_report
+from lavt.transport.rtp import Depacketizer, parse_packet
 from lavt.transport.video_path import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
 """Four reports within the 2 s after which the server closes a silent path."""
-PICTURE_LOSS_PAUSE_NS = 100 * NS_PER_MS
+SAMPLE_PERIOD_NS = NS_PER_S
+"""The record has a line of statistics for each second."""
+KEYFRAME_TAKES_NS = 50 * NS_PER_MS
+"""From the request to its sender to the packets of the keyframe: the wait for the next picture, and its encoding."""
+UNKNOWN_ROUND_TRIP_NS = 50 * NS_PER_MS
+"""Until a sender report has told it."""
 SSRC = 0x4C415654
 """Of the receiver in its reports: "LAVT"."""
 
 
 class ReceiverNode:
-    """Opens the path of the video, keeps it open with receiver reports, and asks for a keyframe after a loss."""
+    """Opens the path of the video, keeps it open with receiver reports, and asks for a keyframe after a loss.
+
+    What is lost comes back from repair packets where there are enough of them. Otherwise pictures are in doubt up to
+    the next whole keyframe, and one is asked for: at once, and again after each round trip without one.
+    `max_bit_rate_bps` is asked of the sender with each report.
+    """
 
     name = "receiver"
 
-    def __init__(self, reorder: ReorderBuffer, depacketizer: Depacketizer) -> None:
+    def __init__(self, reorder: ReorderBuffer, depacketizer: Depacketizer, max_bit_rate_bps: int | None = None) -> None:
         self._counts: Counter[str] = Counter()
         self._reorder = reorder
+        self._repair = RepairReceiver()
         self._depacketizer = depacketizer
+        self._reception = Reception(reorder)
+        self._max_bit_rate_bps = max_bit_rate_bps
         self._path: PathClient | None = None
         self._token = b""
         self._port = 0
-        self._report_ns = 0
-        self._picture_loss_ns = 0
         self._media_ssrc: int | None = None
-        self._packets_since_report = 0
-        self._lost_at_report = 0
-        self._transit: int | None = None
-        self._jitter = 0.0
+        self._report_ns = self._sample_ns = 0
+        self._in_doubt = False
+        self._ask_ns = 0
+        """When a keyframe may be asked for next."""
         self.chains: Mapping[str, Sequence[Hop]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
             "path_token": (("note", self._note_token),),
-            "picture_lost": (("ask", lambda _message, now: self._ask_for_keyframe(now.mono_ns)),),
+            "picture_lost": (("ask", self._note_picture_lost),),
             WAKE: (("expire", self._wake), ("depacketize", self._depacketize)),
         }
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted here, in the reorder buffer and in the depacketizer."""
-        names = ("late", "duplicate", "lost", "reordered", "stray")
+        """What was counted here, in the reorder buffer, the repair and the depacketizer."""
+        names = ("late", "duplicate", "lost", "reordered", "stray", "recovered")
         return {
             **self._counts,
             **{f"packets_{name}": getattr(self._reorder, name) for name in names},
+            "repair_malformed": self._repair.malformed,
+            "repair_blocks_given_up": self._repair.unrepaired,
             "payloads_malformed": self._depacketizer.malformed,
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the reorder buffer gives up waiting, a hello or a report is due."""
+        """When the reorder buffer gives up waiting, a hello, a report, a sample or a request is due."""
         times = [self._reorder.next_wake_ns()]
         if self._path is not None:
-            times += [self._path.next_hello_ns(), self._report_ns if self._media_ssrc is not None else None]
+            times.append(self._path.next_hello_ns())
+        if self._media_ssrc is not None:
+            times.append(self._sample_ns)
+            if self._path is not None:
+                times += [self._report_ns, self._ask_ns if self._asks_again() else None]
         return min((time for time in times if time is not None), default=None)
 
     def _note_token(self, message: Message, _now: Now) -> None:
@@ -71,71 +90,92 @@ class ReceiverNode:
             self._path = PathClient(token.token)
             self._port = token.port
 
-    def _receive(self, message: Message, now: Now) -> tuple[list[tuple[RtpPacket, bool]], Now, list[Send]] | None:
-        if is_path_datagram(message.payload):
-            answer = None if self._path is None else self._path.answer(message.payload)
+    def _receive(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]] | None:
+        """Sort out what came; what is not understood is counted and dropped."""
+        datagram: bytes = message.payload
+        if is_path_datagram(datagram):
+            answer = None if self._path is None else self._path.answer(datagram)
             self._counts["challenges_unreadable"] += answer is None
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
         try:
-            packet = parse_packet(message.payload)
+            if is_rtcp(datagram):
+                self._reception.note_announcement(parse_announcement(datagram), SSRC, message.arrived.mono_ns)
+                return None
+            return self._order(datagram, message.arrived, now), message.arrived, []
         except BadPacket:
             self._counts["packets_unreadable"] += 1
             return None
-        self._counts["packets"] += 1
-        self._packets_since_report += 1
-        self._note_transit(message.arrived.mono_ns, packet.timestamp)
-        self._media_ssrc = packet.ssrc
-        if self._path is not None:
-            self._path.video_arrived(now.mono_ns)
-        return self._reorder.push(packet, now.mono_ns), message.arrived, []
 
-    def _wake(self, message: Message, now: Now) -> tuple[list[tuple[RtpPacket, bool]], Now, list[Send]]:
+    def _order(self, datagram: bytes, arrived: Now, now: Now) -> Ordered:
+        """Put a packet in its place, and those that could be made again because of it; raises `BadPacket`."""
+        packet = parse_packet(datagram)
+        ordered: Ordered = []
+        if packet.payload_type == REPAIR_PAYLOAD_TYPE:
+            self._counts["packets_of_repair"] += 1
+        else:
+            self._counts["packets"] += 1
+            self._media_ssrc = packet.ssrc
+            if self._path is not None:
+                self._path.video_arrived(now.mono_ns)
+            ordered = self._reorder.push(packet, now.mono_ns)
+            self._reception.received(packet, arrived.mono_ns)
+        for made in self._repair.push(packet, now.mono_ns):
+            ordered += self._reorder.push_recovered(made, now.mono_ns)
+        return ordered
+
+    def _wake(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]]:
+        now_ns = now.mono_ns
         sends = []
-        if self._path is not None and now.mono_ns >= self._path.next_hello_ns():
-            sends.append(self._feedback(self._path.hello(now.mono_ns)))
-        if self._media_ssrc is not None and now.mono_ns >= self._report_ns:
-            sends.append(self._report(self._media_ssrc, now.mono_ns))
-            self._report_ns = now.mono_ns + REPORT_PERIOD_NS
-        return self._reorder.expire(now.mono_ns), message.arrived, sends
+        if self._path is not None and now_ns >= self._path.next_hello_ns():
+            sends.append(self._feedback(self._path.hello(now_ns)))
+        if self._media_ssrc is not None:
+            if self._path is not None and now_ns >= self._report_ns:
+                self._report_ns = now_ns + REPORT_PERIOD_NS
+                sends += self._report(self._media_ssrc, now_ns)
+            if now_ns >= self._sample_ns:
+                self._sample_ns = now_ns + SAMPLE_PERIOD_NS
+                sends.append(Send("reception", self._reception.sample(now_ns)))
+            if self._asks_again():
+                sends += self._ask_for_keyframe(now_ns)
+        return self._reorder.expire(now_ns), message.arrived, sends
 
-    def _depacketize(self, ordered: tuple[list[tuple[RtpPacket, bool]], Now, list[Send]], now: Now) -> list[Send]:
+    def _depacketize(self, ordered: tuple[Ordered, Now, list[Send]], now: Now) -> list[Send]:
         packets, arrived, sends = ordered
         for packet, lost_before in packets:
+            if lost_before:
+                self._in_doubt = True
             for unit in self._depacketizer.push(packet, lost_before=lost_before):
                 self._counts["access_units"] += 1
                 self._counts["access_units_incomplete"] += not unit.complete
+                self._in_doubt = not unit.complete or (self._in_doubt and not unit.keyframe)
                 received = ReceivedUnit(unit.data, unit.timestamp, unit.complete, unit.keyframe, arrived.mono_ns)
                 sends.append(Send("access_unit", received))
-            if lost_before:
-                sends += self._ask_for_keyframe(now.mono_ns)
-        return sends
+        return [*sends, *self._ask_for_keyframe(now.mono_ns)] if self._in_doubt and packets else sends
+
+    def _note_picture_lost(self, _message: Message, now: Now) -> list[Send]:
+        """The decoder has no picture, or not the one that was sent."""
+        self._in_doubt = True
+        return self._ask_for_keyframe(now.mono_ns)
+
+    def _asks_again(self) -> bool:
+        """Whether a keyframe should have come by `_ask_ns`; before a round trip is known only the next loss tells."""
+        return self._in_doubt and self._reception.round_trip_ns is not None
 
     def _ask_for_keyframe(self, now_ns: int) -> list[Send]:
-        """Ask for a keyframe after a loss, and no more often than one can come."""
-        if self._media_ssrc is None or now_ns < self._picture_loss_ns:
+        """Ask for a keyframe, unless one that was asked for can be on its way."""
+        if self._media_ssrc is None or self._path is None or now_ns < self._ask_ns:
             return []
-        self._picture_loss_ns = now_ns + PICTURE_LOSS_PAUSE_NS
+        round_trip_ns = self._reception.round_trip_ns
+        self._ask_ns = now_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
         self._counts["picture_loss_requests"] += 1
         return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
 
-    def _report(self, media_ssrc: int, now_ns: int) -> Send:
-        lost_in_all = self._reorder.lost - self._reorder.late
-        lost = max(0, lost_in_all - self._lost_at_report)
-        expected = self._packets_since_report + lost
-        fraction = lost / expected if expected else 0.0
-        self._packets_since_report, self._lost_at_report = 0, lost_in_all
-        report = ReceptionReport(
-            media_ssrc, self._reorder.highest_sequence, fraction, lost_in_all, round(self._jitter)
-        )  # fmt: skip
-        return self._feedback(receiver_report(SSRC, report, clock_ns=now_ns))
-
-    def _note_transit(self, arrived_ns: int, timestamp: int) -> None:
-        """Keep the interarrival jitter, in units of the RTP clock (RFC 3550, section 6.4.1)."""
-        transit = (arrived_ns * 9 // 100_000 - timestamp) & 0xFFFFFFFF
-        if self._transit is not None:
-            difference = (transit - self._transit + 2**31) % 2**32 - 2**31
-            self._jitter += (abs(difference) - self._jitter) / 16
-        self._transit = transit
+    def _report(self, media_ssrc: int, now_ns: int) -> list[Send]:
+        report = self._reception.report(now_ns)
+        sends = [] if report is None else [self._feedback(receiver_report(SSRC, report, clock_ns=now_ns))]
+        if self._max_bit_rate_bps is not None:
+            sends.append(self._feedback(max_bit_rate(SSRC, media_ssrc, self._max_bit_rate_bps, overhead_bytes=0)))
+        return sends
 
     def _feedback(self, datagram: bytes) -> Send:
         return Send("feedback", datagram, self._port)

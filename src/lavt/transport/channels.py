@@ -71,6 +71,7 @@ CHANNELS: dict[str, Channel] = {
     "truth": Channel("record", "actuator"),
     "route": Channel("record", "actuator"),
     "event": Channel("record", "actuator"),
+    "reception": Channel("record", "receiver"),
     "picture": Channel("record", "driver"),
     "lane": Channel("record", "driver"),
     "clock": Channel("record", "clock_sync"),

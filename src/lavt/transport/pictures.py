@@ -24,6 +24,8 @@ _STANDS_ALONE: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
 _LANE: Final = struct.Struct("!Qq7d")
 Planes = NDArray[np.uint8]
 """A picture in I420: (height * 3 / 2, width), the luma first."""
+LEAST_BIT_RATE_BPS: Final = 50_000
+"""Whatever is asked for: below it is no picture that anybody could drive by."""
 KEPT_PICTURES: Final = 300
 """Pictures that are on their way at most: 10 s of them at 30 Hz, and 280 MB."""
 
@@ -57,8 +59,8 @@ class PictureSender(Protocol):
         """Make an access unit of a stamped picture; a keyframe where one is asked for."""
         ...
 
-    def set_bit_rate(self, bit_rate_bps: int) -> None:
-        """Keep to another bit rate from the next picture on, where what is sent has one."""
+    def limit_bit_rate(self, limit_bps: int | None) -> None:
+        """Keep to a bit rate from the next picture on, where what is sent has one; None: to its own."""
         ...
 
 
@@ -82,6 +84,7 @@ class VideoSender:
 
     def __init__(self, encoder: Encoder) -> None:
         self._encoder = encoder
+        self._bit_rate_bps = encoder.bit_rate_bps
 
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
         """Convert the picture where it is not in I420 already; the number is a CRC-32 of its luma below the stamp."""
@@ -97,9 +100,10 @@ class VideoSender:
         """Encode one picture."""
         return self._encoder.encode_planes(stamped, keyframe=keyframe)
 
-    def set_bit_rate(self, bit_rate_bps: int) -> None:
-        """Open the encoder for another bit rate."""
-        self._encoder.set_bit_rate(bit_rate_bps)
+    def limit_bit_rate(self, limit_bps: int | None) -> None:
+        """Keep to the lower one of the limit and the encoder's own bit rate, and to the least one at least."""
+        wanted_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
+        self._encoder.set_bit_rate(max(wanted_bps, LEAST_BIT_RATE_BPS))
 
 
 class VideoReceiver:
@@ -159,7 +163,7 @@ class HandedOver:
         self._pictures.pop(self._key - KEPT_PICTURES, None)
         return _STANDS_ALONE + str(self._key).encode()
 
-    def set_bit_rate(self, bit_rate_bps: int) -> None:
+    def limit_bit_rate(self, limit_bps: int | None) -> None:
         """There is none."""
 
     def decode(self, access_unit: bytes) -> RenderedPicture | None:
@@ -200,7 +204,7 @@ class LaneSender:
         """Write it in hexadecimal digits."""
         return _STANDS_ALONE + _packed(stamped).hex().encode()
 
-    def set_bit_rate(self, bit_rate_bps: int) -> None:
+    def limit_bit_rate(self, limit_bps: int | None) -> None:
         """There is none."""
 
 

@@ -6,9 +6,10 @@ section 3); after repair one that the decoder had to do without.
 
 from __future__ import annotations
 
+from lavt.transport.extended_reports import answered_round_trip_ns
 from lavt.transport.ntp_time import short_time
 from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import ReceptionReport, SenderReport
+from lavt.transport.rtcp import Announcement, ReceptionReport, SenderReport
 from lavt.transport.rtp import RtpPacket
 from lavt.value import value
 
@@ -35,12 +36,18 @@ class ReceptionSample:
     """Came twice, or after they had been made again."""
     jitter_us: int
     """At the end (RFC 3550, section 6.4.1). A frame's packets share a timestamp, so the spacing of these is in it."""
+    round_trip_us: int | None
+    """The last one known at the end: of a report to the sender, and of the sender's report that answers it."""
 
 
 class Reception:
-    """Keeps the statistics of a stream whose packets go through `reorder`, in whose counters the losses are."""
+    """Keeps the statistics of a stream whose packets go through `reorder`, in whose counters the losses are.
+
+    Public: `round_trip_ns`, None before the sender has answered a report.
+    """
 
     def __init__(self, reorder: ReorderBuffer) -> None:
+        self.round_trip_ns: int | None = None
         self._reorder = reorder
         self._packets = 0
         self._strays = reorder.stray
@@ -66,9 +73,16 @@ class Reception:
         if self._strays <= strays:
             self._note_transit(packet.timestamp, arrived_ns)
 
-    def note_sender_report(self, report: SenderReport, arrived_ns: int) -> None:
-        """Remember a sender report, for the round trip that the sender will know from the next reception report."""
-        self._sender_report = report, arrived_ns
+    def note_announcement(self, announcement: Announcement, receiver_ssrc: int, arrived_ns: int) -> None:
+        """Take what a sender says, on the clock of our reports: the round trip, where it answers one of ours.
+
+        Its report is for the round trip that the sender will know from our next one.
+        """
+        for report in announcement.reports:
+            self._sender_report = report, arrived_ns
+        for answer in announcement.answers:
+            if answer.receiver_ssrc == receiver_ssrc:
+                self.round_trip_ns = answered_round_trip_ns(answer, arrived_ns) or self.round_trip_ns
 
     def report(self, now_ns: int) -> ReceptionReport | None:
         """Give the reception report since the one before (RFC 3550, A.3); None before the first packet."""
@@ -100,7 +114,10 @@ class Reception:
         duration_ns = 0
         if self._sampled_ns is not None:
             duration_ns, self._sampled_ns = now_ns - self._sampled_ns, now_ns
-        return ReceptionSample(duration_ns=duration_ns, jitter_us=round(self._jitter * 100 / 9), **since)
+        round_trip_us = None if self.round_trip_ns is None else self.round_trip_ns // 1000
+        return ReceptionSample(
+            duration_ns=duration_ns, jitter_us=round(self._jitter * 100 / 9), round_trip_us=round_trip_us, **since
+        )
 
     def _begin(self, ssrc: int, arrived_ns: int) -> None:
         """Begin a stream: a report is about one only."""

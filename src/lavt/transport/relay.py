@@ -22,6 +22,7 @@ from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
 from lavt.transport.delay import DelayLaw, DelayLine
 from lavt.transport.link import Injected, Link
+from lavt.transport.rtcp import is_rtcp
 
 LONGEST_DATAGRAM = 65_535
 BUFFER_BYTES = 4 * 1024 * 1024
@@ -44,8 +45,12 @@ def is_delayed_video(datagram: bytes) -> bool:
 
 
 def video_index(datagram: bytes) -> int:
-    """Index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay."""
-    return int(struct.unpack_from(">I", datagram, 4)[0]) if len(datagram) >= 8 else 0
+    """Index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay.
+
+    A sender report says the timestamp of the frame that it was sent with, and shares its delay.
+    """
+    at = 16 if is_rtcp(datagram) else 4
+    return int(struct.unpack_from(">I", datagram, at)[0]) if len(datagram) >= at + 4 else 0
 
 
 @dataclass(frozen=True, slots=True)

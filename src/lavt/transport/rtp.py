@@ -20,6 +20,7 @@ MAX_ACCESS_UNIT_BYTES: Final = 2 * 1024 * 1024
 """More than any picture needs: a peer that never ends its access unit fills no memory beyond this."""
 
 _HEADER = struct.Struct("!BBHII")
+RTP_HEADER_BYTES: Final = _HEADER.size
 _VERSION_2: Final = 0x80
 _START_CODE: Final = b"\x00\x00\x00\x01"
 _SHORT_START_CODE: Final = b"\x00\x00\x01"

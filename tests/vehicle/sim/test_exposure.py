@@ -18,9 +18,11 @@ from lavt.experiment.record import read_record
 from lavt.experiment.virtual_run import build_loop, drive, read_costs
 from lavt.node import WAKE
 from lavt.nodes.camera import CameraNode
+from lavt.transport.fec import RepairSender
 from lavt.transport.h264 import Encoder
 from lavt.transport.pictures import VideoSender
 from lavt.transport.rtp import Packetizer
+from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.video_path import PathServer
 from lavt.vehicle.sim.camera import SimCamera
 from lavt.vehicle.sim.camera import pose_at as pose_between
@@ -39,7 +41,9 @@ def node_of(camera: SimCamera) -> CameraNode:
     numbers = count()
     encoder = Encoder(MODEL.width_px, MODEL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=100)
     path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
-    return CameraNode(camera, VideoSender(encoder), Packetizer(2, 0), path, start_ns=MONO_NS)
+    return CameraNode(
+        camera, VideoSender(encoder), StreamSender(Packetizer(2, 0), RepairSender(3, 0)), path, start_ns=MONO_NS
+    )
 
 
 @pytest.mark.parametrize(("exposure_ns", "delay_ns"), [(0, 0), (10_000_000, 0), (8_333_333, 41_000_001), (0, 5_000)])

@@ -1,0 +1,70 @@
+"""The pictures that both sides send: a loop of the simulator's without a seam, in files mapped into memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lavt.domain import CameraModel, Picture, Pose
+from lavt.transport.stamp import STAMP_PX
+from lavt.vehicle.sim.renderer import Renderer
+from lavt.vehicle.sim.road import load_road
+
+LOOP_FRAMES = 300
+FRAME_M = 8.33 / 30
+FROM_M = 175.0
+ROUTE = "b"
+
+Planes = NDArray[np.uint8]
+"""I420, (height * 3 / 2, width)."""
+
+
+def render_loop(stem: Path, width_px: int, height_px: int) -> None:
+    """Write a drive at 30 km/h, forth and then back, as STEM.bgr.npy and STEM.i420.npy; every picture has its noise."""
+    road = load_road(ROUTE)
+    renderer = Renderer(road, CameraModel(width_px, height_px), seed=1, scenery="full")
+    colour = _new(stem, "bgr", (LOOP_FRAMES, height_px, width_px, 3))
+    planes = _new(stem, "i420", (LOOP_FRAMES, height_px * 3 // 2, width_px))
+    for number in range(LOOP_FRAMES):
+        place = min(number, LOOP_FRAMES - number)
+        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + place * FRAME_M))
+        colour[number] = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
+        cv2.cvtColor(colour[number], cv2.COLOR_BGR2YUV_I420, dst=planes[number])
+
+
+def colour_loop(stem: Path) -> NDArray[np.uint8]:
+    """Map the loop in blue, green and red; what is written to it stays in this process."""
+    return _mapped(stem, "bgr")
+
+
+def planes_loop(stem: Path) -> NDArray[np.uint8]:
+    """Map the loop in I420."""
+    return _mapped(stem, "i420")
+
+
+def squared_error(luma: NDArray[np.uint8], filmed: Planes) -> float:
+    """Mean squared error of a luma plane, (height, width), to what was filmed, without the corner of the stamp."""
+    height_px, width_px = luma.shape
+    below = cv2.norm(luma[STAMP_PX:], filmed[STAMP_PX:height_px], cv2.NORM_L2SQR)
+    beside = cv2.norm(luma[:STAMP_PX, STAMP_PX:], filmed[:STAMP_PX, STAMP_PX:], cv2.NORM_L2SQR)
+    error: float = (below + beside) / (height_px * width_px - STAMP_PX**2)
+    return error
+
+
+def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:
+    """Give the picture that a frame shows."""
+    shown: Picture = loop[number % LOOP_FRAMES]
+    return shown
+
+
+def _new(stem: Path, kind: str, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    return np.lib.format.open_memmap(f"{stem}.{kind}.npy", "w+", np.uint8, shape)
+
+
+def _mapped(stem: Path, kind: str) -> NDArray[np.uint8]:
+    loop: NDArray[np.uint8] = np.load(f"{stem}.{kind}.npy", mmap_mode="c")
+    loop.reshape(-1)[::4096].sum()  # no frame pays for the mapping of its pages
+    return loop

@@ -1,0 +1,172 @@
+"""Our two sides as `lavt server` and `lavt client` build them, less what has nothing to do with the video."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from benchmarks.video.pictures import LOOP_FRAMES, colour_loop
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
+
+from lavt.build.entropy import MachineEntropy
+from lavt.build.fidelity import VIDEO
+from lavt.build.sides import build_client, build_server
+from lavt.build.vehicles import Plant, build_unpictured
+from lavt.clock import MachineClock
+from lavt.config import ClientConfig, ServerConfig
+from lavt.control.drive_controller import CONTROLLERS
+from lavt.domain import PATH_POINTS, CameraModel, Decision, Lane, Now, Picture, Pose
+from lavt.node import Hop, Message, Node, Send
+from lavt.nodes.driver import Detector
+from lavt.runtime.realtime import RealRuntime
+from lavt.transport.pictures import PictureReceiver
+from lavt.transport.udp_link import UdpLink
+from lavt.vehicle.camera import CapturedFrame
+
+LOOPBACK = "127.0.0.1"
+
+
+class LoopCamera:
+    """A camera that plays the loop from memory."""
+
+    rate_hz = float(RATE_HZ)
+    phase_ns = 0
+
+    def __init__(self, run: Run) -> None:
+        self.model = CameraModel(run.width_px, run.height_px)
+        self._pictures = colour_loop(run.loop)
+
+    def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame:  # noqa: ARG002 (nothing moves)
+        """Give a frame of the loop."""
+        return CapturedFrame(number, at_ns, self._pictures[number % LOOP_FRAMES])
+
+
+class NoDetector:
+    """Sees no lane, at no cost."""
+
+    def forget(self) -> None:
+        """There is nothing to forget."""
+
+    def detect(self, picture: Picture, /) -> Lane:  # noqa: ARG002 (not looked at)
+        """Give a lane that is none."""
+        return Lane((0.0, 0.0, 0.0), 3.5, 0.0, 0.0, 0.0)
+
+
+class NoController:
+    """Wants nothing, at no cost."""
+
+    def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:  # noqa: ARG002 (not looked at)
+        """Decide nothing."""
+        return Decision(0.0, 0.0, 1.0, (0.0,) * PATH_POINTS)
+
+
+class Deaf:
+    """Stands for a node that only listens: takes the messages of some channels and forgets them."""
+
+    counts: Mapping[str, int] = {}
+
+    def __init__(self, name: str, *channels: str) -> None:
+        self.name = name
+        self.chains: Mapping[str, Sequence[Hop]] = dict.fromkeys(channels, (("forget", _forget),))
+
+    def next_wake_ns(self) -> None:
+        """It sleeps."""
+
+
+def _forget(_message: Message, _now: Now) -> None: ...
+
+
+class Nowhere:
+    """A link that leads nowhere."""
+
+    def send(self, send: Send) -> None:
+        """Forget a message."""
+
+
+class Note(Protocol):
+    """What is done with the messages that a run's record would hold."""
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Take one."""
+        ...
+
+
+class Ends:
+    """A side at work: its nodes, its video socket and its runtime."""
+
+    def __init__(self, channel: str, note: Note, *, remote: tuple[str, int] | None = None) -> None:
+        self.clock = MachineClock()
+        self.runtime: RealRuntime | None = None
+        self._note = note
+        self._link = UdpLink(self.clock, channel, self._deliver, bind=(LOOPBACK, 0), remote=remote)
+
+    @property
+    def port(self) -> int:
+        """The video's port."""
+        return self._link.port
+
+    def start(self, nodes: Sequence[Node]) -> RealRuntime:
+        """Start the nodes, then let messages in."""
+        self.runtime = RealRuntime(self.clock, nodes, self._note, lambda: None)
+        self.runtime.start({"video": self._link, "zenoh": Nowhere()})
+        self._link.start()
+        return self.runtime
+
+    def close(self) -> None:
+        """Stop everything; raises what ended a node before its time."""
+        if self.runtime is not None:
+            self.runtime.stop()
+        self._link.close()
+        if self.runtime is not None and self.runtime.failed is not None:
+            raise self.runtime.failed
+
+    def _deliver(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        if self.runtime is not None and not self.runtime.stopped.is_set():
+            self.runtime.deliver(channel, payload, arrived, peer)
+
+
+def sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
+    """Build the server's camera node for a loop of pictures."""
+    config = ServerConfig.model_validate(
+        {
+            "camera": {"width_px": run.width_px, "height_px": run.height_px, "rate_hz": RATE_HZ},
+            "video": {"bit_rate_bps": run.bit_rate_bps, "gop_frames": GOP_FRAMES, "buffer_ms": VBV_MS},
+        }
+    )
+
+    def plant(config: ServerConfig) -> Plant:
+        return replace(build_unpictured(config), camera=LoopCamera(run))
+
+    fidelity = replace(VIDEO, plant=plant)
+    nodes = build_server(config, clock.now, MachineEntropy(), host="", video_port=port, fidelity=fidelity)
+    return [nodes.camera, Deaf("actuator", "frame")]
+
+
+class WatchedPictures:
+    """The client's decoder, with its last picture at hand."""
+
+    def __init__(self, pictures: PictureReceiver) -> None:
+        self.last: Any = None
+        self.decode = pictures.decode
+        self._read_stamp = pictures.read_stamp
+
+    def read_stamp(self, received: Any) -> int:
+        """Read the stamp, and keep what it was read from."""
+        self.last = received
+        return self._read_stamp(received)
+
+
+def receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], WatchedPictures]:
+    """Build the client's receiver and driver, whose eyes and hands do nothing."""
+    size = {"width_px": run.width_px, "height_px": run.height_px}
+    CONTROLLERS["none"] = lambda *_, **__: NoController()
+    config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}, "controller": {"kind": "none"}})
+    watched = WatchedPictures(VIDEO.receiver(config))
+    fidelity = replace(VIDEO, receiver=lambda _: watched, detector=_no_detector)
+    nodes = build_client(config, clock.now, MachineEntropy(), fidelity=fidelity)
+    return [nodes.receiver, nodes.driver], watched
+
+
+def _no_detector(_config: ClientConfig) -> Detector:
+    return NoDetector()

@@ -1,0 +1,62 @@
+"""`lavt sdp`: what players need to show the video that a server sends them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from lavt.build.addresses import resolved_address
+from lavt.build.fidelity import VIDEO
+from lavt.cli import console
+from lavt.config import ServerConfig
+from lavt.config_file import load_config
+from lavt.errors import UserError
+from lavt.transport.sdp import profile_level_id, session_description
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("sdp")(sdp)
+
+
+def sdp(
+    config: Annotated[Path, typer.Argument(help="A server config in YAML, such as configs/server.yaml.")],
+    receiver: Annotated[
+        str, typer.Option(help="Which of several receivers in video.send_to it is for, as host:port.")
+    ] = "",
+    changes: console.Set = None,
+) -> None:
+    """Print the SDP file with which ffplay, VLC and others show the video sent to a receiver in video.send_to.
+
+    Give it the same --set as the server. On the receiver's machine: ffplay -protocol_whitelist file,udp,rtp lavt.sdp
+
+    Example: lavt sdp configs/server.yaml --set 'video.send_to=["127.0.0.1:5004"]' > lavt.sdp
+    """
+    settings = load_config(ServerConfig, config, changes or [])
+    to = _chosen(settings.video.send_to, receiver)
+    described = session_description(to, rate_hz=settings.camera.rate_hz, profile_level_id=_profile_level_id(settings))
+    console.show(described.removesuffix("\n"))
+
+
+def _chosen(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
+    """Give the address of the only receiver, or of the one that was asked for."""
+    if not send_to:
+        raise UserError("the video is sent to no plain receiver: name one in video.send_to, as host:port")
+    known = [resolved_address("video.send_to", each) for each in send_to]
+    if not receiver:
+        if len(known) > 1:
+            raise UserError(f"the video is sent to {', '.join(send_to)}: choose one of them with --receiver")
+        return known[0]
+    asked = resolved_address("--receiver", receiver)
+    if asked not in known:
+        raise UserError(f"no video is sent to {receiver}: add it to video.send_to, or choose {', '.join(send_to)}")
+    return asked
+
+
+def _profile_level_id(settings: ServerConfig) -> str:
+    """Ask the server's encoder itself: its level follows from size, rates and buffer."""
+    black = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
+    return profile_level_id(VIDEO.sender(settings).encode(black, keyframe=True))

@@ -1,0 +1,123 @@
+"""What our server sends to a plain receiver, as GStreamer and ffmpeg see it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.interop.tools import free_port, read_frames, running
+
+from lavt.build.entropy import MachineEntropy
+from lavt.build.sides import build_server
+from lavt.clock import MachineClock
+from lavt.config import ServerConfig
+from lavt.config_file import load_config, shipped
+from lavt.domain import Now
+from lavt.node import Send
+from lavt.runtime.realtime import RealRuntime
+from lavt.transport.stamp import read_stamp
+from lavt.transport.udp_link import UdpLink
+
+pytestmark = pytest.mark.realtime
+
+SERVER = shipped("configs/server.yaml")
+WIDTH_PX, HEIGHT_PX = 320, 240
+FRAME_BYTES = WIDTH_PX * HEIGHT_PX * 3 // 2
+WANTED = 90
+"""Frames, of three seconds."""
+GSTREAMER = (
+    "gst-launch-1.0 -q udpsrc address=127.0.0.1 port={port} buffer-size=4194304"
+    " caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96"
+    " ! rtpjitterbuffer ! rtph264depay ! avdec_h264 ! videoconvert ! video/x-raw,format=I420 ! fdsink fd=1 sync=false"
+)
+FFMPEG = (
+    "ffmpeg -nostdin -loglevel warning -protocol_whitelist file,udp,rtp -buffer_size 4194304 {flags} -i {sdp}"
+    " -fps_mode passthrough -f rawvideo -pix_fmt yuv420p pipe:1"
+)
+
+
+class Stamps:
+    """A recorder that keeps the stamps of the frames sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[int] = []
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
+        """Write one entry; frames are written before their packets go."""
+        if topic == "frame":
+            self.sent.append(payload.stamp_ns)
+
+
+class Nowhere:
+    """A link to a client that is not there."""
+
+    def send(self, send: Send) -> None:
+        """Forget a message."""
+
+
+def changes(port: int) -> list[str]:
+    """Give what is changed of the shipped config: to whom, small pictures, a keyframe each half second."""
+    return [
+        f"video.send_to=['127.0.0.1:{port}']",
+        f"camera.width_px={WIDTH_PX}",
+        f"camera.height_px={HEIGHT_PX}",
+        "video.bit_rate_bps=1000000",
+        "video.gop_frames=15",
+        "clock.source=probe",
+    ]
+
+
+@contextmanager
+def our_server(port: int) -> Iterator[Stamps]:
+    """Run the server's nodes in real time with a real socket; nobody holds the vehicle, so it stands."""
+    config = load_config(ServerConfig, SERVER, changes(port))
+    clock, stamps = MachineClock(), Stamps()
+    link = UdpLink(clock, "feedback", lambda *_: None, bind=("127.0.0.1", 0))
+    nodes = build_server(config, clock.now, MachineEntropy(), host="here", video_port=link.port).all
+    runtime = RealRuntime(clock, nodes, stamps, lambda: None)
+    with closing(link):
+        runtime.start({"video": link, "zenoh": Nowhere(), "probe": Nowhere(), "netem": Nowhere()})
+        try:
+            yield stamps
+        finally:
+            runtime.stop()
+    assert runtime.failed is None
+
+
+def received(command: str, port: int, said: Path) -> tuple[list[int], list[int]]:
+    """Run a tool that writes raw frames until it has given enough of them: stamps sent, stamps read."""
+    with our_server(port) as stamps, running(command.split(), said, output=True) as tool:
+        assert tool.stdout is not None
+        frames = list(read_frames(tool.stdout, FRAME_BYTES, WANTED))
+    assert len(frames) == WANTED, said.read_text(errors="replace")
+    lumas = [np.frombuffer(frame, np.uint8)[: WIDTH_PX * HEIGHT_PX].reshape(HEIGHT_PX, WIDTH_PX) for frame in frames]
+    return stamps.sent, [read_stamp(luma) for luma in lumas]
+
+
+def check_each_in_order(sent: list[int], read: list[int]) -> None:
+    """From the first picture that the tool gave, it gave each one that was sent."""
+    assert read[0] in sent
+    begin = sent.index(read[0])
+    assert read == sent[begin : begin + len(read)]
+
+
+def test_gstreamer_sees_each_frame(tmp_path: Path) -> None:
+    """GStreamer depacketizes and decodes what we send, and each picture has the stamp of the frame sent."""
+    port = free_port()
+    check_each_in_order(*received(GSTREAMER.format(port=port), port, tmp_path / "said"))
+
+
+@pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
+def test_ffmpeg_sees_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
+    """With no more than what `lavt sdp` prints ffmpeg finds and decodes our stream, and reads each stamp sent."""
+    port, sdp = free_port(), tmp_path / "lavt.sdp"
+    settings = [part for change in changes(port) for part in ("--set", change)]
+    with sdp.open("wb") as file:
+        subprocess.run([sys.executable, "-m", "lavt", "sdp", str(SERVER), *settings], stdout=file, check=True)
+    check_each_in_order(*received(FFMPEG.format(flags=flags, sdp=sdp), port, tmp_path / "said"))

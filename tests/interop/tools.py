@@ -1,0 +1,85 @@
+"""GStreamer and ffmpeg: whether they are here, and how they are run so that none outlives its test."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import socket
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import IO
+
+PACKAGES = (
+    "gstreamer1.0-tools",
+    "gstreamer1.0-plugins-base",
+    "gstreamer1.0-plugins-good",
+    "gstreamer1.0-plugins-bad",
+    "gstreamer1.0-plugins-ugly",
+    "gstreamer1.0-libav",
+    "ffmpeg",
+)
+"""Debian's; .ci/run installs them."""
+PROGRAMS = ("gst-launch-1.0", "gst-inspect-1.0", "ffmpeg")
+ELEMENTS = (
+    "udpsrc", "rtpjitterbuffer", "rtph264depay", "avdec_h264", "videoconvert", "fdsink",
+    "filesrc", "rawvideoparse", "x264enc", "rtph264pay", "udpsink",
+)  # fmt: skip
+LIMIT_S = 60.0
+"""By then a tool that works has ended long ago, on however busy a machine."""
+
+
+@functools.cache
+def missing() -> tuple[str, ...]:
+    """Name the programs and GStreamer elements that are not here."""
+    if absent := tuple(program for program in PROGRAMS if shutil.which(program) is None):
+        return absent
+    asked = ["gst-inspect-1.0", "--exists"]
+    return tuple(each for each in ELEMENTS if subprocess.run([*asked, each], check=False).returncode)
+
+
+@contextmanager
+def running(command: list[str], said: Path, *, output: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a tool, what it says going to the file `said`; with `output` its standard output is a pipe.
+
+    It is killed at the end, and after `LIMIT_S`, so that nothing waits for it for ever.
+    """
+    with said.open("wb") as err:
+        out = subprocess.PIPE if output else err
+        tool = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+    watchdog = threading.Timer(LIMIT_S, tool.kill)
+    watchdog.daemon = True
+    watchdog.start()
+    try:
+        yield tool
+    finally:
+        watchdog.cancel()
+        tool.kill()
+        tool.wait()
+        if tool.stdout is not None:
+            tool.stdout.close()
+
+
+def read_frames(output: IO[bytes], frame_bytes: int, count: int) -> Iterator[bytes]:
+    """Give raw frames as a tool writes them, until there are `count`; fewer where it ends before."""
+    for _ in range(count):
+        frame = output.read(frame_bytes)
+        if len(frame) < frame_bytes:
+            return
+        yield frame
+
+
+def free_port() -> int:
+    """Give a port of the loopback that nobody has, nor the one after it, where some tools expect RTCP."""
+    while True:
+        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as first:
+            first.bind(("127.0.0.1", 0))
+            port = int(first.getsockname()[1])
+            with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:
+                try:
+                    second.bind(("127.0.0.1", port + 1))
+                except (OSError, OverflowError):
+                    continue
+                return port
