@@ -4,7 +4,7 @@ Both sides send the same pictures with the same stamp from one process to anothe
 of the stamp, just before encoding, to its having been read from the decoded luma. GStreamer has its best settings, and
 once its usual ones. Prints tables as it goes and, last, one line of JSON.
 
-    python benchmarks/video_vs_gstreamer.py [--pairs 5] [--seconds 20] [--frames 1800] [--quick] [--only 480p]
+    python benchmarks/video_vs_gstreamer.py [--pairs 5] [--seconds 15] [--frames 1800] [--quick] [--only 480p]
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--pairs", type=int, default=5, help="runs of each side on the clean link")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of each of these, after a warm-up of 3 s")
+    parser.add_argument("--seconds", type=float, default=15.0, help="length of each of these, after a warm-up of 3 s")
     parser.add_argument("--frames", type=int, default=1800, help="of each run on the impaired link")
     parser.add_argument("--only", action="append", help="a part by its name in the last line; may be given again")
     parser.add_argument("--quick", action="store_true", help="for trying: everything as short as can be")

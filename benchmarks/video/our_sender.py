@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+import numpy as np
 from benchmarks.video.product import Ends, sender_nodes
 from benchmarks.video.run import TOKEN, Run, Table, asked_run, cpu_ns, save_units, tell, wait_for_line
 
@@ -16,14 +17,15 @@ class SentFrames:
 
     def __init__(self, run: Run) -> None:
         self.done = threading.Event()
-        self.cpu_ns: list[int] = []
+        self.cpu_ns = np.full(run.frames, -1, np.int64)
+        self.sent = 0
         self.units: list[bytes] = []
         self._table: Table = run.table()
         self._run = run
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the recorder's)
         """Note a frame that was sent."""
-        sent = len(self.cpu_ns)
+        sent = self.sent
         if sent >= self._run.frames:
             return
         if topic == "frame":
@@ -32,7 +34,8 @@ class SentFrames:
         elif topic == "video":
             if self._run.keep:
                 self.units.append(payload.data)
-            self.cpu_ns.append(cpu_ns())
+            self.cpu_ns[sent] = cpu_ns()
+            self.sent = sent + 1
             if sent + 1 == self._run.frames:
                 self.done.set()
 
@@ -50,7 +53,7 @@ def main() -> None:
         pass
     ends.close()
     save_units(run, sent.units)
-    tell({"cpu_ns": sent.cpu_ns})
+    tell({"cpu_ns": sent.cpu_ns[: sent.sent].tolist()})
 
 
 if __name__ == "__main__":

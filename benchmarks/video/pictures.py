@@ -65,6 +65,6 @@ def _new(stem: Path, kind: str, shape: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def _mapped(stem: Path, kind: str) -> NDArray[np.uint8]:
-    loop: NDArray[np.uint8] = np.load(f"{stem}.{kind}.npy", mmap_mode="c")
+    loop = np.asarray(np.load(f"{stem}.{kind}.npy", mmap_mode="c"))  # numpy's own class for it makes views dear
     loop.reshape(-1)[::4096].sum()  # no frame pays for the mapping of its pages
     return loop

@@ -53,8 +53,7 @@ class Run:
 
     def table(self) -> Table:
         """Map the table of what was sent into memory."""
-        shared: Table = np.load(Path(self.folder) / "sent.npy", mmap_mode="r+")
-        return shared
+        return np.asarray(np.load(Path(self.folder) / "sent.npy", mmap_mode="r+"))
 
 
 def new_table(folder: Path) -> None:

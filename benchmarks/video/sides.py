@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time  # noqa: TID251 (the benchmark waits for a run's end)
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.video.run import RATE_HZ, Run, new_table, told
 from numpy.typing import NDArray
 
+import lavt
 from lavt.domain import NS_PER_MS
 from lavt.errors import WorkError
 
@@ -23,8 +24,6 @@ Side = Literal["ours", "gstreamer"]
 
 WARM_UP_FRAMES = 3 * RATE_HZ
 """Sent first, and not counted."""
-LONGEST_WAIT_S = 60.0
-"""Beyond the run itself."""
 DRAIN_S = 0.5
 """What is on its way at the end has so long to arrive."""
 FOLDER = Path(__file__).parents[2]
@@ -34,19 +33,24 @@ class Process:
     """A process of a run: begins when told to, and tells things by lines of JSON."""
 
     def __init__(self, name: str, run: Run, *more: str) -> None:
-        paths = os.pathsep.join([str(FOLDER), *sys.path[1:]])
-        self._name = name
+        paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+        self.name = name
         self._process = subprocess.Popen(
             [sys.executable, "-m", f"benchmarks.video.{name}", told(run), *more],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths},
         )  # fmt: skip
+
+    @property
+    def process_id(self) -> int:
+        """Its number in the system."""
+        return self._process.pid
 
     def heard(self) -> dict[str, Any]:
         """Wait for its next line; raises `WorkError` when it ends without one."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise WorkError(f"the process {self._name} of the benchmark ended before its time; see above")
+            raise WorkError(f"the process {self.name} of the benchmark ended before its time; see above")
         entries: dict[str, Any] = json.loads(line)
         return entries
 
@@ -101,8 +105,14 @@ class Outcome:
         return self.sender_cpu_ms + self.receiver_cpu_ms
 
 
-def measure(side: Side, run: Run, relay: Sequence[str] = ()) -> Outcome:
-    """Do a run; `relay` is what the relay is told, if there is one."""
+def measure(
+    side: Side,
+    run: Run,
+    relay: Sequence[str] = (),
+    *,
+    when_started: Callable[[Sequence[Process]], None] = lambda _processes: None,
+) -> Outcome:
+    """Do a run; `relay` is what the relay is told, if there is one. `when_started` gets the processes."""
     new_table(Path(run.folder))
     order = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[side]
     processes: list[Process] = []
@@ -117,6 +127,7 @@ def measure(side: Side, run: Run, relay: Sequence[str] = ()) -> Outcome:
             port = start("relay", port, side, *relay)["port"]
         start(order[1], port)
         sender, receiver = (processes[0], processes[-1]) if side == "ours" else (processes[-1], processes[0])
+        when_started(processes)
         sender.tell()
         sent = sender.heard()
         time.sleep(DRAIN_S)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.video.pictures import picture_of, planes_loop, squared_error
-from benchmarks.video.run import Run, cpu_ns
+from benchmarks.video.run import ROOM, Run, cpu_ns
 from numpy.typing import NDArray
 
 
@@ -14,7 +14,9 @@ class Watch:
     """Notes for each picture its stamp, when that had been read, the CPU time by then and, if asked, its error."""
 
     def __init__(self, run: Run) -> None:
-        self._rows: list[tuple[int, int, int, float]] = []
+        self._rows = np.full((ROOM, 3), -1, np.int64)  # of this process's memory nothing grows but what is looked for
+        self._errors = np.full(ROOM, -1.0)
+        self._noted = 0
         self._table = run.table()
         self._numbers: dict[int, int] = {}
         self._filmed = planes_loop(run.loop) if run.keep else None
@@ -27,12 +29,14 @@ class Watch:
             if number is None:
                 return
             error = squared_error(luma, picture_of(self._filmed, number))
-        self._rows.append((stamp_ns, read_ns, cpu_ns(), error))
+        if self._noted < ROOM:
+            self._rows[self._noted] = stamp_ns, read_ns, cpu_ns()
+            self._errors[self._noted] = error
+            self._noted += 1
 
     def save(self, path: Path) -> None:
         """Write all down: int64 rows of stamp, time of reading and CPU time, and the errors beside them."""
-        rows = np.array([row[:3] for row in self._rows], np.int64).reshape(-1, 3)
-        np.savez(path, rows=rows, errors=np.array([row[3] for row in self._rows]))
+        np.savez(path, rows=self._rows[: self._noted], errors=self._errors[: self._noted])
 
     def _number_of(self, stamp_ns: int) -> int | None:
         while sent_ns := int(self._table[len(self._numbers), 0]):
