@@ -4,12 +4,12 @@
 
 The simulator's pictures, with its sensor noise (2.2 LSB), at 30 Hz: a drive of 2 s there and back again and again.
 Encoder, packets, reorder buffer, depacketizer, decoder and reader are the product's; packets are lost independently;
-after a loss a keyframe comes two frames later (a round trip of 40 ms), at most one in 100 ms. A frame is intact when
-all its packets arrived or were made again, and in doubt from a loss to the next whole keyframe, as in
-`nodes/picture_reader.py`.
+as long as pictures are in doubt, from a loss to the next whole keyframe, one is asked for every 100 ms and comes two
+frames later (a round trip of 40 ms). A frame is intact when all its packets arrived or were made again.
 
-Each stamp is checked by its RTP timestamp, as ours are, and a second time as a foreign sender's would be: against
-timestamps with a base of their own, of pictures taken up to 4 ms before they were stamped.
+Each stamp is checked by its RTP timestamp, as ours are, and again as a foreign sender's would be: against timestamps
+with a base of their own, of pictures taken up to 4 ms before they were stamped. That check is shown all pictures; those
+whose cells are clear; and of these those that are not in doubt.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LINKS = ((0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2))
 """Share of packets lost, and repair packets for each block of a frame."""
 ROUND_TRIP_FRAMES = 2
 PAUSE_FRAMES = 3
-"""Neither asks a receiver nor answers a sender more often: `nodes/receiver.py`, `nodes/camera.py`."""
+"""Neither asks the receiver nor answers the sender more often: `nodes/receiver.py`, `nodes/camera.py`."""
 
 FRAME_NS = NS_PER_S // RATE_HZ
 START_NS = 1_760_000_000_123_456_789
@@ -105,12 +105,12 @@ class Found:
         return self.rate_kbps * 1000 / (width * height * RATE_HZ)
 
     @property
-    def unread(self) -> float:
+    def unread_share(self) -> float:
         """Share of frames whose stamp was not accepted."""
         return 1 - self.counts["accepted"] / self.counts["frames"]
 
     @property
-    def intact_good(self) -> float:
+    def good_of_intact(self) -> float:
         """Of the intact frames, the share that was accepted and not in doubt."""
         return self.counts["intact_good"] / max(1, self.counts["intact"])
 
@@ -169,7 +169,6 @@ class Receiver:
         self.repair = RepairReceiver()
         self.reorder = ReorderBuffer()
         self.depacketizer = Depacketizer()
-        self.gaps = 0
 
     def receive(self, datagrams: Sequence[bytes], now_ns: int) -> tuple[int, list[AccessUnit]]:
         """Take what arrived of a frame; give the number of media packets that came of it and the access units over.
@@ -186,7 +185,6 @@ class Receiver:
                 ordered += self.reorder.push_recovered(recovered, now_ns)
                 media += 1
         ordered += self.reorder.expire(now_ns + HOLD_NS)
-        self.gaps += sum(lost_before for _, lost_before in ordered)
         return media, [unit for each in ordered for unit in self.depacketizer.push(*each)]
 
 
@@ -199,20 +197,19 @@ class Reader:
         self.foreign_timestamp: dict[int, int] = {}
         self.missing: dict[int, int] = {}
         self.decoder = Decoder()
-        self.learned, self.learned_clear = LearnedBase(), LearnedBase()
+        self.learned = {name: LearnedBase() for name in CHECKS if name.startswith("foreign")}
         self.in_doubt = True
 
-    def read(self, unit: AccessUnit) -> bool:
-        """Read one; tell whether there was a picture of which nothing had to be made up."""
+    def read(self, unit: AccessUnit) -> None:
+        """Read one."""
         picture = self.decoder.decode(unit.data)
-        sound = picture is not None and not picture.corrupt
-        self.in_doubt = not (unit.complete and sound) or (self.in_doubt and not unit.keyframe)
+        whole = unit.complete and picture is not None and not picture.corrupt
+        self.in_doubt = not whole or (self.in_doubt and not unit.keyframe)
         if picture is not None:
             accepted = self._accepted(picture, unit.timestamp)
             intact = self.missing[unit.timestamp] == 0
             self.found.counts.update(accepted=accepted, intact_good=accepted and intact and not self.in_doubt)
             self._read_as_foreign(picture, unit.timestamp)
-        return sound
 
     def _accepted(self, picture: DecodedPicture, timestamp: int) -> bool:
         read_ns = read_stamp(picture.luma)
@@ -223,19 +220,16 @@ class Reader:
         return accepted
 
     def _read_as_foreign(self, picture: DecodedPicture, timestamp: int) -> None:
-        sent_ns, foreign = self.sent_ns[timestamp], self.foreign_timestamp[timestamp]
-        checks = self.found.checks
-        read_ns = read_stamp(picture.luma)
-        if self.learned.agrees(read_ns, foreign):
-            checks["foreign"].note(read_ns, sent_ns)
+        readings = {"foreign": read_stamp(picture.luma)}
         try:
-            read_ns = read_clear_stamp(picture.luma)
-        except BadPacket:
-            return
-        if self.learned_clear.agrees(read_ns, foreign):
-            checks["foreign, clear cells"].note(read_ns, sent_ns)
+            readings["foreign, clear cells"] = read_clear_stamp(picture.luma)
             if not self.in_doubt:
-                checks["foreign, clear cells, not in doubt"].note(read_ns, sent_ns)
+                readings["foreign, clear cells, not in doubt"] = readings["foreign, clear cells"]
+        except BadPacket:
+            pass  # counted by what was accepted
+        for name, read_ns in readings.items():
+            if self.learned[name].agrees(read_ns, self.foreign_timestamp[timestamp]):
+                self.found.checks[name].note(read_ns, self.sent_ns[timestamp])
 
 
 def study(found: Found, frames: int) -> Found:
@@ -253,12 +247,12 @@ def study(found: Found, frames: int) -> Found:
         taken_ns = stamp_ns - int(chance.integers(FOREIGN_JITTER_NS))
         reader.sent_ns[timestamp] = stamp_ns
         reader.foreign_timestamp[timestamp] = (rtp_timestamp(taken_ns) + FOREIGN_BASE) % 2**32
-        gaps_before = receiver.gaps
         media, units = receiver.receive(arrived, now_ns)
         reader.missing[timestamp] = len(datagrams) - media
         found.counts.update(frames=1, intact=reader.missing[timestamp] == 0)
-        unsound = [unit for unit in units if not reader.read(unit)]
-        if receiver.gaps > gaps_before or unsound:
+        for unit in units:
+            reader.read(unit)
+        if reader.in_doubt:
             sender.ask(number)
     return found
 
@@ -291,8 +285,8 @@ def tables(found: Sequence[Found]) -> Iterator[str]:
         yield "|---" * (3 + len(headers)) + "|"
         for rate, links in groupby(of_size, key=lambda each: each.rate_kbps):
             whole, *lossy = links
-            shares = " | ".join(percent(each.intact_good) for each in lossy)
-            yield f"| {rate} | {whole.bit_per_px:.3f} | {percent(whole.unread)} | {shares} |"
+            shares = " | ".join(percent(each.good_of_intact) for each in lossy)
+            yield f"| {rate} | {whole.bit_per_px:.3f} | {percent(whole.unread_share)} | {shares} |"
     yield "\n| check | accepted | of these not the stamp sent | largest error |"
     yield "|---" * 4 + "|"
     for name, worst in totals(found).items():
@@ -313,8 +307,8 @@ def as_json(found: Sequence[Found]) -> str:
     cells = [
         {
             "size": each.size, "rate_kbps": each.rate_kbps, "loss": each.loss, "repair": each.repair,
-            "bit_per_px": round(each.bit_per_px, 4), "unread": round(each.unread, 4),
-            "intact_good": round(each.intact_good, 4), **each.counts,
+            "bit_per_px": round(each.bit_per_px, 4), "unread_share": round(each.unread_share, 4),
+            "good_of_intact": round(each.good_of_intact, 4), **each.counts,
             "checks": {name: asdict(worst) for name, worst in each.checks.items()},
         }
         for each in found

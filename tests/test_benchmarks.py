@@ -47,5 +47,7 @@ def test_the_study_of_the_stamp_runs() -> None:
     assert [(cell["loss"], cell["repair"]) for cell in last["cells"]] == [
         (0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2),
     ]  # fmt: skip
-    assert last["cells"][0]["accepted"] == last["cells"][0]["frames"] == 40
+    whole = last["cells"][0]
+    assert whole["accepted"] == whole["frames"] == whole["intact"] == whole["intact_good"] == 40
+    assert (whole["unread_share"], whole["good_of_intact"], whole["bit_per_px"]) == (0.0, 1.0, 0.1997)
     assert last["checks"]["own"]["largest_error_us"] < 12

@@ -31,7 +31,8 @@ def sdp(
 ) -> None:
     """Print the SDP file with which ffplay, VLC and others show the video sent to a receiver in video.send_to.
 
-    Give it the same --set as the server. On the receiver's machine: ffplay -protocol_whitelist file,udp,rtp lavt.sdp
+    Give it the same --set as the server. On the receiver's machine: ffplay -protocol_whitelist file,udp,rtp
+    -fflags nobuffer -flags low_delay lavt.sdp (docs/watching.md has more players)
 
     Example: lavt sdp configs/server.yaml --set 'video.send_to=["127.0.0.1:5004"]' > lavt.sdp
     """

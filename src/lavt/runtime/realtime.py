@@ -149,7 +149,7 @@ class _Worker:
                 self._walk(message)
             finally:
                 self._turn.release()
-            if not self.inbox.waiting and not _is_before(self._wake_ns, self._sleeps_until_ns):
+            if not (self.inbox.waiting or _is_before(self._wake_ns, self._sleeps_until_ns)):
                 return
         else:
             with self._condition:

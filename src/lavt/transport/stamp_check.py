@@ -32,7 +32,8 @@ class LearnedBase:
 
     Nothing is accepted until `LEARNED_AFTER` stamps agree. When the sender starts again, or steps its clock, the base
     is learned anew. An accepted stamp may be wrong by twice `TOLERANCE_NS`; one of 64 random bits is accepted with a
-    chance of 5e-13 (10 ms in 2^64 ns).
+    chance of 5e-13 (10 ms in 2^64 ns). What a decoder makes up is not random: give it only stamps of pictures that are
+    not in doubt, read by `read_clear_stamp`. Others have been seen to agree with each other on a base wrong by 1 s.
     """
 
     def __init__(self) -> None:

@@ -59,6 +59,7 @@ class UdpLink:
             raise UserError(
                 f"the {name} port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
             ) from error
+        self._room = memoryview(bytearray(LONGEST_DATAGRAM))
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
 
@@ -99,10 +100,11 @@ class UdpLink:
 
     def _take_all(self) -> None:
         """Deliver what has come: a frame's packets come together."""
+        room = self._room
         for _ in range(TAKEN_AT_ONCE):
             try:
-                datagram, ancillary, _flags, address = self._socket.recvmsg(
-                    LONGEST_DATAGRAM, ANCILLARY_BYTES, socket.MSG_DONTWAIT
+                length, ancillary, _flags, address = self._socket.recvmsg_into(
+                    (room,), ANCILLARY_BYTES, socket.MSG_DONTWAIT
                 )
             except BlockingIOError:
                 return
@@ -112,7 +114,7 @@ class UdpLink:
             if self._remote is not None and address != self._server:
                 self.counts["datagrams_from_strangers"] += 1
                 continue
-            self._deliver(self._channel, datagram, arrival(ancillary, self._clock.now()), address)
+            self._deliver(self._channel, bytes(room[:length]), arrival(ancillary, self._clock.now()), address)
 
 
 def look_up(key: str, host: str) -> str:
