@@ -71,7 +71,7 @@ def main() -> int:
     except LavtError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1
-    print(json.dumps(found))
+    print(json.dumps({part: shares for part, shares in found.items() if shares}))
     return 0
 
 

@@ -132,7 +132,8 @@ def main() -> None:
     freeze()
     tell({"port": near.getsockname()[1]})
     tally = carry(near, far, ("127.0.0.1", run.port), case, near_sends=side == "gstreamer")
-    tell({**tally.counts, "late_p99_ms": float(np.percentile(tally.late_ms or [0.0], 99))})
+    late_ms = tally.late_ms or [0.0]
+    tell({**tally.counts, "late_p99_ms": float(np.percentile(late_ms, 99)), "late_max_ms": max(late_ms)})
 
 
 if __name__ == "__main__":

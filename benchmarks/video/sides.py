@@ -63,6 +63,8 @@ class Process:
 
     def close(self) -> None:
         """Wait for its end, or bring it about."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
         try:
             self._process.wait(5)
         except subprocess.TimeoutExpired:
