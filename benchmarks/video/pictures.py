@@ -23,26 +23,23 @@ Planes = NDArray[np.uint8]
 
 
 def render_loop(stem: Path, width_px: int, height_px: int) -> None:
-    """Write a drive at 30 km/h, forth and then back, as STEM.bgr.npy and STEM.i420.npy; every picture has its noise."""
+    """Write a drive at 30 km/h, forth and then back, as STEM.npy; every picture has its noise."""
     road = load_road(ROUTE)
     renderer = Renderer(road, CameraModel(width_px, height_px), seed=1, scenery="full")
-    colour = _new(stem, "bgr", (LOOP_FRAMES, height_px, width_px, 3))
-    planes = _new(stem, "i420", (LOOP_FRAMES, height_px * 3 // 2, width_px))
+    shape = (LOOP_FRAMES, height_px * 3 // 2, width_px)
+    planes = np.lib.format.open_memmap(stem.with_suffix(".npy"), "w+", np.uint8, shape)
     for number in range(LOOP_FRAMES):
         place = min(number, LOOP_FRAMES - number)
         x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + place * FRAME_M))
-        colour[number] = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
-        cv2.cvtColor(colour[number], cv2.COLOR_BGR2YUV_I420, dst=planes[number])
-
-
-def colour_loop(stem: Path) -> NDArray[np.uint8]:
-    """Map the loop in blue, green and red; what is written to it stays in this process."""
-    return _mapped(stem, "bgr")
+        picture = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
+        cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 
 
 def planes_loop(stem: Path) -> NDArray[np.uint8]:
-    """Map the loop in I420."""
-    return _mapped(stem, "i420")
+    """Map the loop, in I420; what is written to it stays in this process."""
+    loop: NDArray[np.uint8] = np.load(stem.with_suffix(".npy"), mmap_mode="c")
+    loop.reshape(-1)[::4096].sum()  # no frame pays for the mapping of its pages
+    return loop
 
 
 def squared_error(luma: NDArray[np.uint8], filmed: Planes) -> float:
@@ -58,13 +55,3 @@ def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:
     """Give the picture that a frame shows."""
     shown: Picture = loop[number % LOOP_FRAMES]
     return shown
-
-
-def _new(stem: Path, kind: str, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    return np.lib.format.open_memmap(f"{stem}.{kind}.npy", "w+", np.uint8, shape)
-
-
-def _mapped(stem: Path, kind: str) -> NDArray[np.uint8]:
-    loop = np.asarray(np.load(f"{stem}.{kind}.npy", mmap_mode="c"))  # numpy's own class for it makes views dear
-    loop.reshape(-1)[::4096].sum()  # no frame pays for the mapping of its pages
-    return loop

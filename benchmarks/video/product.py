@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from benchmarks.video.pictures import LOOP_FRAMES, colour_loop
+from benchmarks.video.pictures import picture_of, planes_loop
 from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 from lavt.build.entropy import MachineEntropy
@@ -15,10 +15,9 @@ from lavt.build.sides import build_client, build_server
 from lavt.build.vehicles import Plant, build_unpictured
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
-from lavt.control.drive_controller import CONTROLLERS
-from lavt.domain import PATH_POINTS, CameraModel, Decision, Lane, Now, Picture, Pose
+from lavt.domain import CameraModel, Now, Pose
 from lavt.node import Hop, Message, Node, Send
-from lavt.nodes.driver import Detector
+from lavt.nodes.picture_reader import PictureReader
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.pictures import PictureReceiver
 from lavt.transport.udp_link import UdpLink
@@ -28,37 +27,20 @@ LOOPBACK = "127.0.0.1"
 
 
 class LoopCamera:
-    """A camera that plays the loop from memory."""
+    """A camera that plays the loop into a buffer of its own, in I420, as the other side does."""
 
     rate_hz = float(RATE_HZ)
     phase_ns = 0
 
     def __init__(self, run: Run) -> None:
         self.model = CameraModel(run.width_px, run.height_px)
-        self._pictures = colour_loop(run.loop)
+        self._loop = planes_loop(run.loop)
+        self._planes = self._loop[0].copy()
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame:  # noqa: ARG002 (nothing moves)
         """Give a frame of the loop."""
-        return CapturedFrame(number, at_ns, self._pictures[number % LOOP_FRAMES])
-
-
-class NoDetector:
-    """Sees no lane, at no cost."""
-
-    def forget(self) -> None:
-        """There is nothing to forget."""
-
-    def detect(self, picture: Picture, /) -> Lane:  # noqa: ARG002 (not looked at)
-        """Give a lane that is none."""
-        return Lane((0.0, 0.0, 0.0), 3.5, 0.0, 0.0, 0.0)
-
-
-class NoController:
-    """Wants nothing, at no cost."""
-
-    def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:  # noqa: ARG002 (not looked at)
-        """Decide nothing."""
-        return Decision(0.0, 0.0, 1.0, (0.0,) * PATH_POINTS)
+        self._planes[:] = picture_of(self._loop, number)
+        return CapturedFrame(number, at_ns, self._planes)
 
 
 class Deaf:
@@ -157,16 +139,23 @@ class WatchedPictures:
         return self._read_stamp(received)
 
 
+class Watcher:
+    """Reads pictures as the driver does, and looks at none of them: what it would see takes time of its own."""
+
+    name = "driver"
+
+    def __init__(self, pictures: PictureReceiver) -> None:
+        reader = PictureReader(pictures)
+        self.counts: Mapping[str, int] = reader.counts
+        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.hops, "view": (("forget", _forget),)}
+
+    def next_wake_ns(self) -> None:
+        """It sleeps."""
+
+
 def receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], WatchedPictures]:
-    """Build the client's receiver and driver, whose eyes and hands do nothing."""
+    """Build the client's receiver, and what reads its pictures."""
     size = {"width_px": run.width_px, "height_px": run.height_px}
-    CONTROLLERS["none"] = lambda *_, **__: NoController()
-    config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}, "controller": {"kind": "none"}})
+    config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}})
     watched = WatchedPictures(VIDEO.receiver(config))
-    fidelity = replace(VIDEO, receiver=lambda _: watched, detector=_no_detector)
-    nodes = build_client(config, clock.now, MachineEntropy(), fidelity=fidelity)
-    return [nodes.receiver, nodes.driver], watched
-
-
-def _no_detector(_config: ClientConfig) -> Detector:
-    return NoDetector()
+    return [build_client(config, clock.now, MachineEntropy()).receiver, Watcher(watched)], watched

@@ -22,6 +22,10 @@ class Inbox:
         self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
         self._newest: dict[str, Message] = {}
 
+    def is_empty(self) -> bool:
+        """Whether no message waits."""
+        return self.waiting == 0
+
     def put(self, message: Message) -> None:
         """Let a message wait."""
         row = CHANNELS[message.channel]

@@ -144,12 +144,12 @@ class _Worker:
         """When the thread wakes by itself; None: only when it is told to; 0: it is awake."""
 
     def put(self, message: Message) -> None:
-        if CHANNELS[message.channel].at_once and not self.inbox.waiting and self._turn.acquire(blocking=False):
+        if CHANNELS[message.channel].at_once and self.inbox.is_empty() and self._turn.acquire(blocking=False):
             try:
                 self._walk(message)
             finally:
                 self._turn.release()
-            if not (self.inbox.waiting or _is_before(self._wake_ns, self._sleeps_until_ns)):
+            if self.inbox.is_empty() and not _is_before(self._wake_ns, self._sleeps_until_ns):
                 return
         else:
             with self._condition:
@@ -197,7 +197,7 @@ class _Worker:
     def _sleep(self) -> None:
         """Sleep until the node wants to be woken, or somebody says that there is something to do."""
         with self._condition:
-            if self.inbox.waiting or self._runtime.stopped.is_set():
+            if not self.inbox.is_empty() or self._runtime.stopped.is_set():
                 return
             self._sleeps_until_ns = wake_ns = self._wake_ns
             pause_s = None if wake_ns is None else (wake_ns - self._runtime.now().mono_ns) / NS_PER_S

@@ -37,8 +37,8 @@ class Channel:
 
 CHANNELS: dict[str, Channel] = {
     # server, between its nodes
-    "pose": Channel("local", "actuator", ("camera",), "newest"),
-    "frame": Channel("local", "camera", ("actuator",)),
+    "pose": Channel("local", "actuator", ("camera",), "newest", at_once=True),
+    "frame": Channel("local", "camera", ("actuator",), at_once=True),
     "video_token": Channel("local", "actuator", ("camera",)),
     "rest": Channel("local", "actuator", ("injection",)),  # in order with requests: a flood of these must not hide it
     # client, between its nodes
