@@ -45,6 +45,17 @@ def test_what_queues_comes_before_what_is_replaced() -> None:
     assert inbox.counts == {"state_replaced": 1}
 
 
+def test_packets_that_had_arrived_come_before_a_wake() -> None:
+    """Packets that came by the time of a wake can be taken first, in order; later ones and other channels stay."""
+    inbox = Inbox()
+    for at_ns, channel in ((900, "control"), (1000, "rtp"), (1001, "rtp")):
+        inbox.put(Message(channel, at_ns, Now(at_ns, 0)))
+    assert inbox.take_arrived(999) is None
+    (taken,) = iter(lambda: inbox.take_arrived(1000), None)
+    assert taken.payload == 1000
+    assert [each.payload for each in iter(inbox.take, None)] == [900, 1001]
+
+
 def test_a_full_queue_drops_its_oldest_and_counts() -> None:
     """Beyond its length a channel loses its oldest message, and says so; a flood on one loses nothing of another."""
     inbox = Inbox()

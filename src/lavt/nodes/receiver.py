@@ -141,16 +141,18 @@ class ReceiverNode:
 
     def _depacketize(self, ordered: tuple[Ordered, Now, list[Send]], now: Now) -> list[Send]:
         packets, arrived, sends = ordered
+        damaged = False
         for packet, lost_before in packets:
-            if lost_before:
-                self._in_doubt = True
+            damaged |= lost_before
             for unit in self._depacketizer.push(packet, lost_before=lost_before):
                 self._counts["access_units"] += 1
                 self._counts["access_units_incomplete"] += not unit.complete
-                self._in_doubt = not unit.complete or (self._in_doubt and not unit.keyframe)
+                damaged = not unit.complete or (damaged and not unit.keyframe)
+                self._in_doubt &= not (unit.complete and unit.keyframe)
                 received = ReceivedUnit(unit.data, unit.timestamp, unit.complete, unit.keyframe, arrived.mono_ns)
                 sends.append(Send("access_unit", received))
-        return [*sends, *self._ask_for_keyframe(now.mono_ns)] if self._in_doubt and packets else sends
+        self._in_doubt |= damaged
+        return [*sends, *self._ask_for_keyframe(now.mono_ns)] if damaged else sends
 
     def _note_picture_lost(self, _message: Message, now: Now) -> list[Send]:
         """The decoder has no picture, or not the one that was sent."""

@@ -57,3 +57,11 @@ class Inbox:
         if first is not None:
             return first.popleft()[1]
         return self._newest.pop(next(iter(self._newest)))
+
+    def take_arrived(self, until_ns: int) -> Message | None:
+        """Take a message that had arrived by a time of the monotonic clock, of a channel that is walked at once."""
+        for channel, queue in self._queues.items():
+            if CHANNELS[channel].at_once and queue and queue[0][1].arrived.mono_ns <= until_ns:
+                self.waiting -= 1
+                return queue.popleft()[1]
+        return None

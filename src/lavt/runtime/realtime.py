@@ -185,12 +185,13 @@ class _Worker:
             self._runtime.fail(error)
 
     def _next(self) -> Message | None:
-        """What the node does next: a wake that is due comes first, then what waits."""
-        self._wake_ns = self.node.next_wake_ns()
-        if self._wake_ns is not None:
+        """What the node does next: a wake that is due comes first, but for what had arrived by then, then what waits."""
+        self._wake_ns = wake_ns = self.node.next_wake_ns()
+        if wake_ns is not None:
             now = self._runtime.now()
-            if self._wake_ns <= now.mono_ns:
-                return Message(WAKE, None, now)
+            if wake_ns <= now.mono_ns:
+                with self._condition:
+                    return self.inbox.take_arrived(wake_ns) or Message(WAKE, None, now)
         with self._condition:
             return self.inbox.take()
 
