@@ -185,7 +185,7 @@ class _Worker:
             self._runtime.fail(error)
 
     def _next(self) -> Message | None:
-        """What the node does next: a wake that is due comes first, but for what had arrived by then, then what waits."""
+        """What the node does next: a wake that is due, but before it what had arrived by then; else what waits."""
         self._wake_ns = wake_ns = self.node.next_wake_ns()
         if wake_ns is not None:
             now = self._runtime.now()
