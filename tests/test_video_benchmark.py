@@ -12,6 +12,7 @@ from benchmarks import endurance, video_vs_gstreamer
 from benchmarks.video.impaired import CASES, psnr_db, undamaged_share
 from benchmarks.video.relay import Case, Fate, Tally
 from benchmarks.video.sides import WARM_UP_FRAMES, frames_of
+from tests.interop.tools import missing
 from tests.require import need
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -127,6 +128,8 @@ def test_the_benchmark_of_the_video_runs() -> None:
         [sys.executable, BENCHMARKS / "video_vs_gstreamer.py", "--quick", "--only", "480p", "--only", "loss1"],
         capture_output=True, text=True, check=False, timeout=300,
     )  # fmt: skip
+    if done.returncode == 2 and not missing():
+        pytest.skip(f"Debian's modules of GStreamer are not for this Python: {done.stderr}")
     if done.returncode == 2:
         need("gstreamer", done.stderr)
     assert done.returncode == 0, done.stderr

@@ -20,22 +20,30 @@ PACKAGES = (
     "gstreamer1.0-plugins-ugly",
     "gstreamer1.0-libav",
     "ffmpeg",
+    "python3-gst-1.0",
+    "gir1.2-gst-plugins-base-1.0",
 )
 """Debian's; .ci/run installs them."""
 PROGRAMS = ("gst-launch-1.0", "gst-inspect-1.0", "ffmpeg")
 ELEMENTS = (
     "udpsrc", "rtpjitterbuffer", "rtph264depay", "avdec_h264", "videoconvert", "fdsink",
-    "filesrc", "rawvideoparse", "x264enc", "rtph264pay", "udpsink",
+    "filesrc", "rawvideoparse", "x264enc", "rtph264pay", "udpsink", "rtpsession",
 )  # fmt: skip
+DEBIANS_PYTHON = "/usr/bin/python3"
+"""For which Debian's modules of GStreamer are made."""
+MODULES = "import gi; gi.require_version('GstApp', '1.0'); from gi.repository import Gst, GstApp"
 LIMIT_S = 60.0
 """By then a tool that works has ended long ago, on however busy a machine."""
 
 
 @functools.cache
 def missing() -> tuple[str, ...]:
-    """Name the programs and GStreamer elements that are not here."""
+    """Name the programs, Python modules and elements of GStreamer that are not here."""
     if absent := tuple(program for program in PROGRAMS if shutil.which(program) is None):
         return absent
+    python = shutil.which(DEBIANS_PYTHON)
+    if python is None or subprocess.run([python, "-c", MODULES], check=False, capture_output=True).returncode:
+        return ("GStreamer's modules for Debian's Python",)
     asked = ["gst-inspect-1.0", "--exists"]
     return tuple(each for each in ELEMENTS if subprocess.run([*asked, each], check=False).returncode)
 

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from tests.require import need
+from tests.interop.tools import DEBIANS_PYTHON
 
 from lavt.domain import NS_PER_S
 from lavt.transport.ntp_time import short_time
@@ -22,8 +21,6 @@ from lavt.transport.rtcp import (
 )
 from lavt.transport.rtp import RtpPacket
 
-SYSTEM_PYTHON = "/usr/bin/python3"
-"""Debian's gi is for Debian's interpreter only."""
 OURS, THEIRS, RECEIVER = 77, 99, 88
 
 SESSION = """
@@ -100,15 +97,8 @@ class Session:
 
 @contextmanager
 def gstreamer() -> Iterator[Session]:
-    packages = "needs GStreamer for Python: apt-get install python3-gst-1.0 gstreamer1.0-plugins-good"
-    probe = "import gi; gi.require_version('Gst', '1.0'); from gi.repository import Gst; Gst.init(None); " + (
-        "raise SystemExit(Gst.ElementFactory.find('rtpsession') is None)"
-    )
-    python = shutil.which(SYSTEM_PYTHON)
-    if python is None or subprocess.run([python, "-c", probe], check=False, capture_output=True).returncode:
-        need("gstreamer", packages)
     pipe = subprocess.PIPE
-    with subprocess.Popen([python, "-c", SESSION], stdin=pipe, stdout=pipe, text=True) as process:
+    with subprocess.Popen([DEBIANS_PYTHON, "-c", SESSION], stdin=pipe, stdout=pipe, text=True) as process:
         try:
             yield Session(process)
         finally:
