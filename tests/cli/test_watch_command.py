@@ -123,9 +123,9 @@ def test_a_foreign_stream(run: Run, port: int) -> None:
 
 
 def test_a_foreign_stream_taken_for_ours(run: Run, port: int) -> None:
-    """Stamps of a foreign sender that is taken for ours are not accepted, and the line says why."""
+    """Stamps of a foreign sender that is taken for ours are not accepted: the line says why, and the end what to do."""
     with sending(port, base=123_456_789):
-        code, out, _ = run("--port", str(port), "--seconds", "1")
+        code, out, err = run("--port", str(port), "--seconds", "1")
     header, second, in_all, check = out.splitlines()
     assert code == 0
     assert header.startswith(f"watching UDP port {port}; ")
@@ -134,6 +134,7 @@ def test_a_foreign_stream_taken_for_ours(run: Run, port: int) -> None:
     assert "not (the last: stamp and RTP timestamp disagree); latency unknown; " in second
     assert in_all.startswith("in all: ")
     assert check == watch.CHECKS["lavt"]
+    assert err == "no stamp was accepted: is there one in the pictures, and is --sender what it should be?\n"
 
 
 def test_another_host(run: Run, port: int) -> None:

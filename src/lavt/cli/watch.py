@@ -78,6 +78,8 @@ def watch(
     _show("summary", {**in_all, "datagrams_from_strangers": strangers, "check": CHECKS[sender]}, as_json)
     if not in_all["pictures"]:
         raise WorkError("no picture came")
+    if not in_all["stamps_accepted"]:
+        console.say("no stamp was accepted: is there one in the pictures, and is --sender what it should be?")
 
 
 def _seconds(clock: MachineClock, told: threading.Event, limit_s: int | None) -> Iterator[int]:
