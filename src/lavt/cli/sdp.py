@@ -60,4 +60,6 @@ def _chosen(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
 def _profile_level_id(settings: ServerConfig) -> str:
     """Ask the server's encoder itself: its level follows from size, rates and buffer."""
     black = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
-    return profile_level_id(VIDEO.sender(settings).encode(black, keyframe=True))
+    sender = VIDEO.sender(settings)
+    planes, _ = sender.prepare(black)
+    return profile_level_id(sender.encode(planes, keyframe=True))
