@@ -18,6 +18,7 @@ from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
 from lavt.node import Hop, Message, Node, Send
 from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.watcher import WatcherNode
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.pictures import PictureReceiver
 from lavt.transport.udp_link import UdpLink
@@ -139,23 +140,9 @@ class WatchedPictures:
         return self._read_stamp(received)
 
 
-class Watcher:
-    """Reads pictures as the driver does, and looks at none of them: what it would see takes time of its own."""
-
-    name = "driver"
-
-    def __init__(self, pictures: PictureReceiver) -> None:
-        reader = PictureReader(pictures)
-        self.counts: Mapping[str, int] = reader.counts
-        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.hops, "view": (("forget", _forget),)}
-
-    def next_wake_ns(self) -> None:
-        """It sleeps."""
-
-
 def receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], WatchedPictures]:
     """Build the client's receiver, and what reads its pictures."""
     size = {"width_px": run.width_px, "height_px": run.height_px}
     config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}})
     watched = WatchedPictures(VIDEO.receiver(config))
-    return [build_client(config, clock.now, MachineEntropy()).receiver, Watcher(watched)], watched
+    return [build_client(config, clock.now, MachineEntropy()).receiver, WatcherNode(PictureReader(watched))], watched

@@ -375,6 +375,7 @@ COMMANDS = [
     "relay",
     "clock",
     "join",
+    "watch",
 ]
 
 
@@ -439,6 +440,28 @@ def test_relay_port_in_use(taken: int, run: Run) -> None:
     """A relay whose port somebody else has is refused in one sentence."""
     said = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{taken}").refused()
     assert f"the relay's video port 127.0.0.1:{taken} cannot be opened" in said
+
+
+WATCHES = {
+    "no such address": (["--bind", "192.0.2.7"], "the video port 192.0.2.7:5600 cannot be opened"),
+    "no host to listen at": (["--bind", "a" * 64], "cannot be opened"),
+    "no host to hear": (["--from", "a" * 64], "--from: the host"),
+}
+
+
+@pytest.mark.parametrize("case", WATCHES)
+def test_bad_watch(case: str, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A host that nobody knows, and an address that is not this machine's, are refused in one sentence."""
+    monkeypatch.setattr(console, "take_precedence", lambda: None)  # it would be that of all tests
+    arguments, said = WATCHES[case]
+    assert said in run("watch", *arguments).refused()
+
+
+def test_watched_port_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A port that somebody else has is refused in one sentence."""
+    monkeypatch.setattr(console, "take_precedence", lambda: None)
+    said = run("watch", "--bind", "127.0.0.1", "--port", str(taken)).refused()
+    assert f"the video port 127.0.0.1:{taken} cannot be opened" in said
 
 
 def test_server_of_an_unknown_route(router: str, run: Run, tmp_path: Path) -> None:

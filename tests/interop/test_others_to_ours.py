@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import socket
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
@@ -12,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.interop.tools import running
+from tests.interop.tools import LIMIT_S, running
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, Picture
@@ -21,6 +24,7 @@ from lavt.transport.h264 import Decoder
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import AccessUnit, Depacketizer, RtpPacket, parse_packet, split_nal_units
 from lavt.transport.stamp import read_stamp, rtp_timestamp, write_stamp
+from lavt.transport.stamp_check import LEARNED_AFTER
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 
 pytestmark = pytest.mark.realtime
@@ -168,3 +172,27 @@ def test_ffmpeg_is_received(raw: Path, tmp_path: Path) -> None:
     packets = packets_from(FFMPEG, raw, tmp_path / "said")
     check_each_picture(units_of(packets))
     assert kinds_of(packets).keys() >= {FU_A, STAP_A}
+
+
+def test_gstreamer_is_watched(raw: Path, tmp_path: Path) -> None:
+    """`lavt watch` accepts the stamps of all that GStreamer sends, but for those that its base is learned from."""
+    options = ["--bind", "127.0.0.1", "--port", "0", "--sender", "foreign", "--json"]
+    program = [sys.executable, "-m", "lavt", "watch", *options]
+    with running(program, tmp_path / "watched", output=True) as watching:
+        assert watching.stdout is not None
+        port = json.loads(watching.stdout.readline())["watching"]["port"]
+        command = GSTREAMER.format(
+            encoder=FAST, profile="constrained-baseline", aggregate="zero-latency", raw=raw, port=port
+        )
+        with running(command.split(), tmp_path / "said") as tool:
+            assert tool.wait(LIMIT_S) == 0, (tmp_path / "said").read_text(errors="replace")
+        seen = 0
+        while seen < COUNT:
+            seen += json.loads(watching.stdout.readline())["second"]["pictures"]
+        watching.send_signal(signal.SIGINT)
+        out, _ = watching.communicate(timeout=LIMIT_S)
+    in_all = json.loads(out.splitlines()[-1])["summary"]
+    assert watching.returncode == 0
+    assert (in_all["pictures"], in_all["stamps_accepted"]) == (COUNT, COUNT - LEARNED_AFTER + 1)
+    assert (in_all["lost"], in_all["stamps_unreadable"]) == (0, LEARNED_AFTER - 1)
+    assert "the check is weaker" in in_all["check"]

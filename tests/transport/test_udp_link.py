@@ -179,3 +179,18 @@ def test_close(started: bool) -> None:
     assert set(threading.enumerate()) <= before
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
         again.bind(("127.0.0.1", port))
+
+
+def test_only_from_one_host(sender: socket.socket) -> None:
+    """A link that only listens hears any port of the one host that it was given; the others are counted."""
+    heard = Heard()
+    with (
+        closing(UdpLink(MachineClock(), "rtp", heard, bind=ANY, only_from="127.0.0.2")) as link,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known,
+    ):
+        known.bind(("127.0.0.2", 0))
+        link.start()
+        sender.sendto(b"stranger", ("127.0.0.1", link.port))
+        known.sendto(b"known", ("127.0.0.1", link.port))
+        assert heard.next()[1] == b"known"
+        assert link.counts["datagrams_from_strangers"] == 1

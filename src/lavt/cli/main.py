@@ -25,6 +25,7 @@ from lavt.cli import (
     server,
     stop,
     sweep,
+    watch,
 )
 
 app = typer.Typer(
@@ -47,6 +48,7 @@ COMMANDS = (
     server,
     client,
     sdp,
+    watch,
     stop,
     router,
     relay,

@@ -35,15 +35,24 @@ class StampRead:
 class PictureReader:
     """Decodes every access unit, reads its stamp, and shows it where that can be believed.
 
-    `agrees(stamp, RTP timestamp)` says whether it can. `hops` are a node's chain for "access_unit"; what comes out is a
-    "view" for whoever looks at pictures, and "picture_lost" where the decoder has none or had to make parts of it up.
+    `agrees(stamp, RTP timestamp)` says whether it can. Where that check is weak, stamps of pictures in doubt are better
+    not shown to it (`reads_doubtful` false): made up ones can agree with each other. `hops` are a node's chain for
+    "access_unit"; what comes out is a "view" for whoever looks at pictures, and "picture_lost" where the decoder has
+    none or had to make parts of it up.
     """
 
-    def __init__(self, pictures: PictureReceiver, agrees: Callable[[int, int], bool] = stamp_agrees) -> None:
+    def __init__(
+        self,
+        pictures: PictureReceiver,
+        agrees: Callable[[int, int], bool] = stamp_agrees,
+        *,
+        reads_doubtful: bool = True,
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self.hops: Sequence[Hop] = (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show))
         self._pictures = pictures
         self._agrees = agrees
+        self._reads_doubtful = reads_doubtful
         self._in_doubt = True
 
     def _decode(self, message: Message, now: Now) -> Decoded:
@@ -57,6 +66,8 @@ class PictureReader:
         decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
         if decoded.picture is None:
             return StampRead(decoded, 0, "no picture")
+        if self._in_doubt and not self._reads_doubtful:
+            return StampRead(decoded, 0, "in doubt until the next keyframe")
         try:
             stamp_ns = self._pictures.read_stamp(decoded.picture)
         except BadPacket as error:

@@ -29,7 +29,8 @@ class UdpLink:
 
     `channel` names what comes in, `name` says what the port is for. `peer` of what goes out is an address, or for a
     client, whose server is known by `remote`, the port (0: the one in `remote`). A client hears its server only: what
-    comes from elsewhere is counted, not delivered. Raises `UserError` for a port that cannot be opened
+    comes from elsewhere is counted, not delivered. Who only listens may name the one host, by its number, that is heard
+    (`only_from`). Raises `UserError` for a port that cannot be opened
     and a host that is not known.
     """
 
@@ -41,6 +42,7 @@ class UdpLink:
         *,
         bind: tuple[str, int],
         remote: tuple[str, int] | None = None,
+        only_from: str | None = None,
         name: str = "video",
     ) -> None:
         self.counts: Counter[str] = Counter()
@@ -49,6 +51,7 @@ class UdpLink:
         self._deliver = deliver
         self._remote = None if remote is None else (look_up("video.server", remote[0]), remote[1])
         self._server: tuple[str, int] | None = None
+        self._only_from = only_from
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         want_arrival_times(self._socket)
@@ -111,10 +114,15 @@ class UdpLink:
             except OSError:  # an ICMP error of an earlier datagram
                 self.counts["datagrams_refused"] += 1
                 continue
-            if self._remote is not None and address != self._server:
+            if self._is_stranger(address):
                 self.counts["datagrams_from_strangers"] += 1
                 continue
             self._deliver(self._channel, bytes(room[:length]), arrival(ancillary, self._clock.now()), address)
+
+    def _is_stranger(self, address: tuple[str, int]) -> bool:
+        if self._only_from is not None and address[0] != self._only_from:
+            return True
+        return self._remote is not None and address != self._server
 
 
 def look_up(key: str, host: str) -> str:

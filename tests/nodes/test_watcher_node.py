@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, give, of
+
+from lavt.domain import NS_PER_S
+from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.reports import PictureRead, ReceivedUnit
+from lavt.nodes.watcher import WatcherNode
+from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.pictures import VideoReceiver
+from lavt.transport.stamp import read_clear_stamp, rtp_timestamp, write_stamp
+
+SIZES = [(128, 96), (320, 240)]
+
+
+def units(count: int, size: tuple[int, int] = SIZES[0], *, contrast: float = 1.0) -> list[ReceivedUnit]:
+    """Encode grey pictures with stamps a second apart, the first one a keyframe."""
+    width_px, height_px = size
+    encoder = Encoder(width_px, height_px, rate_hz=30, bit_rate_bps=4_000_000, gop_frames=30)
+    made = []
+    for number in range(count):
+        picture = np.full((height_px, width_px, 3), 90, np.uint8)
+        write_stamp(picture, WALL_NS + number * NS_PER_S)
+        dulled = (128 + (picture.astype(float) - 128) * contrast).astype(np.uint8)
+        timestamp = rtp_timestamp(WALL_NS + number * NS_PER_S)
+        made.append(ReceivedUnit(encoder.encode(dulled), timestamp, True, number == 0, MONO_NS))
+    return made
+
+
+def watched(node: WatcherNode, unit: ReceivedUnit) -> PictureRead:
+    (picture,) = of(give(node, "access_unit", unit, at(0)), "picture")
+    assert isinstance(picture, PictureRead)
+    return picture
+
+
+def test_pictures_of_any_size() -> None:
+    """A watcher that is told no size reads pictures of whatever size comes, and counts them."""
+    node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None)))
+    read = [watched(node, units(1, size)[0]) for size in SIZES]
+    assert [picture.stamp_ns for picture in read] == [WALL_NS, WALL_NS]
+    assert (node.counts["frames_decoded"], node.counts["frames_unreadable"]) == (2, 0)
+
+
+def test_a_view_is_dropped() -> None:
+    """What it has read it gives to whoever asks for views, which is itself, and nothing comes of that."""
+    node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None)))
+    (view,) = of(give(node, "access_unit", units(1)[0], at(0)), "view")
+    assert give(node, "view", view, at(1)) == []
+
+
+@pytest.mark.parametrize("reads_doubtful", [True, False])
+def test_pictures_in_doubt(reads_doubtful: bool) -> None:
+    """A check that is not to see stamps of pictures in doubt sees none, up to and not including the next keyframe."""
+    shown: list[int] = []
+
+    def agrees(stamp_ns: int, _timestamp: int) -> bool:
+        shown.append((stamp_ns - WALL_NS) // NS_PER_S)
+        return True
+
+    node = WatcherNode(PictureReader(VideoReceiver(Decoder(), None), agrees, reads_doubtful=reads_doubtful))
+    first, second, third = units(3)
+    again = units(1)[0]
+    read = [watched(node, unit) for unit in (first, replace(second, complete=False), third, again)]
+    assert [picture.in_doubt for picture in read] == [False, True, True, False]
+    assert shown == ([0, 1, 2, 0] if reads_doubtful else [0, 0])
+    reasons = ["", "", "", ""] if reads_doubtful else ["", *["in doubt until the next keyframe"] * 2, ""]
+    assert [picture.reason for picture in read] == reasons
+
+
+def test_only_clear_stamps() -> None:
+    """With the reader for weak checks a stamp whose cells are neither black nor white is no stamp."""
+    (grey,) = units(1, contrast=0.2)
+    assert watched(WatcherNode(PictureReader(VideoReceiver(Decoder(), None))), grey).stamp_ns == WALL_NS
+    strict = watched(WatcherNode(PictureReader(VideoReceiver(Decoder(), None, read_clear_stamp))), grey)
+    assert (strict.stamp_ns, strict.reason) == (None, "a cell of the stamp is neither black nor white")
