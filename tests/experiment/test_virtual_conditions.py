@@ -46,15 +46,10 @@ def test_a_constant_delay_counts_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", MORE)
 def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> None:
-    """Without pixels every condition is driven to a valid end, and with equal digests when driven again.
-
-    That is the goal, but where pictures and commands are lost in bursts: one is soon longer than the vehicle waits.
-    """
+    """Without pixels every condition is driven to the goal, validly, and with equal digests when driven again."""
     changes = ("fidelity=geometry", f"network.condition={name}")
     result, again = driven(tmp_path / "run", *changes), driven(tmp_path / "again", *changes)
-    assert (result["ending"], result["valid"], result["invalid_because"]) == (
-        "safe_stop" if name == "loss_burst" else "completed", True, []
-    )  # fmt: skip
+    assert (result["ending"], result["valid"], result["invalid_because"]) == ("completed", True, [])
     assert result["digest"] == again["digest"]
     other = driven(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
     assert other["digest"] != result["digest"]

@@ -9,7 +9,8 @@ from pydantic import Field
 from lavt.config.section import Section
 from lavt.transport.link import QUEUE_PACKETS
 
-HALF: Final = 0.5
+EARLY_SHARE: Final = {"video": 0.0, "control": 0.5}
+"""With more packets that overtake, the median need not be delayed: a repair packet brings its frame early."""
 
 
 class InjectionConfig(Section):
@@ -117,6 +118,6 @@ class Condition(Section):
     def least_ms(self) -> dict[str, float]:
         """A delay that next to no median of each flow is below: jitter and overtaking make it less than was asked."""
         return {
-            name: 0.0 if each.reorder >= HALF else max(0.0, delay_ms - 4 * each.jitter_ms)
+            name: 0.0 if each.reorder > EARLY_SHARE[name] else max(0.0, delay_ms - 4 * each.jitter_ms)
             for name, (delay_ms, each) in self.flows.items()
         }

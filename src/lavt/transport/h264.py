@@ -109,7 +109,6 @@ class Encoder:
             raise UserError(f"the encoder was made for I420 of {self._planes.shape}, not of {planes.shape}")
         frame = VideoFrame.from_numpy_buffer(planes, format="yuv420p")
         frame.pts = self._next_pts
-        frame.time_base = self._context.time_base
         self._next_pts += 1
         if keyframe:
             frame.pict_type = PictureType.I

@@ -42,6 +42,8 @@ class ReorderBuffer:
         self._stray: RtpPacket | None = None
         self._after_loss = False
         self._ssrc: int | None = None
+        self._next: int | None = None
+        self._highest = 0
         self._start(0)
 
     @property
@@ -51,6 +53,12 @@ class ReorderBuffer:
 
     def push(self, packet: RtpPacket, now_ns: int) -> Ordered:
         """Take a packet that arrived at `now_ns`; return the packets that are in order now."""
+        number = self._next
+        if number is not None and not self._held and (packet.sequence, packet.ssrc) == (number % 2**16, self._ssrc):
+            # As nearly always: the next one, and nothing waits.
+            self._highest, self._next, self._stray = number, number + 1, None
+            after_loss, self._after_loss = self._after_loss, False
+            return [(packet, after_loss)]
         released: Ordered = []
         if packet.ssrc != self._ssrc:
             released = self._restart(packet)
@@ -93,7 +101,7 @@ class ReorderBuffer:
     def _start(self, first_number: int) -> None:
         """Forget the stream."""
         self._held: dict[int, tuple[RtpPacket, int]] = {}
-        self._next: int | None = None
+        self._next = None
         self._first = first_number
         self._highest = first_number
         self._given_up: set[int] = set()

@@ -26,6 +26,11 @@ _BLACK_BELOW, _WHITE_ABOVE = 64, 192  # far from both is what a codec makes of a
 
 _BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), what OpenCV makes of 0 and 255
 _CLEARLY_BLACK, _CLEARLY_WHITE = _BLACK + (_WHITE - _BLACK) // 3, _WHITE - (_WHITE - _BLACK) // 3
+_INNERMOST = (_CELL_PX // 2 - 1, _CELL_PX // 2)
+"""Row and column, from the corner of a cell, of two of the pixels in its middle."""
+_UNCLEAR = b"?"
+_DIGITS = b"0" * (_CLEARLY_BLACK + 1) + _UNCLEAR * (_CLEARLY_WHITE - _CLEARLY_BLACK - 1) + b"1" * (256 - _CLEARLY_WHITE)
+"""For each luma the digit of a cell that has it."""
 _BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _LUMA_OF_BYTE = np.where(_BITS_OF_BYTE, _WHITE, _BLACK).astype(np.uint8).repeat(_CELL_PX, axis=1)
 """(256, STAMP_PX): one row of pixels for each byte of a stamp."""
@@ -84,6 +89,11 @@ def read_stamp(luma: NDArray[np.uint8]) -> int:
     What it returns is only a claim until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too
     small to hold a stamp, and for what is no plane.
     """
+    _check_plane(luma)
+    # Of nearly all pictures two pixels of each cell say the same, each clearly: summing takes five times as long.
+    one, other = (luma[at:STAMP_PX:_CELL_PX, at:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for at in _INNERMOST)
+    if one == other and _UNCLEAR not in one:
+        return int(one, 2)
     return _number(_cell_sums(luma) > _THRESHOLD * _CENTRE_PIXELS)
 
 
@@ -102,11 +112,15 @@ def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
 
 def _cell_sums(luma: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Sum the pixels in the centre half of each cell, (8, 8)."""
-    if luma.ndim != 2 or min(luma.shape) < STAMP_PX:
-        raise BadPacket(f"a picture of shape {luma.shape} holds no stamp")
+    _check_plane(luma)
     cells = luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
     sums: NDArray[np.uint16] = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
     return sums
+
+
+def _check_plane(luma: NDArray[np.uint8]) -> None:
+    if luma.ndim != 2 or min(luma.shape) < STAMP_PX:
+        raise BadPacket(f"a picture of shape {luma.shape} holds no stamp")
 
 
 def _number(white: NDArray[np.bool_]) -> int:
