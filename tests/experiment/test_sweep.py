@@ -183,6 +183,44 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < 60
 
 
+IMPORT_FOR_LONG = """
+import sys, time
+from pathlib import Path
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "lavt.experiment.report":
+            Path("importing").touch()
+            exec("time.sleep(3)")
+
+sys.meta_path.insert(0, Finder())
+"""
+"""Makes the import of the report a place to interrupt: it executes a string, as the definition of a dataclass does."""
+
+
+@pytest.mark.realtime
+def test_a_sweep_that_is_stopped_in_an_import_ends_with_its_own_exit_code(tmp_path: Path) -> None:
+    """`python -m` dies of a signal that finds the main thread executing a string, although it was handled."""
+    (tmp_path / "sitecustomize.py").write_text(IMPORT_FOR_LONG)
+    path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    started = subprocess.Popen(
+        [
+            *(sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml").resolve())),
+            *("--set", "fidelity=geometry", "--set", "repetitions=10", "--out", "out"),
+        ],
+        cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
+        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
+    )  # fmt: skip
+    for _ in range(3000):
+        if (tmp_path / "importing").exists():
+            break
+        pause(20 * NS_PER_MS)
+    os.killpg(started.pid, signal.SIGINT)
+    _, said = started.communicate(timeout=60)
+    assert "stopped; what was finished is kept" in said
+    assert started.returncode == 1
+
+
 def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
     config = load_config(
         SweepConfig, shipped("configs/sweep.yaml"), ["fidelity=geometry", "conditions=[L0, L3, L5]", *changes]

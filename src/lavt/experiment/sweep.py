@@ -6,6 +6,7 @@ import functools
 import itertools
 import os
 import shutil
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
@@ -95,8 +96,10 @@ class _Work:
         """Have runs driven; give those that were not, because a worker's process died."""
         futures = {workers.submit(each, self.runs_dir / each.name): each for each in todo}
         broken = []
+        # With matplotlib and SciPy it takes long: the others drive already. Not in the main thread: where Ctrl-C finds
+        # Python executing a string, as it does to define a dataclass, `python -m` dies of it although it was handled.
+        threading.Thread(target=import_module, args=("lavt.experiment.report",)).start()
         try:
-            import_module("lavt.experiment.report")  # with matplotlib and SciPy it takes long: the others drive already
             for future in as_completed(list(futures)):
                 planned = futures.pop(future)  # with it goes what it gave: a run's files, where they came from far
                 try:
