@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import threading
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from lavt.clock import Clock
@@ -20,8 +20,6 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_DATAGRAM = 65_535
-TAKEN_AT_ONCE = 256
-"""Datagrams in a row, before somebody who wants the link closed is heard."""
 
 
 class UdpLink:
@@ -63,7 +61,7 @@ class UdpLink:
                 f"the {name} port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
             ) from error
         self._room = memoryview(bytearray(LONGEST_DATAGRAM))
-        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._closing = False
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
 
     @property
@@ -88,32 +86,26 @@ class UdpLink:
 
     def close(self) -> None:
         """Stop receiving and close the socket."""
-        self._wake_writer.send(b"x")
+        self._closing = True
+        with suppress(OSError):  # it says that there is no connection, and ends the waiting all the same
+            self._socket.shutdown(socket.SHUT_RD)
         if self._thread.is_alive():
             self._thread.join()
-        for each in (self._socket, self._wake_reader, self._wake_writer):
-            each.close()
+        self._socket.close()
 
     def _receive(self) -> None:
-        while True:
-            ready, _, _ = select.select((self._socket, self._wake_reader), (), ())
-            if self._wake_reader in ready:
-                return
-            self._take_all()
-
-    def _take_all(self) -> None:
-        """Deliver what has come: a frame's packets come together."""
+        """Deliver what comes, one datagram for each call of the system: who waits for the first one is in it already."""
         room = self._room
-        for _ in range(TAKEN_AT_ONCE):
+        while True:
             try:
-                length, ancillary, _flags, address = self._socket.recvmsg_into(
-                    (room,), ANCILLARY_BYTES, socket.MSG_DONTWAIT
-                )
-            except BlockingIOError:
-                return
+                length, ancillary, _flags, address = self._socket.recvmsg_into((room,), ANCILLARY_BYTES)
             except OSError:  # an ICMP error of an earlier datagram
+                if self._closing:
+                    return
                 self.counts["datagrams_refused"] += 1
                 continue
+            if self._closing:
+                return
             if self._is_stranger(address):
                 self.counts["datagrams_from_strangers"] += 1
                 continue
