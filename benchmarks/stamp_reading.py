@@ -33,7 +33,8 @@ from lavt.errors import BadPacket
 from lavt.streams import stream
 from lavt.transport.fec import RepairReceiver, RepairSender
 from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
-from lavt.transport.reorder import HOLD_NS, Ordered, ReorderBuffer
+from lavt.transport.hold import LEAST_HOLD_NS
+from lavt.transport.reorder import Ordered, ReorderBuffer
 from lavt.transport.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
 from lavt.transport.stamp import read_clear_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp_i420
 from lavt.transport.stamp_check import LearnedBase
@@ -184,7 +185,7 @@ class Receiver:
             for recovered in self.repair.push(packet, now_ns):
                 ordered += self.reorder.push_recovered(recovered, now_ns)
                 media += 1
-        ordered += self.reorder.expire(now_ns + HOLD_NS)
+        ordered += self.reorder.expire(now_ns + LEAST_HOLD_NS)
         return media, [unit for each in ordered for unit in self.depacketizer.push(*each)]
 
 

@@ -12,8 +12,9 @@ from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, SessionReques
 from lavt.perception.lane_detector import LaneDetector
 from lavt.transport.delay import DelayLaw, DelayLine
 from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.hold import LEAST_HOLD_NS
 from lavt.transport.messages import decode, encode
-from lavt.transport.reorder import HOLD_NS, ReorderBuffer
+from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
 from lavt.transport.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
 from lavt.vehicle.sim.camera import SimCamera
@@ -92,7 +93,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     arrived[-1], arrived[-2] = arrived[-2], arrived[-1]
     reorder, depacketizer = ReorderBuffer(), Depacketizer()
     ordered = [each for packet in arrived for each in reorder.push(parse_packet(packet), now_ns)]
-    now_ns += HOLD_NS  # the first packets of a stream wait for any that were sent before them
+    now_ns += LEAST_HOLD_NS  # the first packets of a stream wait for any that were sent before them
     ordered += reorder.expire(now_ns)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
     assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit)]
@@ -135,7 +136,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 12. The command is admitted: right epoch, newer, and made from a picture that this server took just now.
     picture_age_ns = now_ns - START_NS
-    assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + HOLD_NS
+    assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + LEAST_HOLD_NS
     car.advance(now_ns)
     assert gate.admit(received, car.state(), now_ns).obeyed
     assert not gate.admit(received, car.state(), now_ns).obeyed, "nothing is obeyed twice"

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, Picture
 from lavt.streams import stream
 from lavt.transport.h264 import Decoder, Encoder
-from lavt.transport.reorder import HOLD_NS, Ordered, ReorderBuffer
+from lavt.transport.hold import LEAST_HOLD_NS
+from lavt.transport.reorder import Ordered, ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer, parse_packet
 from lavt.transport.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
 
@@ -53,7 +54,7 @@ def test_reordered(sent: Sent) -> None:
     random = stream(1, "delay")
     arrivals = []
     for number, datagrams in enumerate(sent.datagrams):
-        delays_ns = random.integers(0, HOLD_NS - NS_PER_MS, len(datagrams))
+        delays_ns = random.integers(0, LEAST_HOLD_NS - NS_PER_MS, len(datagrams))
         arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
     buffer, depacketizer, decoder = ReorderBuffer(), Depacketizer(), Decoder()
     ordered: Ordered = []

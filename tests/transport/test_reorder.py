@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS
-from lavt.transport.reorder import CAPACITY, HOLD_NS, MAX_JUMP, Ordered, ReorderBuffer
+from lavt.transport.hold import LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS
+from lavt.transport.reorder import CAPACITY, MAX_JUMP, Ordered, ReorderBuffer
 from lavt.transport.rtp import RtpPacket
 
+HOLD_NS = 10 * NS_PER_MS
 STARTED_NS = HOLD_NS
 
 
@@ -24,9 +26,9 @@ def gaps(ordered: Ordered) -> list[int]:
     return [one.sequence for one, lost_before in ordered if lost_before]
 
 
-def started(first: int = 0) -> ReorderBuffer:
+def started(first: int = 0, hold_ns: int | None = HOLD_NS) -> ReorderBuffer:
     """Give a buffer past its start: packet `first` has left it, at `STARTED_NS`."""
-    buffer = ReorderBuffer()
+    buffer = ReorderBuffer(hold_ns)
     buffer.push(packet(first), 0)
     assert numbers(buffer.expire(STARTED_NS)) == [first % 2**16]
     return buffer
@@ -34,7 +36,7 @@ def started(first: int = 0) -> ReorderBuffer:
 
 def test_start() -> None:
     """The first packets wait one hold, so that the stream begins with the first sent and not the first to arrive."""
-    buffer = ReorderBuffer()
+    buffer = ReorderBuffer(HOLD_NS)
     assert buffer.next_wake_ns() is None
     assert buffer.push(packet(11), 100) == []
     assert buffer.push(packet(12), 100 + NS_PER_MS) == []
@@ -175,7 +177,7 @@ def test_bounded_memory() -> None:
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
 def test_any_order(first: int, order: list[int], start_ns: int) -> None:
     """Packets that arrive within one hold leave in the order they were sent, none missing."""
-    buffer = ReorderBuffer()
+    buffer = ReorderBuffer(HOLD_NS)
     ordered = [
         one for at, number in enumerate(order) for one in buffer.push(packet(first + number), start_ns + at * 1000)
     ]
@@ -191,7 +193,7 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 8 * NS_PER_MS))
 @given(st.integers(0, 2**16 - 1), ARRIVALS)
 def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
     """Whatever arrives when: order is kept, gaps are told, each packet is accounted for and held one hold at most."""
-    buffer = ReorderBuffer()
+    buffer = ReorderBuffer(HOLD_NS)
     ordered: Ordered = []
     now_ns = 0
     for number, pause_ns in arrivals:
@@ -211,7 +213,7 @@ def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
 @given(st.lists(st.tuples(st.integers(0, 2**16 - 1), st.integers(0, 1), st.integers(0, HOLD_NS)), max_size=60))
 def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
     """No sequence numbers and sources break the buffer, and after them an orderly stream goes through."""
-    buffer = ReorderBuffer()
+    buffer = ReorderBuffer(HOLD_NS)
     now_ns = 0
     for sequence, ssrc, pause_ns in arrivals:
         now_ns += pause_ns
@@ -245,4 +247,63 @@ def test_recovered_that_nobody_waits_for() -> None:
     counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
     assert counts == (0, 1, 0, 0, 0)
     assert numbers(buffer.push(packet(3), STARTED_NS + HOLD_NS)) == [3]
-    assert ReorderBuffer().push_recovered(packet(0), 0) == []
+    assert ReorderBuffer(HOLD_NS).push_recovered(packet(0), 0) == []
+
+
+def hold_of(buffer: ReorderBuffer, number: int, now_ns: int) -> int:
+    """Let packet `number` be lost for good at `now_ns`; give how long it was waited for."""
+    assert buffer.push(packet(number + 1), now_ns) == []
+    wake_ns = buffer.next_wake_ns()
+    assert wake_ns is not None
+    assert numbers(buffer.expire(wake_ns)) == [number + 1]
+    return wake_ns - now_ns
+
+
+def test_the_hold_follows_the_network() -> None:
+    """Who has seen packets overtaken by 40 ms waits for the next ones a quarter longer, until that is long ago."""
+    buffer = started(hold_ns=None)
+    assert hold_of(buffer, 1, STARTED_NS) == LEAST_HOLD_NS
+    came_ns = STARTED_NS + 40 * NS_PER_MS
+    assert buffer.push(packet(1), came_ns) == []
+    assert (buffer.late, hold_of(buffer, 3, came_ns)) == (1, 50 * NS_PER_MS)
+    assert hold_of(buffer, 5, came_ns + WINDOW_NS) == 50 * NS_PER_MS
+    assert hold_of(buffer, 7, came_ns + 3 * WINDOW_NS) == LEAST_HOLD_NS
+
+
+def test_the_hold_follows_what_closes_a_gap_in_time() -> None:
+    """A packet that needed 9 ms of the 10 is as much of a sign as one that was late."""
+    buffer = started(hold_ns=None)
+    buffer.push(packet(2), STARTED_NS)
+    assert numbers(buffer.push(packet(1), STARTED_NS + 9 * NS_PER_MS)) == [1, 2]
+    assert hold_of(buffer, 3, STARTED_NS + 9 * NS_PER_MS) == 11_250_000
+
+
+def test_the_hold_follows_repairs() -> None:
+    """A packet that is made again after it was given up would have been waited for with a longer hold."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    assert buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS) == []
+    assert hold_of(buffer, 3, STARTED_NS + 20 * NS_PER_MS) == 25 * NS_PER_MS
+
+
+def test_nobody_waits_for_ever() -> None:
+    """What is overtaken by more than makes sense to wait for changes nothing."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    buffer.push(packet(1), STARTED_NS + MOST_HOLD_NS)
+    assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS) == LEAST_HOLD_NS
+
+
+@given(ARRIVALS)
+def test_any_arrivals_with_a_hold_that_follows(arrivals: list[tuple[int, int]]) -> None:
+    """Whatever arrives when, no packet is held longer than the longest hold, and each is accounted for."""
+    buffer = ReorderBuffer()
+    left, now_ns = 0, 0
+    for number, pause_ns in arrivals:
+        now_ns += pause_ns
+        left += len(buffer.push(packet(number), now_ns))
+        wake_ns = buffer.next_wake_ns()
+        assert wake_ns is None or now_ns < wake_ns <= now_ns + MOST_HOLD_NS
+    left += len(buffer.expire(now_ns + MOST_HOLD_NS))
+    assert buffer.next_wake_ns() is None
+    assert left + buffer.late + buffer.duplicate == len(arrivals)

@@ -164,6 +164,7 @@ def build_client(
     """Make the client's nodes."""
     controller = config.controller
     pictures, detector = fidelity.receiver(config), fidelity.detector(config)
+    hold_ms = config.video.reorder_hold_ms
     drive_controller = build_controller(controller)
     start = now()
     instance = entropy.number(64)
@@ -177,7 +178,7 @@ def build_client(
     )
     return ClientNodes(
         ReceiverNode(
-            ReorderBuffer(round(config.video.reorder_hold_ms * NS_PER_MS)),
+            ReorderBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
             Depacketizer(),
             config.video.max_bit_rate_bps,
         ),

@@ -41,8 +41,14 @@ def watch(
         Sender, typer.Option(help="foreign: its RTP clock has a base of its own, which is learned: a weaker check.")
     ] = "lavt",
     reorder_hold_ms: Annotated[
-        int, typer.Option(min=0, max=500, help="How long a packet after a gap waits for those before it.")
-    ] = 10,
+        int | None,
+        typer.Option(
+            min=0,
+            max=500,
+            help="How long a packet after a gap waits for those before it.",
+            show_default="as the network needs it",
+        ),
+    ] = None,
     seconds: Annotated[int | None, typer.Option(min=1, help="End after so long, not by Ctrl-C only.")] = None,
     as_json: console.Json = False,
 ) -> None:

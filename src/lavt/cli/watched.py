@@ -27,9 +27,10 @@ Sender = Literal["lavt", "foreign"]
 class Watched:
     """A receiver without a path, so that it sends nothing, a watcher, and the recorder that both report to."""
 
-    def __init__(self, sender: Sender, reorder_hold_ms: int) -> None:
+    def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
         self._reader = _reader(sender)
-        self._receiver = ReceiverNode(ReorderBuffer(reorder_hold_ms * NS_PER_MS), Depacketizer())
+        hold_ns = None if reorder_hold_ms is None else reorder_hold_ms * NS_PER_MS
+        self._receiver = ReceiverNode(ReorderBuffer(hold_ns), Depacketizer())
         self.nodes = (self._receiver, WatcherNode(self._reader))
         self._latencies_ms = array("d")
         self._jitter_us = 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -77,6 +77,10 @@ class ClientCameraConfig(CameraConfig):
     """File of a calibration, which then says everything but the rate; empty: the keys above say it."""
 
 
+ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
+"""How long a packet waits for those before it, in ms; auto: 10 ms, and as long as any have lately been overtaken by."""
+
+
 class VideoConfig(Section):
     """H.264 and RTP."""
 
@@ -94,8 +98,7 @@ class VideoConfig(Section):
     """Each encodes a slice of every picture."""
     repair_packets: Literal["auto", 0, 1, 2] = "auto"
     """For each frame (for each 16 packets of a large one); auto: as many as the reported loss asks for."""
-    reorder_hold_ms: float = Field(10.0, ge=0, le=500)
-    """So long a packet waits for those before it: at least the network's jitter."""
+    reorder_hold_ms: ReorderHold = "auto"
 
 
 class NetworkConfig(Section):
@@ -320,7 +323,7 @@ class ClientVideoConfig(Section):
     """0: the port that the server names in the session."""
     max_bit_rate_bps: int | None = Field(None, ge=50_000, le=50_000_000)
     """What the server is asked to keep to, where that is less than its own bit rate."""
-    reorder_hold_ms: float = Field(10.0, ge=0, le=500)
+    reorder_hold_ms: ReorderHold = "auto"
 
 
 class ClientConfig(Section):

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
+from lavt.runtime.bell import Bell
 from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
 from lavt.runtime.recording import Recorder
@@ -137,11 +138,12 @@ class _Worker:
         self.thread = threading.Thread(target=self._work, name=node.name, daemon=True)
         self._runtime = runtime
         self._turn = threading.Lock()
+        self._inbox_turn = threading.Lock()
+        self._bell = Bell()
         self._wake_ns: int | None = 0
         """When the node wants to be woken, as it said when it was walked last; written by who has the turn."""
-        self._condition = threading.Condition()
         self._sleeps_until_ns: int | None = 0
-        """When the thread wakes by itself; None: only when it is told to; 0: it is awake."""
+        """When the thread wakes by itself; None: only when the bell rings; 0: it is awake."""
 
     def put(self, message: Message) -> None:
         if CHANNELS[message.channel].at_once and self.inbox.is_empty() and self._turn.acquire(blocking=False):
@@ -152,13 +154,12 @@ class _Worker:
             if self.inbox.is_empty() and not _is_before(self._wake_ns, self._sleeps_until_ns):
                 return
         else:
-            with self._condition:
+            with self._inbox_turn:
                 self.inbox.put(message)
         self.notify()
 
     def notify(self) -> None:
-        with self._condition:
-            self._condition.notify()
+        self._bell.ring()
 
     def _work(self) -> None:
         while not self._runtime.stopped.is_set():
@@ -190,21 +191,20 @@ class _Worker:
         if wake_ns is not None:
             now = self._runtime.now()
             if wake_ns <= now.mono_ns:
-                with self._condition:
+                with self._inbox_turn:
                     return self.inbox.take_arrived(wake_ns) or Message(WAKE, None, now)
-        with self._condition:
+        with self._inbox_turn:
             return self.inbox.take()
 
     def _sleep(self) -> None:
         """Sleep until the node wants to be woken, or somebody says that there is something to do."""
-        with self._condition:
-            if not self.inbox.is_empty() or self._runtime.stopped.is_set():
-                return
+        self._bell.silence()
+        self._sleeps_until_ns = None  # from here on the bell is rung for whatever comes
+        if self.inbox.is_empty() and not self._runtime.stopped.is_set():
             self._sleeps_until_ns = wake_ns = self._wake_ns
             pause_s = None if wake_ns is None else (wake_ns - self._runtime.now().mono_ns) / NS_PER_S
-            if pause_s is None or pause_s > 0:
-                self._condition.wait(pause_s)
-            self._sleeps_until_ns = 0
+            self._bell.wait(pause_s)
+        self._sleeps_until_ns = 0
 
 
 def _is_before(one_ns: int | None, other_ns: int | None) -> bool:

@@ -1,7 +1,7 @@
 """Packets back into the order of their sequence numbers, without keeping those that are in order.
 
-A packet in order leaves at once. One after a gap waits for the missing ones, at most `hold_ns` from the first sign of
-the gap; then the gap is given up. The very first packets wait one hold, since the first to arrive need not be the
+A packet in order leaves at once. One after a gap waits for the missing ones, at most a hold from the first sign of the
+gap; then the gap is given up. The very first packets wait one hold, since the first to arrive need not be the
 first that was sent: without it a reordered keyframe at the start costs the whole first group of pictures.
 """
 
@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from lavt.domain import NS_PER_MS
+from lavt.transport.hold import AdaptiveHold
 from lavt.transport.rtp import RtpPacket
 
-HOLD_NS: Final = 10 * NS_PER_MS
 MAX_JUMP: Final = 3000
 """Sequence numbers further from the newest than this are another range. RFC 3550 (A.1) allows only 100 backwards; here
 a delay spike, which brings many old packets in a row, must not pass for a restart of the sender."""
@@ -26,19 +25,21 @@ Ordered = list[tuple[RtpPacket, bool]]
 class ReorderBuffer:
     """Puts the packets of one RTP stream in order; a new SSRC begins a new stream.
 
+    `hold_ns` is how long a gap is waited for; None: as long as the network's packets have lately been overtaken by.
     Repair packets have another SSRC and must not come in here. Public counters, in packets: `late` came after they had
     been given up, `duplicate` came twice, `lost` were given up (late ones included), `reordered` came late but in
     time, `stray` were far from all others and alone, `recovered` did not come in time but were made again in time.
     """
 
-    def __init__(self, hold_ns: int = HOLD_NS) -> None:
+    def __init__(self, hold_ns: int | None = None) -> None:
         self.late = 0
         self.duplicate = 0
         self.lost = 0
         self.reordered = 0
         self.stray = 0
         self.recovered = 0
-        self._hold_ns = hold_ns
+        self._adaptive = AdaptiveHold() if hold_ns is None else None
+        self._hold_ns = 0 if hold_ns is None else hold_ns
         self._stray: RtpPacket | None = None
         self._after_loss = False
         self._ssrc: int | None = None
@@ -81,7 +82,10 @@ class ReorderBuffer:
         """Take a packet that was made again; one that is not missing, or no longer waited for, changes nothing."""
         number = self._extend(packet.sequence)
         waited_for = number not in self._held and (self._next is None or number >= self._next)
-        if packet.ssrc != self._ssrc or abs(number - self._highest) > MAX_JUMP or not waited_for:
+        if packet.ssrc != self._ssrc or abs(number - self._highest) > MAX_JUMP:
+            return []
+        if not waited_for:
+            self._note_given_up(number, now_ns)
             return []
         self.recovered += 1
         self._hold(packet, number, now_ns)
@@ -104,7 +108,8 @@ class ReorderBuffer:
         self._next = None
         self._first = first_number
         self._highest = first_number
-        self._given_up: set[int] = set()
+        self._given_up: dict[int, int] = {}
+        """Numbers of packets that were given up, each with the time of the first sign that it was missing."""
 
     def _restart(self, first: RtpPacket) -> Ordered:
         """Let go all that is held and begin anew with the stream of `first`."""
@@ -127,16 +132,21 @@ class ReorderBuffer:
             self.duplicate += 1
         elif self._next is not None and number < self._next:
             if number in self._given_up or number < self._first:
-                self._given_up.discard(number)
+                self._note_given_up(number, now_ns)
+                self._given_up.pop(number, None)
                 self.late += 1
             else:
                 self.duplicate += 1
         else:
-            self.reordered += number < self._highest
+            if number < self._highest:
+                self.reordered += 1
+                self._note_overtaken(self._first_sign_ns(), now_ns)
             self._hold(packet, number, now_ns)
 
     def _hold(self, packet: RtpPacket, number: int, now_ns: int) -> None:
         """Keep a packet that is waited for."""
+        if self._adaptive is not None and not self._held:
+            self._hold_ns = self._adaptive.at(now_ns)
         self._highest = max(self._highest, number)
         self._held[number] = packet, now_ns
 
@@ -158,13 +168,27 @@ class ReorderBuffer:
         elif first > self._next:
             missing = range(self._next, first)
             self.lost += len(missing)
-            self._given_up.update(missing)
+            self._given_up.update(dict.fromkeys(missing, self._first_sign_ns()))
             if len(self._given_up) > 2 * MAX_JUMP:
-                self._given_up = {number for number in self._given_up if number > first - MAX_JUMP}
+                self._given_up = {each: at for each, at in self._given_up.items() if each > first - MAX_JUMP}
             self._after_loss = True
         self._next = first
         return self._drain()
 
+    def _first_sign_ns(self) -> int:
+        """Tell when the first gap showed: the packet held longest was the first sign of it."""
+        return next(iter(self._held.values()))[1]
+
     def _deadline_ns(self) -> int:
-        """Tell when the hold of the first gap is over: the packet held longest was the first sign of it."""
-        return next(iter(self._held.values()))[1] + self._hold_ns
+        """Tell when the hold of the first gap is over."""
+        return self._first_sign_ns() + self._hold_ns
+
+    def _note_given_up(self, number: int, now_ns: int) -> None:
+        """A packet came, or was made again, that had been given up: a longer hold would have waited for it."""
+        if number in self._given_up:
+            self._note_overtaken(self._given_up[number], now_ns)
+
+    def _note_overtaken(self, first_sign_ns: int, now_ns: int) -> None:
+        if self._adaptive is not None:
+            self._adaptive.note(now_ns - first_sign_ns, now_ns)
+            self._hold_ns = self._adaptive.at(now_ns)

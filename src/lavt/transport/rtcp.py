@@ -24,7 +24,7 @@ from lavt.transport.extended_reports import (
     write_answers,
     write_reference_time,
 )
-from lavt.transport.ntp_time import delay_ns_of, ntp_of_wall, round_trip_ns, short_delay, short_time
+from lavt.transport.ntp_time import delay_ns_of, ntp_of_wall, short_delay
 from lavt.value import value
 
 RECEIVER_CNAME: Final = "receiver@lavt"
@@ -228,11 +228,6 @@ def parse_announcement(datagram: bytes) -> Announcement:
         elif kind == _EXTENDED_REPORT:
             answers += read_answers(body)
     return Announcement(tuple(reports), tuple(answers))
-
-
-def reported_round_trip_ns(report: ReceptionReport, arrived_wall_ns: int) -> int | None:
-    """Give the sender the round trip from a reception report that came at `arrived_wall_ns`; None: it says none."""
-    return round_trip_ns(short_time(ntp_of_wall(arrived_wall_ns)), report.last_report, report.last_report_age_ns)
 
 
 def is_rtcp(datagram: bytes) -> bool:

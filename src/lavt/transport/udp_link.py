@@ -94,7 +94,7 @@ class UdpLink:
         self._socket.close()
 
     def _receive(self) -> None:
-        """Deliver what comes, one datagram for each call of the system: who waits for the first one is in it already."""
+        """Deliver what comes, one datagram for each call of the system; the waiting is in it."""
         room = self._room
         while True:
             try:
