@@ -171,6 +171,20 @@ def test_a_keyframe_on_request_is_rate_limited() -> None:
     assert sum(sizes) == node.counts["keyframes_on_request"]
 
 
+def test_changes_of_the_bit_rate_bring_no_flood_of_keyframes() -> None:
+    """Each change is a keyframe: of a receiver that asks for another with each frame, every one in 100 ms is heard."""
+    node = node_with()
+    give(node, "video_token", TOKEN, at(0))
+    prove(node)
+    keyframes = 0
+    for number in range(30):
+        limit = max_bit_rate(1, 2, 500_000 + number * 10_000, overhead_bytes=0)
+        give(node, "feedback", limit, at(number * FRAME_NS + NS_PER_MS), HOME)
+        (unit,) = of(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
+        keyframes += any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data)))
+    assert 8 <= keyframes <= 11
+
+
 def test_strangers_move_nothing() -> None:
     """RTCP and hellos from anywhere else bring no keyframe, keep no path open and take no video away."""
     node = node_with()

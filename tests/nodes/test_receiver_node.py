@@ -118,15 +118,15 @@ def test_a_loss_asks_for_a_keyframe() -> None:
     assert node.counts["picture_loss_requests"] == 4
 
 
-def answered(node: ReceiverNode, round_trip_ns: int) -> None:
+def answered(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
     """Let the node report, and the sender answer 30 ms after it heard."""
-    (report,) = [each for each in of(give(node, WAKE, None, at(0)), "feedback") if not is_path_datagram(each)]
+    (report,) = [each for each in of(give(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)]
     (reference,) = parse_feedback(report).reference_times
     answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
     datagram = sender_report(
         77, wall_ns=at(0).wall_ns, rtp_timestamp=0, packets=1, octets=1, cname="x", answered=[answer]
     )
-    assert give(node, "rtp", datagram, at(round_trip_ns + 30 * NS_PER_MS)) == []
+    assert give(node, "rtp", datagram, at(begin_ns + round_trip_ns + 30 * NS_PER_MS)) == []
 
 
 def test_it_asks_each_round_trip_until_the_keyframe_comes() -> None:
@@ -144,6 +144,20 @@ def test_it_asks_each_round_trip_until_the_keyframe_comes() -> None:
         give(node, "rtp", packet, at(700 * NS_PER_MS))
     assert not any(asks(give(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
     assert node.counts["picture_loss_requests"] == 4
+
+
+def test_a_round_trip_that_was_long_once_does_not_hold_requests_back() -> None:
+    """What counts is the round trip as it is known now, not as it was when the last keyframe was asked for."""
+    node = new_node()
+    first, second, _ = packets()
+    for packet in first:
+        give(node, "rtp", packet, at(0))
+    answered(node, 3 * NS_PER_S)
+    for packet in second[1:]:
+        give(node, "rtp", packet, at(4 * NS_PER_S))
+    assert asks(give(node, WAKE, None, at(4 * NS_PER_S + 10 * NS_PER_MS)))
+    answered(node, 100 * NS_PER_MS, 4 * NS_PER_S + 600 * NS_PER_MS)
+    assert asks(give(node, WAKE, None, at(4 * NS_PER_S + 740 * NS_PER_MS)))
 
 
 def test_a_repaired_loss_costs_nothing() -> None:

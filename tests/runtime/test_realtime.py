@@ -103,3 +103,21 @@ def test_a_failing_node_ends_the_run() -> None:
     assert isinstance(runtime.failed, ValueError)
     runtime.stop()
     assert "driver" not in {thread.name for thread in threading.enumerate()}
+
+
+class NeverSays(Ticker):
+    """A node that breaks where it is asked when it wants to be woken."""
+
+    def next_wake_ns(self) -> int:
+        """Break."""
+        raise ValueError("broken")
+
+
+def test_a_node_that_breaks_between_messages_ends_the_run() -> None:
+    """No half of a node stays alive, wherever it broke."""
+    clock = MachineClock()
+    runtime = RealRuntime(clock, [NeverSays(0)], Kept(), lambda: None)
+    runtime.start({})
+    assert runtime.stopped.wait(5)
+    assert isinstance(runtime.failed, ValueError)
+    runtime.stop()

@@ -236,6 +236,15 @@ def test_sender_report_comes_back() -> None:
     assert report.last_report == 0
 
 
+def test_a_round_trip_of_less_than_a_step_is_known() -> None:
+    """It is 0 then, and not unknown."""
+    reception = Reception(ReorderBuffer())
+    sent_ns = 5 * NS_PER_S
+    answer = ReferenceAnswer(1, short_time(ntp_of_elapsed(sent_ns)), 0)
+    reception.note_announcement(Announcement((), (answer,)), 1, sent_ns + 1000)
+    assert reception.round_trip_ns == 0
+
+
 def test_an_answer_tells_the_round_trip() -> None:
     """The sender's answer to a reference time of ours gives the round trip; that to another receiver's does not."""
     stream = Stream()

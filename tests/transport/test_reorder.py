@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.domain import NS_PER_MS
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.hold import LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS
 from lavt.transport.reorder import CAPACITY, MAX_JUMP, Ordered, ReorderBuffer
 from lavt.transport.rtp import RtpPacket
@@ -156,6 +156,15 @@ def test_jump() -> None:
     assert (buffer.stray, buffer.lost) == (0, 0)
 
 
+def test_a_jump_keeps_the_wraps() -> None:
+    """A stream that goes on elsewhere goes on upwards: who reads its reports must not see it go back."""
+    buffer = started(65_000)
+    for number in (65_000 + MAX_JUMP + 1, 65_000 + MAX_JUMP + 2, 50_000, 50_001):
+        buffer.push(packet(number), STARTED_NS)
+        buffer.expire(STARTED_NS + HOLD_NS)
+    assert buffer.highest_sequence == 2**16 + 50_001
+
+
 def test_delay_spike() -> None:
     """Many old packets in a row are late packets and not a restart of the sender."""
     buffer = started()
@@ -290,8 +299,34 @@ def test_nobody_waits_for_ever() -> None:
     """What is overtaken by more than makes sense to wait for changes nothing."""
     buffer = started(hold_ns=None)
     hold_of(buffer, 1, STARTED_NS)
-    buffer.push(packet(1), STARTED_NS + MOST_HOLD_NS)
-    assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS) == LEAST_HOLD_NS
+    buffer.push(packet(1), STARTED_NS + MOST_HOLD_NS + 1)
+    assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS + 1) == LEAST_HOLD_NS
+
+
+def test_a_loss_does_not_make_what_was_only_swapped_long_overtaken() -> None:
+    """While a lost packet is waited for, others swap places behind it: each was overtaken by that much only."""
+    buffer = started(hold_ns=None)
+    now_ns = STARTED_NS
+    for number in range(2, 2000, 2):
+        lost = number % 200 == 100
+        for each in (number,) if lost else (number, number - 1):
+            now_ns += NS_PER_MS // 5
+            buffer.push(packet(each), now_ns)
+    assert buffer.reordered > 900
+    assert hold_of(buffer, 2001, now_ns + NS_PER_S) == LEAST_HOLD_NS
+
+
+def test_the_hold_stays_what_repairs_need() -> None:
+    """Repairs that take 20 ms are waited for as long as they come, though each comes in time."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS)
+    for second in range(1, 200):
+        now_ns, number = STARTED_NS + second * NS_PER_S, 2 * second + 1
+        assert buffer.push(packet(number + 1), now_ns) == []
+        assert buffer.expire(now_ns + 20 * NS_PER_MS) == []
+        assert numbers(buffer.push_recovered(packet(number), now_ns + 20 * NS_PER_MS)) == [number, number + 1]
+    assert buffer.lost == 1
 
 
 @given(ARRIVALS)

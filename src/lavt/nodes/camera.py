@@ -17,7 +17,7 @@ from lavt.value import value
 from lavt.vehicle.camera import Camera, CapturedFrame, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
-"""No more than one keyframe on request in this time, so that requests cannot fill the link."""
+"""No more than one keyframe on request in this time, so that requests cannot fill the link; nor for a new bit rate."""
 REMEMBERED_STAMPS = 512
 """No stamp is one of so many before: at 60 Hz more than the 5 s for which the safety of the vehicle knows them."""
 REMEMBERED_POSES = 512
@@ -79,6 +79,7 @@ class CameraNode:
         self._poses: deque[Pose] = deque(maxlen=REMEMBERED_POSES)
         self._keyframe_wanted = False
         self._keyframe_ns = 0
+        self._limit_bps: int | None = None
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
         self._highest_stamp_ns = 0
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -144,11 +145,15 @@ class CameraNode:
         return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(prepared, stamp_ns))
 
     def _encode(self, stamped: Stamped, now: Now) -> Encoded:
-        keyframe = self._keyframe_wanted and now.mono_ns - self._keyframe_ns >= KEYFRAME_PAUSE_NS
+        paused = now.mono_ns - self._keyframe_ns < KEYFRAME_PAUSE_NS
+        keyframe = self._keyframe_wanted and not paused
+        limit_bps = self._stream.bit_rate_limit_bps
+        if limit_bps != self._limit_bps and not paused:
+            self._limit_bps, self._keyframe_ns = limit_bps, now.mono_ns
+            self._pictures.limit_bit_rate(limit_bps)
         if keyframe:
             self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
             self._counts["keyframes_on_request"] += 1
-        self._pictures.limit_bit_rate(self._stream.bit_rate_limit_bps)
         return Encoded(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
 
     def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:

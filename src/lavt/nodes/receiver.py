@@ -51,8 +51,8 @@ class ReceiverNode:
         self._media_ssrc: int | None = None
         self._report_ns = self._sample_ns = 0
         self._in_doubt = False
-        self._ask_ns = 0
-        """When a keyframe may be asked for next."""
+        self._asked_ns: int | None = None
+        """When a keyframe was asked for last."""
         self.chains: Mapping[str, Sequence[Hop]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
             "path_token": (("note", self._note_token),),
@@ -80,7 +80,7 @@ class ReceiverNode:
         if self._media_ssrc is not None:
             times.append(self._sample_ns)
             if self._path is not None:
-                times += [self._report_ns, self._ask_ns if self._asks_again() else None]
+                times += [self._report_ns, self._ask_ns() if self._asks_again() else None]
         return min((time for time in times if time is not None), default=None)
 
     def _note_token(self, message: Message, _now: Now) -> None:
@@ -99,7 +99,10 @@ class ReceiverNode:
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
         try:
             if is_rtcp(datagram):
-                self._reception.note_announcement(parse_announcement(datagram), SSRC, message.arrived.mono_ns)
+                announcement = parse_announcement(datagram)
+                # Without a path nothing was reported: what a sender answers is another receiver's.
+                own_ssrc = None if self._path is None else SSRC
+                self._reception.note_announcement(announcement, own_ssrc, message.arrived.mono_ns)
                 return None
             return self._order(datagram, message.arrived, now), message.arrived, []
         except BadPacket:
@@ -163,12 +166,18 @@ class ReceiverNode:
         """Whether a keyframe should have come by `_ask_ns`; before a round trip is known only the next loss tells."""
         return self._in_doubt and self._reception.round_trip_ns is not None
 
+    def _ask_ns(self) -> int:
+        """Tell when a keyframe may be asked for next: one that was asked for can be on its way for a round trip."""
+        if self._asked_ns is None:
+            return 0
+        round_trip_ns = self._reception.round_trip_ns
+        return self._asked_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
+
     def _ask_for_keyframe(self, now_ns: int) -> list[Send]:
         """Ask for a keyframe, unless one that was asked for can be on its way."""
-        if self._media_ssrc is None or self._path is None or now_ns < self._ask_ns:
+        if self._media_ssrc is None or self._path is None or now_ns < self._ask_ns():
             return []
-        round_trip_ns = self._reception.round_trip_ns
-        self._ask_ns = now_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
+        self._asked_ns = now_ns
         self._counts["picture_loss_requests"] += 1
         return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
 

@@ -59,7 +59,10 @@ class Inbox:
         return self._newest.pop(next(iter(self._newest)))
 
     def take_arrived(self, until_ns: int) -> Message | None:
-        """Take a message that had arrived by a time of the monotonic clock, of a channel that is walked at once."""
+        """Take a message that had arrived by a time of the monotonic clock.
+
+        Only of a channel that queues and is walked at once: where only the newest counts a wake does not wait for it.
+        """
         for channel, queue in self._queues.items():
             if CHANNELS[channel].at_once and queue and queue[0][1].arrived.mono_ns <= until_ns:
                 self.waiting -= 1

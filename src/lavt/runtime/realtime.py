@@ -162,11 +162,14 @@ class _Worker:
         self._bell.ring()
 
     def _work(self) -> None:
-        while not self._runtime.stopped.is_set():
-            with self._turn:
-                walked = self._walk_next()
-            if not walked:
-                self._sleep()
+        try:
+            while not self._runtime.stopped.is_set():
+                with self._turn:
+                    walked = self._walk_next()
+                if not walked:
+                    self._sleep()
+        except BaseException as error:  # as in `_walk`
+            self._runtime.fail(error)
 
     def _walk_next(self) -> bool:
         """Walk what comes next through the node; False where nothing does. Needs the turn."""

@@ -16,7 +16,7 @@ WINDOW_NS: Final = 30 * NS_PER_S
 class AdaptiveHold:
     """A quarter longer than any packet of the last 30 to 60 s was overtaken by; within `LEAST_` and `MOST_HOLD_NS`.
 
-    Packets that were overtaken by more than `MOST_HOLD_NS` are not waited for and count for nothing.
+    Packets that were overtaken by more than `MOST_HOLD_NS` count for nothing.
     """
 
     def __init__(self) -> None:
@@ -26,12 +26,13 @@ class AdaptiveHold:
     def at(self, now_ns: int) -> int:
         """Give the hold of a gap that is noticed at `now_ns`."""
         self._begin_window(now_ns)
-        return max(LEAST_HOLD_NS, _with_margin(max(self._longest_ns, self._longest_before_ns)))
+        longest_ns = max(self._longest_ns, self._longest_before_ns)
+        return min(max(LEAST_HOLD_NS, longest_ns * 5 // 4), MOST_HOLD_NS)
 
     def note(self, overtaken_ns: int, now_ns: int) -> None:
         """A packet came so long after the first sign that it was missing, or was made again then."""
         self._begin_window(now_ns)
-        if _with_margin(overtaken_ns) <= MOST_HOLD_NS:
+        if overtaken_ns <= MOST_HOLD_NS:
             self._longest_ns = max(self._longest_ns, overtaken_ns)
 
     def _begin_window(self, now_ns: int) -> None:
@@ -40,8 +41,4 @@ class AdaptiveHold:
         windows = (now_ns - self._began_ns) // WINDOW_NS
         if windows > 0:
             self._longest_ns, self._longest_before_ns = 0, self._longest_ns if windows == 1 else 0
-            self._began_ns = now_ns
-
-
-def _with_margin(overtaken_ns: int) -> int:
-    return overtaken_ns * 5 // 4
+            self._began_ns += windows * WINDOW_NS

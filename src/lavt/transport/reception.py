@@ -73,7 +73,7 @@ class Reception:
         if self._strays <= strays:
             self._note_transit(packet.timestamp, arrived_ns)
 
-    def note_announcement(self, announcement: Announcement, receiver_ssrc: int, arrived_ns: int) -> None:
+    def note_announcement(self, announcement: Announcement, receiver_ssrc: int | None, arrived_ns: int) -> None:
         """Take what a sender says, on the clock of our reports: the round trip, where it answers one of ours.
 
         Its report is for the round trip that the sender will know from our next one.
@@ -82,7 +82,8 @@ class Reception:
             self._sender_report = report, arrived_ns
         for answer in announcement.answers:
             if answer.receiver_ssrc == receiver_ssrc:
-                self.round_trip_ns = answered_round_trip_ns(answer, arrived_ns) or self.round_trip_ns
+                round_trip_ns = answered_round_trip_ns(answer, arrived_ns)
+                self.round_trip_ns = self.round_trip_ns if round_trip_ns is None else round_trip_ns
 
     def report(self, now_ns: int) -> ReceptionReport | None:
         """Give the reception report since the one before (RFC 3550, A.3); None before the first packet."""

@@ -72,7 +72,7 @@ class ReorderBuffer:
             # Two in a row: the sender has moved its sequence numbers (RFC 3550, A.1).
             self.stray -= 1
             released += self._restart(stray)
-            self._insert(stray, stray.sequence, now_ns)
+            self._insert(stray, self._highest, now_ns)
             number = self._extend(packet.sequence)
         self._stray = None
         self._insert(packet, number, now_ns)
@@ -88,6 +88,8 @@ class ReorderBuffer:
             self._note_given_up(number, now_ns)
             return []
         self.recovered += 1
+        if number < self._highest:
+            self._note_overtaken(number, now_ns)
         self._hold(packet, number, now_ns)
         return self._drain() + self.expire(now_ns)
 
@@ -117,9 +119,10 @@ class ReorderBuffer:
         while self._held:
             released += self._skip_gap()
         self._after_loss = self._ssrc is not None
+        same_stream = first.ssrc == self._ssrc
         self._ssrc = first.ssrc
         self._stray = None
-        self._start(first.sequence)
+        self._start(self._highest + (first.sequence - self._highest) % 2**16 if same_stream else first.sequence)
         return released
 
     def _extend(self, sequence: int) -> int:
@@ -140,7 +143,7 @@ class ReorderBuffer:
         else:
             if number < self._highest:
                 self.reordered += 1
-                self._note_overtaken(self._first_sign_ns(), now_ns)
+                self._note_overtaken(number, now_ns)
             self._hold(packet, number, now_ns)
 
     def _hold(self, packet: RtpPacket, number: int, now_ns: int) -> None:
@@ -185,10 +188,12 @@ class ReorderBuffer:
 
     def _note_given_up(self, number: int, now_ns: int) -> None:
         """A packet came, or was made again, that had been given up: a longer hold would have waited for it."""
-        if number in self._given_up:
-            self._note_overtaken(self._given_up[number], now_ns)
+        if self._adaptive is not None and number in self._given_up:
+            self._adaptive.note(now_ns - self._given_up[number], now_ns)
 
-    def _note_overtaken(self, first_sign_ns: int, now_ns: int) -> None:
+    def _note_overtaken(self, number: int, now_ns: int) -> None:
+        """A packet came, or was made again, in time, but after later ones; the first of these to come was the sign."""
         if self._adaptive is not None:
-            self._adaptive.note(now_ns - first_sign_ns, now_ns)
+            sign_ns = min((came_ns for later, (_, came_ns) in self._held.items() if later > number), default=now_ns)
+            self._adaptive.note(now_ns - sign_ns, now_ns)
             self._hold_ns = self._adaptive.at(now_ns)

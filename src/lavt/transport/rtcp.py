@@ -3,7 +3,7 @@
 Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
 receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
 time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the highest bit rate that the
-receiver wants (RFC 5104, section 4.2.1). So both know the round trip without a clock in common.
+receiver wants (RFC 5104, section 4.2.1). So both can know the round trip without a clock in common.
 
 Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
 with RTP; which of the two a datagram is shows in its second byte (RFC 5761).

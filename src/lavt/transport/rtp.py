@@ -177,8 +177,8 @@ class AccessUnit:
     """Annex B; b"" when nothing of it can be decoded."""
     timestamp: int
     complete: bool
-    """Nothing of it is missing, nor anything before it that it refers to. A picture that is not complete stays in what
-    is predicted from it, so pictures are in doubt from here to the next complete keyframe."""
+    """Nothing of it is missing, nor, since the stream began, anything before it that it refers to. A picture that is
+    not complete stays in what is predicted from it, so pictures are in doubt from there to the next whole keyframe."""
     keyframe: bool
     """It holds slices of an IDR picture: decoding can begin here."""
 

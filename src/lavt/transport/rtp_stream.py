@@ -59,7 +59,7 @@ class StreamSender:
         report = []
         if now.mono_ns >= self._report_ns:
             self._report_ns = now.mono_ns + REPORT_PERIOD_NS
-            report.append(self._report(stamp_ns, timestamp, now.mono_ns))
+            report.append(self._report(now))
         return FramePackets(media, repair, report)
 
     def hear(self, feedback: Feedback, now_ns: int) -> None:
@@ -74,17 +74,17 @@ class StreamSender:
         if feedback.reference_times:
             self._reference = feedback.reference_times[-1], now_ns
 
-    def _report(self, stamp_ns: int, timestamp: int, now_ns: int) -> bytes:
-        """Write a sender report of the moment of a frame's stamp."""
+    def _report(self, now: Now) -> bytes:
+        """Write a sender report: which wall time belongs to which RTP timestamp, now (RFC 3550, section 6.4.1)."""
         answers = []
         if self._reference is not None:
             reference, came_ns = self._reference
-            answers.append(ReferenceAnswer(reference.receiver_ssrc, reference.time, now_ns - came_ns))
+            answers.append(ReferenceAnswer(reference.receiver_ssrc, reference.time, now.mono_ns - came_ns))
             self._reference = None
         ssrc = self._packetizer.ssrc
         return sender_report(
-            ssrc, wall_ns=stamp_ns, rtp_timestamp=timestamp, packets=self._packets, octets=self._octets,
-            cname=f"{ssrc:08x}@lavt", answered=answers,
+            ssrc, wall_ns=now.wall_ns, rtp_timestamp=rtp_timestamp(now.wall_ns), packets=self._packets,
+            octets=self._octets, cname=f"{ssrc:08x}@lavt", answered=answers,
         )  # fmt: skip
 
     def _note_reception(self, report: ReceptionReport, now_ns: int) -> None:

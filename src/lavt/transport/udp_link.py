@@ -26,10 +26,10 @@ class UdpLink:
     """A UDP socket and a thread that receives.
 
     `channel` names what comes in, `name` says what the port is for. `peer` of what goes out is an address, or for a
-    client, whose server is known by `remote`, the port (0: the one in `remote`). A client hears its server only: what
-    comes from elsewhere is counted, not delivered. Who only listens may name the one host, by its number, that is heard
-    (`only_from`). Raises `UserError` for a port that cannot be opened
-    and a host that is not known.
+    client, whose server is known by `remote`, the port, which counts where that of `remote` is 0. A client hears its
+    server only: what comes from elsewhere is counted, not delivered. Who only listens may name the one host, by its
+    number, that is heard (`only_from`). Raises `UserError` for a port that cannot be opened and for a host that is not
+    known.
     """
 
     def __init__(
@@ -80,8 +80,8 @@ class UdpLink:
             if self._remote is not None:
                 address = self._server = (self._remote[0], self._remote[1] or send.peer)
             try:
-                self._socket.sendto(send.payload, address)
-            except OSError:
+                self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
+            except OSError:  # what the system cannot take now is lost, as on the way: no frame waits for the one before
                 self.counts["datagrams_not_sent"] += 1
 
     def close(self) -> None:
