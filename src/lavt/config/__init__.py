@@ -78,7 +78,7 @@ class ClientCameraConfig(CameraConfig):
 
 
 ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
-"""How long a packet waits for those before it, in ms; auto: 10 ms, and as long as any have lately been overtaken by."""
+"""So many ms a packet waits for those before it; auto: 10, or a quarter more than any was overtaken by lately."""
 
 
 class VideoConfig(Section):

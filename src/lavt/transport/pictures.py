@@ -87,7 +87,6 @@ class VideoSender:
     def __init__(self, encoder: Encoder) -> None:
         self._encoder = encoder
         self._bit_rate_bps = encoder.bit_rate_bps
-        self._limit_bps: int | None = None
 
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
         """Convert the picture where it is not in I420 already; the number is a CRC-32 of its luma below the stamp.
@@ -108,10 +107,8 @@ class VideoSender:
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
         """Keep to the lower one of the limit and the encoder's own bit rate, and to the least one at least."""
-        if limit_bps != self._limit_bps:
-            self._limit_bps = limit_bps
-            wanted_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
-            self._encoder.set_bit_rate(max(wanted_bps, LEAST_BIT_RATE_BPS))
+        wanted_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
+        self._encoder.set_bit_rate(max(wanted_bps, LEAST_BIT_RATE_BPS))
 
 
 class VideoReceiver:

@@ -84,13 +84,14 @@ def _check_room(height: int, width: int) -> None:
 
 
 def read_stamp(luma: NDArray[np.uint8]) -> int:
-    """Read the stamp from the luma plane (height, width) of a decoded picture: mean of each cell's centre half.
+    """Read the stamp from the luma plane (height, width) of a decoded picture.
 
+    Two pixels in the middle of each cell tell it, where all are clear, else the mean of its centre half.
     What it returns is only a claim until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too
     small to hold a stamp, and for what is no plane.
     """
     _check_plane(luma)
-    # Of nearly all pictures two pixels of each cell say the same, each clearly: summing takes five times as long.
+    # Nearly always they are clear; summing takes five times as long.
     one, other = (luma[at:STAMP_PX:_CELL_PX, at:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for at in _INNERMOST)
     if one == other and _UNCLEAR not in one:
         return int(one, 2)
