@@ -51,3 +51,13 @@ def test_the_study_of_the_stamp_runs() -> None:
     assert whole["accepted"] == whole["frames"] == whole["intact"] == whole["intact_good"] == 40
     assert (whole["unread_share"], whole["good_of_intact"], whole["bit_per_px"]) == (0.0, 1.0, 0.1997)
     assert last["checks"]["own"]["largest_error_us"] < 12
+
+
+def test_the_benchmark_of_the_rendezvous_runs() -> None:
+    """`benchmarks/rendezvous.py` tells how long packets take straight and through the process, last as JSON."""
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / "rendezvous.py", "--seconds", "0.5"],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    took_us = json.loads(done.stdout.splitlines()[-1])["us"]
+    assert 0 < took_us["straight"]["p50"] < took_us["through"]["p50"]

@@ -4,29 +4,45 @@ import math
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 from itertools import repeat
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
+from tests.nodes.stand_ins import NoiseCamera
+from tests.vehicle.moving_video import write_video
 
+from lavt.build import cameras
 from lavt.build.addresses import parse_address
-from lavt.build.cameras import camera_model
+from lavt.build.cameras import build_camera, camera_model, camera_of_file
 from lavt.build.clock_source import clock_source
 from lavt.build.entropy import MachineEntropy, SeededEntropy, run_seed
 from lavt.build.fidelity import FIDELITIES
 from lavt.build.injection import injection_client
 from lavt.build.sides import build_controller, build_server, check_names
-from lavt.build.vehicles import build_plant, build_unpictured, car_of
+from lavt.build.simulators import car_of
+from lavt.build.vehicles import build_plant, build_unpictured
 from lavt.clock import MachineClock
-from lavt.config import CameraConfig, ClientInjectionConfig, ClockConfig, ControllerConfig, ServerConfig, VehicleConfig
+from lavt.config import (
+    CameraConfig,
+    ClientInjectionConfig,
+    ClockConfig,
+    ControllerConfig,
+    ServerCameraConfig,
+    ServerConfig,
+    VehicleConfig,
+)
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
 from lavt.runtime.chain import walk
 from lavt.transport.shell import Shell
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
+from lavt.vehicle.video_device import VideoDevice
 
 
 @given(st.integers(0, 2**63 - 1), st.text(max_size=10), st.integers(0, 10_000))
@@ -137,7 +153,7 @@ def test_settings_of_the_config_replace_those_of_the_preset() -> None:
 
 def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None:
     """On demand, the simulator is woken for frames and its state only; a vehicle that may lose something is not."""
-    config = ServerConfig(camera=CameraConfig(width_px=128, height_px=128))
+    config = ServerConfig(camera=ServerCameraConfig(width_px=128, height_px=128))
     every_step, on_demand, careful = (
         build_server(
             config, lambda: Now(10**12, 10**18), SeededEntropy(1, "server"), host="", video_port=1,
@@ -152,6 +168,7 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
     woken = []
     for actuator in (every_step, on_demand, careful):
         wakes = 0
+        assert actuator is not None
         while (wake_ns := actuator.next_wake_ns()) < 10**12 + 10**9:
             now = Now(max(wake_ns, 10**12), 10**18)
             walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
@@ -197,3 +214,64 @@ def test_a_source_that_is_not_installed(source: Literal["chrony", "ptp"], monkey
     assert report is not None
     assert (report.source, report.correction_s) == (source, None)
     assert report.status.endswith("is not installed")
+
+
+def device_config(device: str | int, **camera: Any) -> ServerConfig:
+    return ServerConfig(
+        camera=ServerCameraConfig(source="device", device=device, width_px=320, height_px=240, **camera)
+    )
+
+
+def test_a_camera_that_is_plugged_in_is_built(tmp_path: Path) -> None:
+    """With source device the configured device is opened, with the configured geometry; without one there is none."""
+    assert build_camera(ServerConfig()) is None
+    camera = build_camera(device_config(str(write_video(tmp_path / "video.avi", rate_hz=30.0)), z_m=2.5))
+    assert isinstance(camera, VideoDevice)
+    with closing(camera):
+        assert (camera.model.width_px, camera.model.z_m, camera.rate_hz, camera.phase_ns) == (320, 2.5, 30.0, 0)
+
+
+def test_a_camera_by_its_number() -> None:
+    """A number is a V4L2 device's."""
+    with pytest.raises(UserError, match=r"^/dev/video97 cannot be opened as a camera"):
+        build_camera(device_config(97))
+
+
+def test_unknown_camera() -> None:
+    """A source of pictures that does not exist is refused with those that do."""
+    config = ServerConfig(camera=ServerCameraConfig(source="webcam"))
+    with pytest.raises(UserError, match="no camera 'webcam': the known sources are simulated, device"):
+        build_camera(config)
+
+
+def noise_camera(config: ServerConfig) -> NoiseCamera:
+    return NoiseCamera(camera_model(config.camera))
+
+
+def test_a_package_adds_a_camera_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera registered in the group `lavt.cameras` is found by its name and made of the server's config."""
+    entry = EntryPoint("noise", f"{__name__}:noise_camera", cameras.CUSTOM_CAMERAS)
+    monkeypatch.setattr(cameras, "entry_points", lambda group: [entry] if group == "lavt.cameras" else [])
+    camera = build_camera(ServerConfig(camera=ServerCameraConfig(source="noise", width_px=256)))
+    assert camera is not None
+    assert camera.model.width_px == 256
+
+
+def test_the_simulator_has_a_camera_of_its_own() -> None:
+    """No camera sees the simulator's road: with one that is plugged in it is not built."""
+    with pytest.raises(UserError, match=r"'simulator' draws its own pictures.*leave out camera.source"):
+        build_plant(device_config("/dev/video0"))
+
+
+def test_a_servers_config_tells_the_cameras_geometry(tmp_path: Path) -> None:
+    """`lavt perception show --camera` takes a server's config, whatever its pictures come from."""
+    path = tmp_path / "server.yaml"
+    path.write_text("vehicle_id: v-1\ncamera: {source: device, device: /dev/video0, format: MJPG, width_px: 800}\n")
+    assert camera_of_file(path).width_px == 800
+
+
+@pytest.mark.parametrize("pixel_format", ["MJP", "MJPEG", "MJ\nP"])
+def test_a_pixel_format_has_four_characters(pixel_format: str) -> None:
+    """V4L2 names formats by four characters: anything else is refused."""
+    with pytest.raises(ValidationError):
+        ServerCameraConfig(format=pixel_format)

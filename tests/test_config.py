@@ -20,6 +20,7 @@ from lavt.config import (
     Impairment,
     NetworkConfig,
     RelayConfig,
+    RendezvousConfig,
     RunConfig,
     SafetyConfig,
     Section,
@@ -34,13 +35,17 @@ from lavt.experiment.plan import plan_run, plan_sweep
 SCHEMAS: dict[str, type[Section]] = {
     "boundary.yaml": BoundaryConfig,
     "client.yaml": ClientConfig,
+    "client-secure.yaml": ClientConfig,
     "costs.yaml": Costs,
     "demo.yaml": RunConfig,
     "loss_and_jitter.yaml": SweepConfig,
     "paper.yaml": SweepConfig,
     "paper_designed.yaml": SweepConfig,
     "relay.yaml": RelayConfig,
+    "rendezvous.yaml": RendezvousConfig,
     "server.yaml": ServerConfig,
+    "server-by-wire.yaml": ServerConfig,
+    "server-secure.yaml": ServerConfig,
     "speed.yaml": SweepConfig,
     "sweep.yaml": SweepConfig,
 }
@@ -252,6 +257,11 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
     (SweepConfig, "axes: {seed: 1}", "'axes.seed'"),
     (ServerConfig, "video: {port: 65536}", "'video.port'"),
     (ServerConfig, "video: {gop_frames: 0}", "'video.gop_frames'"),
+    (ServerConfig, "rendezvous: {host: a, video_port: 0}", "'rendezvous.video_port'"),
+    (ServerConfig, "rendezvous: {probe: 5602}", "did you mean 'probe_port'"),
+    (ServerConfig, "{rendezvous: {host: a}, injection: {interface: eth0}}", "leave out rendezvous.host or injection"),
+    (RendezvousConfig, "video_port: 65536", "'video_port'"),
+    (RendezvousConfig, "security: {key: a}", "unknown key 'security'"),
     (RelayConfig, "video_server: 127.0.0.1:1", "'control_server' is missing"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {constant_ms: -1}}", "'video.constant_ms'"),
     (RelayConfig, "{video_server: a:1, control_server: a:1, video: {jitter_median_ms: .inf}}", "jitter_median_ms"),
@@ -325,7 +335,7 @@ LEAVES = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text
 TREES = st.recursive(LEAVES, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(LEAVES, inner, max_size=3))
 
 
-@given(st.sampled_from([RunConfig, SweepConfig, ServerConfig, ClientConfig, RelayConfig]), st.data())
+@given(st.sampled_from([RunConfig, SweepConfig, ServerConfig, ClientConfig, RelayConfig, RendezvousConfig]), st.data())
 def test_any_values(kind: type[Section], data: Any) -> None:
     """No values raise anything but UserError when they are taken as a config."""
     keys = st.sampled_from([*kind.model_fields, "other"])
@@ -340,23 +350,27 @@ def test_configs_do_not_change() -> None:
 
 
 @pytest.mark.parametrize(
-    "safety", [SafetyConfig(lateral_acceleration_mps2=3.1), SafetyConfig(picture_age_limit_ms=501.0)]
+    "safety",
+    [SafetyConfig(lateral_acceleration_mps2=3.1), SafetyConfig(picture_age_limit_ms=501.0), SafetyConfig(sight_m=21.0)],
 )
 def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
-    """Limits beyond the defaults are for a simulated vehicle only; any other is refused with the two keys to lower."""
-    with pytest.raises(UserError, match=r"safety\.lateral_acceleration_mps2 and safety\.picture_age_limit_ms"):
+    """Limits beyond the defaults are for a simulated vehicle only; any other is refused with the keys to lower."""
+    keys = r"safety\.lateral_acceleration_mps2, safety\.picture_age_limit_ms and safety\.sight_m"
+    with pytest.raises(UserError, match=keys):
         limits_of(safety, simulated=False)
     wide = limits_of(safety, simulated=True)
     assert wide.lateral_acceleration_mps2 == safety.lateral_acceleration_mps2
     assert wide.picture_age_limit_ns == safety.picture_age_limit_ms * 1e6
+    assert wide.sight_m == safety.sight_m
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_limits(simulated: bool) -> None:
     """The defaults, and limits tighter than they are, hold for every vehicle, and no other limit can be configured."""
     assert limits_of(SafetyConfig(), simulated=simulated) == LIMITS
-    tight = limits_of(SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0), simulated=simulated)
-    assert (tight.lateral_acceleration_mps2, tight.picture_age_limit_ns) == (2.0, 300_000_000)
+    asked = SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0, sight_m=10.0)
+    tight = limits_of(asked, simulated=simulated)
+    assert (tight.lateral_acceleration_mps2, tight.picture_age_limit_ns, tight.sight_m) == (2.0, 300_000_000, 10.0)
     assert tight.stop_after_ns == LIMITS.stop_after_ns
     assert tight.stamp_memory_ns == LIMITS.stamp_memory_ns
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime
 from typing import Protocol
 
 from lavt.domain import NS_PER_S, Now
@@ -39,3 +40,8 @@ def pause(duration_ns: int) -> None:
     """Sleep; for the outermost loops of programs only."""
     if duration_ns > 0:
         time.sleep(duration_ns / NS_PER_S)
+
+
+def calendar_time(wall_ns: int) -> datetime:
+    """Say a time of the wall clock as the calendar does, in UTC and in whole seconds."""
+    return datetime.fromtimestamp(wall_ns // NS_PER_S, UTC)

@@ -70,6 +70,12 @@ class VehicleState:
     speed_mps: float
     steering_rad: float
     gear: Literal["park", "reverse", "neutral", "drive"]
+    hindrance: str = ""
+    """Why the vehicle cannot be driven by command, in words; empty: it can."""
+    is_engaged: bool = True
+    """It obeys commands now; where that takes time, after `Vehicle.engage`."""
+    is_overridden: bool = False
+    """A driver in the car has taken over: nothing commanded reaches the wheels."""
 
 
 @value
@@ -169,7 +175,8 @@ class Decision:
 
 
 Mode = Literal["arm", "drive", "stop"]
-Operation = Literal["hold", "release", "emergency_stop", "clear_emergency_stop"]
+Operation = Literal["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]
+"""ask: the holder is asked to release the vehicle to who asks."""
 SafetyState = Literal["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]
 
 
@@ -210,7 +217,17 @@ class State:
     applied_sequence: int
     """Sequence of the command last obeyed; -1: none in this epoch."""
     refused: str
-    """Why a command was last refused; empty: none was."""
+    """Why a command was refused, of those in the last second the last; empty: none was."""
+    limited: str = ""
+    """Which limits changed the command last obeyed; empty: none did."""
+    holder: str = ""
+    """Who holds the vehicle; empty: nobody."""
+    holder_instance: int = 0
+    """As in that one's `SessionRequest`s: two clients of one name are told apart."""
+    asked_by: str = ""
+    """Who asks the holder for the vehicle; empty: nobody."""
+    instance: int = 0
+    """Random number of the server's process."""
 
 
 @value

@@ -27,6 +27,7 @@ SWEEP = str(shipped("configs/sweep.yaml"))
 SERVER = str(shipped("configs/server.yaml"))
 CLIENT = str(shipped("configs/client.yaml"))
 RELAY = str(shipped("configs/relay.yaml"))
+RENDEZVOUS = str(shipped("configs/rendezvous.yaml"))
 ROUTER = str(shipped("zenoh-configs/router-server.json5"))
 ENDS_S = 60.0
 
@@ -220,7 +221,9 @@ MISSING = {
     "sweep": ["sweep", "nothing.yaml"],
     "server": ["server", "nothing.yaml"],
     "client": ["client", "nothing.yaml"],
+    "software-car": ["software-car", "nothing.yaml"],
     "relay": ["relay", "nothing.yaml"],
+    "rendezvous": ["rendezvous", "nothing.yaml"],
     "router": ["router", "nothing.json5"],
     "report": ["report", "nothing"],
 }
@@ -237,7 +240,9 @@ WRONG_CONFIG = {
     "run": ["run", SERVER],
     "server": ["server", DEMO],
     "client": ["client", DEMO],
+    "software-car": ["software-car", DEMO],
     "relay": ["relay", DEMO],
+    "rendezvous": ["rendezvous", DEMO],
     "router": ["router", DEMO],
 }
 
@@ -343,6 +348,14 @@ SIDES = {
     "unknown key": (["server", SERVER, "--set", "vehicl_id=a"], "did you mean 'vehicle_id'?"),
     "missing session file": (["client", CLIENT, "--set", "zenoh.session=no.json5"], "no.json5"),
     "TCP through the relay": (["relay", RELAY, "--set", "control_server=tcp/127.0.0.1:1"], "carries UDP only"),
+    "rendezvous of a bad name": (
+        ["rendezvous", RENDEZVOUS, "--set", "vehicle_id=a/b"],
+        "the vehicle 'a/b'",
+    ),
+    "rendezvous without the key": (
+        ["rendezvous", RENDEZVOUS, "--set", "vehicle_key=no.sign.pub"],
+        "the key no.sign.pub cannot be read",
+    ),
     "no address": (["relay", RELAY, "--set", "video_listen=here"], "write it as host:port"),
     "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
     "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], "no listen endpoints"),
@@ -369,11 +382,15 @@ COMMANDS = [
     "report",
     "server",
     "client",
+    "software-car",
     "sdp",
     "stop",
     "router",
+    "keys",
     "relay",
+    "rendezvous",
     "clock",
+    "doctor",
     "join",
     "watch",
 ]
@@ -442,6 +459,13 @@ def test_relay_port_in_use(taken: int, run: Run) -> None:
     assert f"the relay's video port 127.0.0.1:{taken} cannot be opened" in said
 
 
+def test_port_of_the_rendezvous_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rendezvous of whose ports somebody else has one is refused in one sentence, and gives the other one back."""
+    monkeypatch.setattr(console, "take_precedence", lambda: None)
+    changes = ("--set", "bind=127.0.0.1", "--set", "video_port=0", "--set", f"probe_port={taken}")
+    assert f"the probe port 127.0.0.1:{taken} cannot be opened" in run("rendezvous", RENDEZVOUS, *changes).refused()
+
+
 WATCHES = {
     "no such address": (["--bind", "192.0.2.7"], "the video port 192.0.2.7:5600 cannot be opened"),
     "no host to listen at": (["--bind", "a" * 64], "cannot be opened"),
@@ -471,6 +495,13 @@ def test_server_of_an_unknown_route(router: str, run: Run, tmp_path: Path) -> No
     assert files(tmp_path) == {}
 
 
+def test_server_of_an_unknown_rendezvous(router: str, run: Run, tmp_path: Path) -> None:
+    """A server whose rendezvous no one can look up is refused in one sentence, and nothing is made."""
+    changes = ("--set", f"rendezvous.host={'a' * 64}", "--set", f"zenoh.router={router}")
+    assert "rendezvous.host: the host" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert files(tmp_path) == {}
+
+
 def test_client_of_an_unknown_server(router: str, run: Run, tmp_path: Path) -> None:
     """A client whose server no one can look up is refused in one sentence, and nothing is made."""
     changes = ("--set", f"video.server={'a' * 64}", "--set", f"zenoh.router={router}")
@@ -486,7 +517,10 @@ def test_processes(router: str, taken: int, tmp_path: Path) -> None:
             "server", SERVER, "--json", "--set", f"video.port={taken}", "--set", "video.bind=127.0.0.1",
             "--set", f"zenoh.router={router}", *out,
         ],
-        "start one with `lavt router": ["client", CLIENT, "--json", "--set", "zenoh.router=tcp/127.0.0.1:1", *out],
+        "start one with `lavt router": ["stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1"],
+        "zenoh.router cannot be 'foo/127.0.0.1:1'": [
+            "client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", *out,
+        ],
         f"tcp/127.0.0.1:{taken}": ["router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{taken}]"],
     }  # fmt: skip
     started = {said: lavt_process(*arguments) for said, arguments in cases.items()}
@@ -496,15 +530,31 @@ def test_processes(router: str, taken: int, tmp_path: Path) -> None:
     assert files(tmp_path) == {}
 
 
+@pytest.mark.parametrize("command", [["client", CLIENT], ["server", SERVER, "--set", "video.port=0"]])
+def test_a_side_waits_for_its_router(command: list[str]) -> None:
+    """A server or client that no router answers says so once and waits, and ends with 0 on Ctrl-C."""
+    ports = ["--set", "zenoh.router=tcp/127.0.0.1:1", "--set", f"clock.probe_port={1 if command[0] == 'client' else 0}"]
+    process = lavt_process(*command, *ports, "--json", "--set", "camera.width_px=128", "--set", "camera.height_px=128")
+    assert process.stdout is not None
+    assert '"ready"' in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=ENDS_S)
+    assert process.returncode == 0
+    assert err.count("\n") == 1
+    assert "start one with `lavt router" in err
+    assert "waiting until one does" in err
+
+
 def test_version(run: Run) -> None:
     """The version goes to standard output."""
     assert run("--version") == Ended(0, f"lavt {lavt.__version__}\n", "")
 
 
 def test_end_by_ctrl_c() -> None:
-    """A router and a relay say on one line where they are, and end with 0 on Ctrl-C."""
+    """A router, a relay and a rendezvous say on one line where they are, and end with 0 on Ctrl-C."""
     arguments = {
         "locators": ["router", ROUTER, "--json", "--set", "listen.endpoints=[tcp/127.0.0.1:0]"],
+        "ready": ["rendezvous", RENDEZVOUS, "--json", "--set", "video_port=0", "--set", "probe_port=0"],
         "ports": ["relay", RELAY, "--json", "--set", "video_listen=127.0.0.1:0", "--set", "control_listen=127.0.0.1:0"],
     }
     started = {said: lavt_process(*each) for said, each in arguments.items()}

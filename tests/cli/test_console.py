@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -22,6 +24,30 @@ def test_what_runs_until_told_is_told_by_each_signal_that_ends(number: signal.Si
         assert heard == [number]
     finally:
         signal.signal(number, before)
+
+
+TOLD_AT_EVERY_LINE = """
+import signal, sys
+from lavt.cli import console
+
+def again(frame, event, argument):
+    signal.raise_signal(signal.SIGTERM)
+    return again
+
+with console.until_told() as told:
+    for use in (told.set, told.is_set, told.clear, lambda: told.wait(0.01), told.clear, lambda: told.wait(0.01)):
+        sys.settrace(again)
+        use()
+        sys.settrace(None)
+    assert told.is_set() and told.wait(0.01) and told.wait()
+    told.clear()
+    assert not told.is_set() and not told.wait(0.01)
+"""
+
+
+def test_a_signal_that_interrupts_the_handler_of_another_is_no_deadlock() -> None:
+    """However many signals come, and at whichever line of what they set, the program goes on, and has been told."""
+    subprocess.run([sys.executable, "-c", TOLD_AT_EVERY_LINE], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -10,22 +10,48 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, StandingVehicle
 
-from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
+from lavt.build.by_wire import inside
+from lavt.config import DbwConfig, ServerConfig, VehicleConfig
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
 from lavt.vehicle.sim.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 
 ROAD = load_road("a_key")
-VEHICLES: dict[str, Callable[[], Vehicle]] = {
+TICK_NS = 20 * NS_PER_MS
+BRAKE = Actuation(0.0, 0.0, 1.0)
+
+
+def by_wire(profile: str) -> Vehicle:
+    dbw = DbwConfig(profile=profile, interface="inside", steering_sign=1)
+    return inside(ServerConfig(vehicle=VehicleConfig(kind="dbw", dbw=dbw)), ROAD, Now(MONO_NS, 0))
+
+
+DRIVABLE: dict[str, Callable[[], Vehicle]] = {
     "simulator": lambda: Simulator(road=ROAD, seed=1, start_mono_ns=MONO_NS),
-    "stand-in of the node tests": StandingVehicle,
+    "dataspeed_gen1": lambda: by_wire("dataspeed_gen1"),
+    "dataspeed_gen2": lambda: by_wire("dataspeed_gen2"),
 }
+VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "stand-in of the node tests": StandingVehicle}
 each_vehicle = pytest.mark.parametrize("name", sorted(VEHICLES))
+each_drivable = pytest.mark.parametrize("name", sorted(DRIVABLE))
+
+
+def live(vehicle: Vehicle, from_ns: int, actuation: Actuation, *, wanted: bool, seconds: float) -> int:
+    """Do for some time what the actuator node does: live on, engage and apply at each wake; give the time after it."""
+    now_ns, end_ns = from_ns, from_ns + round(seconds * NS_PER_S)
+    while now_ns < end_ns:
+        vehicle.advance(now_ns)
+        vehicle.engage(wanted, now_ns)
+        vehicle.apply(actuation, now_ns)
+        now_ns = min(max(vehicle.next_wake_ns(), now_ns + 1), now_ns + TICK_NS, end_ns)
+    vehicle.advance(end_ns)
+    return end_ns
 
 
 @each_vehicle
 def test_its_time_goes_on_and_never_ahead(name: str) -> None:
-    """A state's time never goes back, is not later than what was advanced to, and the next wake lies ahead of it."""
+    """A state's time never goes back, is not later than what was advanced to; wakes lie ahead, and lead on."""
     vehicle = VEHICLES[name]()
     vehicle.advance(MONO_NS + 20 * NS_PER_MS)
     before_ns = vehicle.state().mono_ns
@@ -35,7 +61,8 @@ def test_its_time_goes_on_and_never_ahead(name: str) -> None:
         assert vehicle.state().mono_ns <= MONO_NS + max(500, offset_ms) * NS_PER_MS
         before_ns = vehicle.state().mono_ns
         assert vehicle.next_wake_ns() > before_ns
-    vehicle.advance(vehicle.next_wake_ns())
+    while vehicle.next_wake_ns() <= MONO_NS + 601 * NS_PER_MS:
+        vehicle.advance(vehicle.next_wake_ns())
     assert vehicle.state().mono_ns > before_ns
 
 
@@ -71,3 +98,37 @@ def test_whatever_it_is_asked_its_state_is_finite(name: str, asked: list[tuple[f
         state = vehicle.state()
         assert math.isfinite(state.speed_mps)
         assert abs(state.steering_rad) <= vehicle.capabilities.max_steering_rad + 1e-9
+
+
+@each_drivable
+def test_it_is_engaged_at_standstill_and_obeys(name: str) -> None:
+    """With the brake on it gets engaged in less than 3 s; then throttle drives it, and a left turn turns it left."""
+    vehicle = DRIVABLE[name]()
+    now_ns = live(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
+    assert vehicle.state().hindrance == ""
+    now_ns = live(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
+    state = vehicle.state()
+    assert (state.is_engaged, state.hindrance, state.is_overridden, state.gear) == (True, "", False, "drive")
+    live(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), wanted=True, seconds=2)
+    state = vehicle.state()
+    assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, less the lags"
+    assert state.steering_rad == pytest.approx(0.05, abs=0.002)
+    truth = vehicle.ground_truth()
+    assert truth is not None
+    assert truth.steering_rad == pytest.approx(0.05, abs=0.002)
+
+
+@each_drivable
+def test_what_is_wanted_no_more_is_braked_and_holds_itself(name: str) -> None:
+    """From driving, no more wanted and braked, it comes to stand and stays there."""
+    vehicle = DRIVABLE[name]()
+    now_ns = live(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
+    now_ns = live(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
+    now_ns = live(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), wanted=True, seconds=2)
+    assert vehicle.state().speed_mps > 2
+    now_ns = live(vehicle, now_ns, BRAKE, wanted=False, seconds=3)
+    assert vehicle.state().speed_mps == 0
+    live(vehicle, now_ns, BRAKE, wanted=False, seconds=1)
+    truth = vehicle.ground_truth()
+    assert truth is not None
+    assert truth.speed_mps == 0

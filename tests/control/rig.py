@@ -71,7 +71,7 @@ class Rig:
         return self.stamp_ns
 
     def ask(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
-        reply = self.gate.answer(SessionRequest(operation, who, instance, number), self.vehicle)
+        reply = self.gate.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch
         return reply

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.control.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
 
+from lavt.control.limiter import sight_limit_mps
 from lavt.control.limits import LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 
@@ -94,6 +95,44 @@ def test_all_limits_that_changed_something_are_named() -> None:
     _, changed = limited(Actuation(1.0, 1.0, 0.0), 20.0, after_ns=1)
     assert changed == ("steering angle", "lateral acceleration", "steering rate", "speed")
     assert limited(Actuation(0.01, 0.5, 0.0), SPEED_MPS)[1] == ()
+
+
+@pytest.mark.parametrize("age_s", [0.0, 0.08, 0.5, 0.86, 2.0])
+def test_the_sight_limit_is_the_speed_that_stops_on_the_path(age_s: float) -> None:
+    """From the limit the car covers exactly the 20 m of a path in the picture's age, 0.5 s, and braking with 4 m/s2."""
+    speed_mps = sight_limit_mps(age_s, LIMITS)
+    assert speed_mps * (age_s + 0.5) + speed_mps**2 / 8 == pytest.approx(20)
+
+
+def test_30_kmh_is_within_sight_up_to_860_ms() -> None:
+    """The limit lies above 30 km/h for pictures of up to 0.86 s, and below it for older ones."""
+    assert sight_limit_mps(0.85, LIMITS) > SPEED_MPS > sight_limit_mps(0.87, LIMITS)
+
+
+def by_sight(asked: Actuation, excess_mps: float, age_ns: int = NS_PER_S) -> tuple[Actuation, tuple[str, ...]]:
+    """Give what becomes of `asked` at a speed so far above the sight limit."""
+    limiter = new_limiter()
+    limiter.start(0.0, 0)
+    speed_mps = sight_limit_mps(age_ns / NS_PER_S, LIMITS) + excess_mps
+    return limiter.limit(asked, vehicle_at(speed_mps), AGES_NS, age_ns), limiter.changed
+
+
+def test_faster_than_sight_allows_it_brakes() -> None:
+    """Above the limit there is no throttle and a brake of 4 m/s2 for each m/s too much, at most that of a safe stop."""
+    full = LIMITS.stop_deceleration_mps2 / 6.0
+    for excess_mps, brake in ((0.25, full / 4), (1.0, full), (3.0, full)):
+        actuation, changed = by_sight(Actuation(0.0, 0.8, 0.0), excess_mps)
+        assert (actuation.throttle, changed) == (0.0, ("sight",))
+        assert actuation.brake == pytest.approx(brake)
+
+
+def test_sight_eases_no_brake_and_names_what_it_changes_only() -> None:
+    """Who brakes harder than that is left alone, and so is who stays below the limit or drives by no picture."""
+    assert by_sight(Actuation(0.0, 0.0, 0.9), 5.0) == (Actuation(0.0, 0.0, 0.9), ())
+    assert by_sight(Actuation(0.0, 0.8, 0.0), -0.01) == (Actuation(0.0, 0.8, 0.0), ())
+    assert limited(Actuation(0.0, 0.8, 0.0), 11.0) == (Actuation(0.0, 0.8, 0.0), ())
+    limiter = new_limiter()
+    assert limiter.limit(Actuation(0.0, 0.0, 0.2), vehicle_at(math.nan), 0, 2 * NS_PER_S).brake == 0.2
 
 
 @given(

@@ -158,7 +158,7 @@ def test_a_step_of_the_wall_clock_changes_nothing(step_ns: int) -> None:
 
 
 def test_degraded_takes_the_throttle_away_and_brakes_gently() -> None:
-    """Degraded: no throttle, 1 m/s2, on the last command's steering; a newer picture ends it."""
+    """Degraded: no throttle, 1 m/s2; a newer picture ends it."""
     rig = Rig().driving(steering_rad=0.0, throttle=1.0)
     rig.vehicle = vehicle_at(8.0)
     rig.go(DEGRADED_NS)
@@ -181,6 +181,10 @@ def test_silence_never_eases_a_brake() -> None:
 def test_degraded_obeys_no_command_from_a_picture_already_used() -> None:
     """300 ms without a newer picture there is no command at all: what comes from an old one does not even steer."""
     rig = Rig().driving(steering_rad=0.02)
+    rig.go(TICK_NS)
+    rig.actuation()
+    rig.go(TICK_NS)
+    assert rig.actuation().steering_rad == 0.02
     rig.go(DEGRADED_NS)
     assert rig.drive(steering_rad=-0.3).reason == "not made from a newer picture"
     rig.go(TICK_NS)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from hypothesis import settings
@@ -14,13 +15,14 @@ from tests.control.rig import MAX_STEERING_RAD, TICK_NS, Rig, vehicle_at
 
 from lavt.control.limits import LIMITS
 from lavt.control.safety import BREAKS_ARMING, TRANSITIONS
-from lavt.domain import NS_PER_MS, NS_PER_S, Operation, SafetyState
+from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Operation, SafetyState
 
 STEPS = {(before, after) for (before, _), after in TRANSITIONS.items()}
 WIRE = {
     "steering_rad": st.floats(-1, 1),
     "throttle": st.floats(0, 1),
     "brake": st.floats(0, 1),
+    "path_curvature_per_m": st.tuples(*[st.floats(-1, 1)] * PATH_POINTS),
     "mode": st.sampled_from(["arm", "drive", "stop"]),
     "epoch": st.integers(0, 2**64 - 1),
     "sequence": st.integers(0, 2**63 - 1),
@@ -80,7 +82,11 @@ class GateMachine(RuleBasedStateMachine):
     def any_command(self, changes: dict[str, Any]) -> None:
         self.give(**changes)
 
-    @rule(changes=st.fixed_dictionaries({}, optional={k: WIRE[k] for k in ("steering_rad", "throttle", "brake")}))
+    @rule(
+        changes=st.fixed_dictionaries(
+            {}, optional={k: WIRE[k] for k in ("steering_rad", "throttle", "brake", "path_curvature_per_m")}
+        )
+    )
     def drive(self, changes: dict[str, Any]) -> None:
         self.rig.picture()
         self.give(mode="drive", **changes)
@@ -108,7 +114,7 @@ class GateMachine(RuleBasedStateMachine):
             self.held_since_ns = None
 
     @rule(
-        operation=st.sampled_from(["hold", "release", "emergency_stop", "clear_emergency_stop"]),
+        operation=st.sampled_from(["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]),
         who=st.sampled_from(["alice", "alice", "bob"]),
         number=st.integers(0, 5),
     )
@@ -121,7 +127,11 @@ class GateMachine(RuleBasedStateMachine):
 
     @rule(speed_mps=SPEEDS, steering_rad=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD))
     def vehicle_is(self, speed_mps: float, steering_rad: float) -> None:
-        self.rig.vehicle = vehicle_at(speed_mps, steering_rad)
+        self.rig.vehicle = replace(vehicle_at(speed_mps, steering_rad), mono_ns=self.rig.now_ns)
+
+    @rule(hindrance=st.sampled_from(["", "fault"]), engaged=st.booleans(), overridden=st.booleans())
+    def vehicle_obeys_or_not(self, hindrance: str, *, engaged: bool, overridden: bool) -> None:
+        self.rig.vehicle = replace(self.rig.vehicle, hindrance=hindrance, is_engaged=engaged, is_overridden=overridden)
 
     @precondition(lambda self: self.rig.state == "driving")
     @rule()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from tests.control.rig import Rig, vehicle_at
+from tests.control.rig import TICK_NS, Rig, vehicle_at
 
+from lavt.control.limits import LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Operation, SessionRequest
 
 
@@ -48,7 +49,7 @@ def test_a_second_client_is_refused_while_the_vehicle_is_armed_or_moves(other: t
     rig = Rig().hold()
 
     def refused() -> bool:
-        reply = rig.gate.answer(SessionRequest("hold", *other, 0), rig.vehicle)
+        reply = rig.gate.answer(SessionRequest("hold", *other, 0), rig.vehicle, rig.now_ns)
         return (reply.granted, reply.epoch, reply.token) == (False, 0, b"")
 
     rig.arm_for(NS_PER_S // 2)
@@ -128,3 +129,144 @@ def test_what_was_asked_is_counted() -> None:
     rig.ask("hold", "bob", 1)
     counts = rig.gate.counts
     assert (counts["session hold granted"], counts["session hold refused"]) == (1, 1)
+
+
+def asked_by(rig: Rig) -> str:
+    return rig.gate.claims.asked_by(rig.now_ns)
+
+
+def test_who_asks_is_told_to_the_holder_and_changes_nothing_else() -> None:
+    """An ask is granted without epoch or token, named for whoever holds the vehicle, and the drive goes on."""
+    rig = Rig().driving()
+    reply = rig.ask("ask", "bob", 7)
+    assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
+    assert asked_by(rig) == "bob"
+    rig.picture()
+    assert rig.drive().obeyed
+    assert rig.gate.holder == ("alice", 1)
+
+
+def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
+    """Asking alone, for however long, gives nobody a vehicle that is driven."""
+    rig = Rig().driving()
+    for _ in range(5):
+        rig.ask("ask", "bob", 7)
+        reply = rig.ask("hold", "bob", 7)
+        assert (reply.granted, reply.because) == (
+            False, "held by alice, and the vehicle is not disarmed at standstill",
+        )  # fmt: skip
+        for _ in range(50):
+            rig.go(TICK_NS)
+            rig.picture()
+            assert rig.drive().obeyed
+
+
+def test_with_consent_the_vehicle_stops_and_goes_to_who_asked() -> None:
+    """A release while somebody asks stops the vehicle, keeps it from all others, and who asked gets it at once."""
+    rig = Rig().driving()
+    rig.vehicle = vehicle_at(5.0)
+    rig.ask("ask", "bob", 7)
+    assert rig.ask("release").granted
+    assert (rig.state, rig.gate.holder, asked_by(rig)) == ("safe_stop", None, "")
+    for who, instance in (("carol", 1), ("alice", 1), ("bob", 8)):
+        reply = rig.ask("hold", who, instance)
+        assert (reply.granted, reply.because) == (False, "handed over to bob, who has not taken it yet")
+    assert rig.ask("hold", "bob", 7).epoch != 0
+    rig.vehicle = vehicle_at(0.0)
+    assert rig.ask("hold", "carol").granted
+
+
+def test_a_new_holder_arms_at_standstill() -> None:
+    """Who took over a rolling vehicle arms it like anybody: not before it stands, and then for a second."""
+    rig = Rig().driving()
+    rig.vehicle = vehicle_at(5.0)
+    rig.ask("ask", "bob", 7)
+    rig.ask("release")
+    rig.epoch = rig.ask("hold", "bob", 7).epoch
+    rig.picture()
+    assert rig.send().reason == "arming needs standstill"
+    rig.vehicle = vehicle_at(0.0)
+    rig.arm_for(NS_PER_S - TICK_NS)
+    assert rig.state == "arming"
+    rig.arm_for(TICK_NS)
+    assert rig.state == "driving"
+
+
+def test_what_is_kept_for_who_asked_becomes_free() -> None:
+    """Who asked and then does not come has the vehicle kept for 5 s, and no longer."""
+    rig = Rig().driving()
+    rig.ask("ask", "bob", 7)
+    rig.ask("release")
+    rig.go(LIMITS.kept_ns - 1)
+    assert not rig.ask("hold", "carol").granted
+    rig.go(1)
+    assert rig.ask("hold", "carol").granted
+    assert LIMITS.kept_ns == 5 * NS_PER_S
+
+
+def test_an_ask_lapses() -> None:
+    """Who has not asked for 3 s does not ask any more, and a release then keeps the vehicle for nobody."""
+    rig = Rig().driving()
+    rig.ask("ask", "bob", 7)
+    rig.go(LIMITS.ask_lapses_ns - 1)
+    assert asked_by(rig) == "bob"
+    rig.ask("ask", "bob", 7)
+    rig.go(LIMITS.ask_lapses_ns - 1)
+    assert asked_by(rig) == "bob"
+    rig.go(1)
+    assert asked_by(rig) == ""
+    rig.ask("release")
+    assert rig.ask("hold", "carol").granted
+    assert LIMITS.ask_lapses_ns == 3 * NS_PER_S
+
+
+def test_the_first_who_asks_comes_first() -> None:
+    """While somebody asks, another is refused with that one's name; once the ask has lapsed the other may."""
+    rig = Rig().driving()
+    rig.ask("ask", "bob", 7)
+    for who, instance in (("carol", 1), ("bob", 8)):
+        reply = rig.ask("ask", who, instance)
+        assert (reply.granted, reply.because) == (False, "bob asks for it already")
+    rig.go(LIMITS.ask_lapses_ns)
+    assert rig.ask("ask", "carol").granted
+    assert asked_by(rig) == "carol"
+
+
+def test_asking_is_for_what_somebody_else_holds() -> None:
+    """The holder, and anybody while nobody holds the vehicle, is refused with the reason."""
+    rig = Rig()
+    assert rig.ask("ask").because == "nobody holds the vehicle"
+    rig.hold()
+    assert rig.ask("ask").because == "you hold the vehicle"
+    assert asked_by(rig) == ""
+
+
+def test_at_rest_no_consent_is_needed() -> None:
+    """At standstill and disarmed another gets the vehicle also while a third one asks, whose ask is over then."""
+    rig = Rig().hold()
+    rig.ask("ask", "bob", 7)
+    assert rig.ask("hold", "carol").granted
+    assert asked_by(rig) == ""
+
+
+def test_an_emergency_stop_by_another_is_named_and_leaves_the_session_as_it_is() -> None:
+    """Anybody stops the vehicle, also who asks for it; the state says who did, and the holder stays the holder."""
+    rig = Rig().driving()
+    rig.ask("ask", "bob", 7)
+    assert rig.ask("emergency_stop", "bob", 7, number=5).granted
+    assert (rig.state, rig.gate.because) == ("emergency_stop", "emergency stop by bob")
+    assert (rig.gate.holder, asked_by(rig)) == (("alice", 1), "bob")
+    rig.ask("emergency_stop", "carol", 1, number=5)
+    assert rig.gate.because == "emergency stop by bob"
+
+
+def test_a_server_that_ends_stops_the_vehicle_for_good() -> None:
+    """When the server is about to end the vehicle stops, its holder is obeyed no more, and nobody gets it."""
+    rig = Rig().driving()
+    rig.vehicle = vehicle_at(5.0)
+    rig.gate.end()
+    assert (rig.state, rig.gate.because, rig.gate.holder) == ("safe_stop", "the server was told to end", None)
+    rig.picture()
+    assert rig.drive().reason == "not the epoch in force"
+    rig.vehicle = vehicle_at(0.0)
+    assert rig.ask("hold", "bob").because == "the server is about to end"

@@ -40,6 +40,14 @@ def test_a_stamp_written_twice_counts_as_the_newer_frame() -> None:
     assert written.number(777) == 9
 
 
+def test_a_picture_was_taken_when_the_camera_says_so() -> None:
+    """The time of taking is the camera's, or that of writing where it has none, or that of the first of equal ones."""
+    written = WrittenStamps(MEMORY_NS, 5)
+    for stamp_ns, mono_ns, crc, taken_ns in ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390)):
+        written.note(stamp_ns, stamp_ns, mono_ns, crc, taken_ns)
+    assert [written.taken_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4)] == [90, 200, 200, 390]
+
+
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, NS_PER_S)), max_size=60))
 def test_memory_does_not_grow(frames: list[tuple[int, int]]) -> None:
     """Whatever the stamps, only those of the last 5 s are kept, and each of them is known."""
@@ -48,10 +56,10 @@ def test_memory_does_not_grow(frames: list[tuple[int, int]]) -> None:
     for number, (stamp_ns, passed_ns) in enumerate(frames):
         now_ns += passed_ns
         written.note(stamp_ns, number, now_ns, number)
-        last[stamp_ns] = (number, now_ns)
+        last[stamp_ns] = (number, now_ns, now_ns)
     alive = {stamp_ns: each for stamp_ns, each in last.items() if now_ns - each[1] <= MEMORY_NS}
     assert written._written == alive
-    assert all(written.mono_ns(stamp_ns, now_ns) == at_ns for stamp_ns, (_, at_ns) in alive.items())
+    assert all(written.mono_ns(stamp_ns, now_ns) == at_ns for stamp_ns, (_, at_ns, _) in alive.items())
 
 
 def test_frozen_is_five_equal_pictures_in_a_row() -> None:

@@ -7,9 +7,9 @@ import signal
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -181,6 +181,30 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
     assert "stopped; what was finished is kept" in said
     assert "Traceback" not in said
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < 60
+
+
+def test_a_sweep_that_is_stopped_while_files_come_in_keeps_no_half_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run whose files come from far is there as a whole, or not at all, when Ctrl-C comes between them."""
+
+    def put_one_and_stop(_files: Mapping[str, bytes], directory: Path) -> None:
+        directory.mkdir()
+        (directory / "server.mcap").touch()
+        raise KeyboardInterrupt
+
+    @contextmanager
+    def far(_address: str, _jobs: int | None) -> Iterator[Workers]:
+        with ThreadPoolExecutor(1) as executor:
+            yield Workers(executor, 1, far=True)
+
+    monkeypatch.setattr("lavt.experiment.sweep.cluster", far)
+    monkeypatch.setattr("lavt.experiment.workers.put_files", put_one_and_stop)
+    (tmp_path / "runs").mkdir()
+    planned = plan_sweep(asked("fidelity=geometry"))[:1]
+    with pytest.raises(KeyboardInterrupt):
+        run_all(planned, tmp_path / "runs", jobs=1, tell=lambda _: None, cluster_at="local")
+    assert not list(tmp_path.glob("runs/*"))
 
 
 IMPORT_FOR_LONG = """

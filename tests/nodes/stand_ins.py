@@ -14,7 +14,7 @@ from lavt.domain import NS_PER_S, Actuation, CameraModel, GroundTruth, Now, Pict
 from lavt.node import Message, Node, Send
 from lavt.runtime.chain import walk
 from lavt.vehicle.camera import CapturedFrame
-from lavt.vehicle.vehicle import Capabilities
+from lavt.vehicle.vehicle import Capabilities, Reached
 
 MONO_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
@@ -82,6 +82,8 @@ class StandingVehicle:
     now_ns: int = MONO_NS
     happens: list[VehicleEvent] = field(default_factory=list)
     obeyed: list[Actuation] = field(default_factory=list)
+    wanted: bool = False
+    reached: list[Reached] = field(default_factory=list)
 
     @property
     def capabilities(self) -> Capabilities:
@@ -94,6 +96,13 @@ class StandingVehicle:
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
         self.obeyed.append(actuation)
+
+    def engage(self, wanted: bool, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
+        self.wanted = wanted
+
+    def take_reached(self) -> list[Reached]:
+        reached, self.reached = self.reached, []
+        return reached
 
     def state(self) -> VehicleState:
         return VehicleState(self.now_ns, self.speed_mps, 0.0, "drive")

@@ -18,9 +18,10 @@ from lavt.control.safety import SafetyGate
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
 from lavt.nodes.actuator import POSE_AHEAD_NS, ActuatorNode
-from lavt.nodes.reports import Admission, FrameWritten, Route
+from lavt.nodes.reports import Admission, AtWheel, FrameWritten, Route
 from lavt.transport.messages import decode, encode
 from lavt.vehicle.camera import FrameTimes
+from lavt.vehicle.vehicle import Reached
 
 TICK_NS = 20 * NS_PER_MS
 
@@ -280,3 +281,69 @@ def test_bytes_from_anybody_are_survived_and_counted(data: bytes) -> None:
     counts = bench.node.counts
     assert (counts["commands_unreadable"], counts["session_requests_unreadable"]) == (1, 1)
     assert bench.vehicle.obeyed == []
+
+
+def states(sends: list[Send]) -> list[State]:
+    return [decode(State, payload) for payload in of(sends, "state")]
+
+
+def test_the_state_tells_who_holds_and_who_asks() -> None:
+    """Holder and asker are in every state; who has not asked for 3 s is in none."""
+    bench = Bench().armed()
+    bench.take("session", encode(SessionRequest("ask", "bob", 7, 0)), peer="query")
+    told = states(bench.go(2 * NS_PER_S))
+    assert {(state.holder, state.asked_by) for state in told} == {("alice", "bob")}
+    assert {state.asked_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}
+
+
+def test_a_refusal_is_told_for_a_second() -> None:
+    """The state names why a command was refused, and a second after the last refusal no more."""
+    bench = Bench().armed()
+    bench.drive(epoch=99)
+    assert {state.refused for state in states(bench.go(NS_PER_S - TICK_NS))} == {"not the epoch in force"}
+    assert {state.refused for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
+
+
+def test_a_server_that_ends_stops_the_vehicle() -> None:
+    """Told that the server ends, the vehicle brakes, nobody holds it, the video's path closes, the drive has ended."""
+    bench = Bench().armed()
+    bench.vehicle.speed_mps = 5.0
+    sends = bench.take("server_ends", None)
+    assert of(sends, "video_token") == [None]
+    last = states(bench.go(TICK_NS))[-1]
+    assert (last.safety, last.because, last.holder) == ("safe_stop", "the server was told to end", "")
+    assert bench.vehicle.obeyed[-1].brake > 0
+    bench.vehicle.speed_mps = 0.0
+    bench.go(TICK_NS)
+    assert bench.events("ending") == ["safe_stop"]
+
+
+def test_the_vehicle_is_engaged_while_it_is_needed() -> None:
+    """The vehicle is told that it is wanted from arming on, and no more once it stands after a stop."""
+    bench = Bench()
+    bench.go(TICK_NS)
+    assert not bench.vehicle.wanted
+    bench.armed()
+    bench.drive()
+    assert bench.vehicle.wanted
+    bench.vehicle.speed_mps = 5.0
+    bench.go(NS_PER_S)
+    assert (bench.safety, bench.vehicle.wanted) == ("safe_stop", True)
+    bench.vehicle.speed_mps = 0.0
+    bench.go(TICK_NS)
+    assert not bench.vehicle.wanted
+
+
+def test_what_reaches_the_wheels_is_told_by_command() -> None:
+    """Of what the vehicle saw reaching its wheels, what was a command is told once, with its sequence and stamp."""
+    bench = Bench().armed()
+    first, second = bench.drive(), bench.drive(steering_rad=0.1)
+    assert first.applied_mono_ns is not None
+    bench.go(TICK_NS)
+    applied_ns, reached_ns = second.applied_mono_ns or 0, at(bench.mono_ns).mono_ns
+    bench.vehicle.reached = [Reached(applied_ns + 1, reached_ns)]
+    assert of(bench.go(TICK_NS), "wheel") == []
+    third = bench.drive()
+    bench.vehicle.reached = [Reached(third.applied_mono_ns or 0, reached_ns)] * 2
+    told = of(bench.go(TICK_NS), "wheel")
+    assert told == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]

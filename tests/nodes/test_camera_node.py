@@ -1,17 +1,22 @@
 from __future__ import annotations
 
+from contextlib import closing
 from itertools import count
+from pathlib import Path
 
 import pytest
 from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
+from tests.vehicle.moving_video import MODEL as MOVING
+from tests.vehicle.moving_video import number_of, write_video
 
+from lavt.clock import MachineClock
 from lavt.control.written import WrittenStamps
-from lavt.domain import NS_PER_MS, NS_PER_S, Pose
+from lavt.domain import NS_PER_MS, NS_PER_S, Now, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
 from lavt.transport.fec import RepairSender
-from lavt.transport.h264 import Encoder
-from lavt.transport.pictures import VideoSender
+from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.pictures import VideoReceiver, VideoSender
 from lavt.transport.rtcp import (
     ReceptionReport,
     is_rtcp,
@@ -24,6 +29,8 @@ from lavt.transport.rtp import Packetizer, parse_packet
 from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.stamp import rtp_timestamp
 from lavt.transport.video_path import PathClient, PathServer
+from lavt.vehicle.camera import Camera
+from lavt.vehicle.video_device import VideoDevice
 
 FRAME_NS = NS_PER_S // 30
 TOKEN = bytes(range(16))
@@ -32,10 +39,11 @@ REPORT = receiver_report(1, ReceptionReport(2, 1, 0.0, 0, 0), clock_ns=0)
 PLEASE = picture_loss(1, 2)
 
 
-def node_with(camera: NoiseCamera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
+def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
     numbers = count()
+    model = SMALL if camera is None else camera.model
     pictures = VideoSender(
-        Encoder(SMALL.width_px, SMALL.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
+        Encoder(model.width_px, model.height_px, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=1000)
     )
     path = PathServer(lambda: next(numbers).to_bytes(32, "big"))
     return CameraNode(
@@ -46,6 +54,16 @@ def node_with(camera: NoiseCamera | None = None, *, send_to: tuple[tuple[str, in
         start_ns=MONO_NS,
         send_to=send_to,
     )
+
+
+class HandClock:
+    """Time goes on when the test says so, from when a node's time begins."""
+
+    mono_ns = 0
+
+    def now(self) -> Now:
+        """Give it."""
+        return at(self.mono_ns)
 
 
 def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:
@@ -69,6 +87,14 @@ def test_a_frame_is_told_sent_and_kept() -> None:
     assert frame.size_bytes == len(unit.data)
     packets = [packet for packet in of(sends, "rtp") if not is_rtcp(packet)]
     assert {parse_packet(packet).timestamp for packet in packets} == {rtp_timestamp(frame.stamp_ns)}
+
+
+def test_the_safety_is_told_of_a_frame_before_its_first_packet_leaves() -> None:
+    """A command made from a frame never comes before the safety knows the frame's stamp, however short the way."""
+    sends = wake(node_with(send_to=(HOME,)), 0)
+
+    assert sends[0].channel == "frame"
+    assert sends[1].channel == "rtp"
 
 
 def test_a_late_wake_skips_frames_and_counts_them() -> None:
@@ -274,3 +300,41 @@ def test_the_receiver_may_ask_for_a_lower_bit_rate() -> None:
     assert mean_bytes(91) == pytest.approx(own, rel=0.2)
     give(node, "feedback", max_bit_rate(1, 2, 500_000, overhead_bytes=0), at(140 * FRAME_NS), ELSEWHERE)
     assert mean_bytes(141) == pytest.approx(own, rel=0.2)
+
+
+def test_what_a_device_sees_is_what_is_sent(tmp_path: Path) -> None:
+    """A picture of a device comes out of H.264 with its content and its frame's stamp, and none is sent twice."""
+    path = write_video(tmp_path / "video.avi", rate_hz=30.0)
+    receiver = VideoReceiver(Decoder(), (MOVING.height_px, MOVING.width_px))
+    seen = []
+    clock = HandClock()
+    with closing(VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=clock)) as device:
+        node = node_with(device)
+        for number in range(4):
+            clock.mono_ns = number * FRAME_NS
+            assert device.wait(20.0)
+            (unit,) = of(wake(node, number * FRAME_NS), "video")
+            received = receiver.decode(unit.data)
+            assert received is not None
+            assert receiver.read_stamp(received) == unit.stamp_ns
+            seen.append(number_of(received.picture))
+    assert seen[0] == 0
+    assert seen == sorted(set(seen))
+
+
+def test_a_device_that_vanishes_sends_no_frames_and_is_counted(tmp_path: Path) -> None:
+    """A camera's last picture is sent once, with no time where none is known; when it is lost no frame follows."""
+    path = write_video(tmp_path / "short.avi", rate_hz=30.0, pictures=1)
+    clock = MachineClock()
+    device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=HandClock())
+    path.unlink()
+    with closing(device):
+        node = node_with(device)
+        (frame,) = of(wake(node, 0), "frame")
+        end_ns = clock.now().mono_ns + 20 * NS_PER_S
+        while not node.counts.get("camera_times_lost") and clock.now().mono_ns < end_ns:
+            device.wait(0.02)
+        assert [of(wake(node, number * FRAME_NS), "frame") for number in range(1, 20)] == [[]] * 19
+    assert (frame.number, frame.capture_ns) == (0, None)
+    assert node.counts["camera_pictures_read"] == node.counts["camera_times_lost"] == 1
+    assert node.counts["frames_missing"] == 19

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,19 @@ from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, give, noise, of
 
 from lavt.control.limits import CLIENT_LIMITS
-from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, Decision, Lane, Picture, SessionReply, State
+from lavt.domain import (
+    NS_PER_MS,
+    NS_PER_S,
+    CameraModel,
+    Command,
+    Decision,
+    Lane,
+    Now,
+    Picture,
+    SessionReply,
+    SessionRequest,
+    State,
+)
 from lavt.node import WAKE, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
@@ -267,6 +279,16 @@ def test_garbage_from_the_vehicle_is_counted() -> None:
     assert bench.session.phase == "driving"
 
 
+def test_after_every_reply_that_can_be_read_the_vehicle_can_be_stopped() -> None:
+    """Whatever a reply says was the last emergency stop, the next one is a message that the vehicle can read."""
+    for last in (2**62, 2**62 + 1, 2**63 - 1):
+        bench = Bench().driving()
+        bench.take("session_reply", encode(replace(GRANTED, emergency_stop=last)))
+        sends = bench.take("operator", "emergency_stop")
+        assert decode(SessionRequest, of(sends, "session")[0]).operation == "emergency_stop"
+        assert commands(sends)[0].emergency_stop > 0
+
+
 @given(st.binary(max_size=300))
 def test_any_bytes_are_survived(data: bytes) -> None:
     """No bytes on any channel from outside raise into the loop."""
@@ -286,7 +308,7 @@ def test_a_grant_without_a_token_opens_no_path() -> None:
 def test_the_emergency_stop_is_in_every_command() -> None:
     """Once raised, its number is in every command, and none of them asks for throttle."""
     bench = Bench().driving()
-    number = bench.session.stop_now(WALL_NS).number
+    number = bench.session.stop_now(Now(0, WALL_NS)).number
     bench.mono_ns += NS_PER_MS
     made = [*bench.view(), *(command for _, command in bench.go(200 * NS_PER_MS))]
     assert len(made) == 11
@@ -306,3 +328,19 @@ def test_after_a_gap_the_lane_is_looked_for_anew(since_ns: int, forgets: bool) -
     bench.mono_ns += since_ns
     bench.view()
     assert (bench.detector.forgot > before) == forgets
+
+
+def requests(sends: list[Send]) -> list[str]:
+    return [decode(SessionRequest, payload).operation for payload in of(sends, "session")]
+
+
+def test_a_release_ends_the_commands_at_once() -> None:
+    """When the person releases the vehicle the query leaves at once, and no command after it."""
+    bench = Bench().driving()
+    sends = bench.take("operator", "release")
+    assert (requests(sends), commands(sends)) == (["release"], [])
+    assert bench.view() == []
+    bench.take("session_reply", encode(SessionReply(True, "", 0, b"", 5600, "kernel", 0)))
+    assert bench.session.released
+    assert bench.go(NS_PER_S) == []
+    assert bench.node.next_wake_ns() is None

@@ -196,6 +196,15 @@ def test_what_the_queues_say_of_an_older_order_is_not_taken_for_the_newer() -> N
     assert refusals(done(node, 2)) == ["", ""]
 
 
+def test_a_flood_of_questions_is_not_kept() -> None:
+    """Of those who ask while the queues are busy the last 64 are answered, as many as the link still knows."""
+    node = server()
+    for peer in range(1000):
+        ask(node, replace(L4, delay_ms=float(peer)), peer=peer)
+    replies = [send.peer for send in done(node, 1000) if send.channel == "netem_reply"]
+    assert replies == list(range(1000 - 64, 1000))
+
+
 def test_garbage_is_counted() -> None:
     """Bytes that are no request, and no reply, are counted and change nothing."""
     node, client = server(), asking()

@@ -10,7 +10,7 @@ import pytest
 import lavt.nodes
 from lavt.build.entropy import SeededEntropy
 from lavt.build.sides import build_client, build_server
-from lavt.config import CameraConfig, ClientCameraConfig, ClientConfig, ServerConfig, VehicleConfig
+from lavt.config import ClientCameraConfig, ClientConfig, ServerCameraConfig, ServerConfig, VehicleConfig
 from lavt.domain import Now
 from lavt.node import WAKE, Node
 from lavt.transport.channels import CHANNELS, QUEUE_LENGTH
@@ -21,7 +21,7 @@ OUTSIDE_OF_THE_NODES = {"clock_source", "injector", "operator", "runtime"}
 @pytest.fixture(scope="module")
 def nodes() -> Sequence[Node]:
     """All nodes of both sides, as they are built for a run."""
-    camera = CameraConfig(width_px=640, height_px=480)
+    camera = ServerCameraConfig(width_px=640, height_px=480)
     server = build_server(
         ServerConfig(vehicle=VehicleConfig(scenery="none"), camera=camera),
         lambda: Now(0, 10**18),

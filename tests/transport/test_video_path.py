@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 
 import pytest
@@ -10,8 +11,10 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.rtcp import is_rtcp, is_rtp
+from lavt.transport.video_cipher import SrtpCipher
 from lavt.transport.video_path import (
     CHALLENGE_LIFETIME_NS,
+    HELLO_AGAIN_NS,
     HELLO_INTERVAL_NS,
     REPORT_TIMEOUT_NS,
     PathClient,
@@ -105,9 +108,10 @@ def test_wrong_token() -> None:
     assert server.receive(stranger.hello(T0), HOME, T0) is None
     challenge = server.receive(PathClient(TOKEN).hello(T0), HOME, T0)
     assert challenge is not None
-    answer = stranger.answer(challenge)
-    assert answer is not None
-    server.receive(answer, HOME, T0)
+    assert stranger.answer(challenge) is None
+    right = PathClient(TOKEN).answer(challenge)
+    assert right is not None
+    server.receive(right[:-32] + bytes(32), HOME, T0)
     assert server.open_address(T0) is None
     assert refused(server) == {"wrong_token": 2}
 
@@ -217,6 +221,82 @@ def test_report_from_elsewhere() -> None:
     assert refused(server) == {"foreign_reports": 1}
 
 
+def test_a_challenge_of_nobody_is_not_answered() -> None:
+    """The client answers challenges of who knows the token, each newer than the one before, and no others."""
+    server, client = new_server(), PathClient(TOKEN)
+    challenge = server.receive(client.hello(T0), HOME, T0)
+    newer = server.receive(client.hello(T0 + 1), HOME, T0 + 1)
+    assert challenge is not None
+    assert newer is not None
+    for at in range(len(challenge)):
+        assert client.answer(challenge[:at] + bytes([challenge[at] ^ 1]) + challenge[at + 1 :]) is None
+    assert client.answer(newer) is not None
+    assert client.answer(newer) is None
+    assert client.answer(challenge) is None
+
+
+def encrypted() -> tuple[PathServer, PathClient]:
+    pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
+    server = PathServer(secrets(), partial(SrtpCipher, "server"))
+    server.set_token(TOKEN)
+    return server, PathClient(TOKEN, partial(SrtpCipher, "client"))
+
+
+def reopened(server: PathServer, client: PathClient, address: tuple[str, int], now_ns: int) -> None:
+    challenge = server.receive(client.hello(now_ns), address, now_ns)
+    assert challenge is not None
+    server.receive(client.answer(challenge) or b"", address, now_ns)
+    assert server.open_address(now_ns) == address
+
+
+RTP = bytes.fromhex("80600001000000010000000a") + b"a picture"
+RTCP = bytes.fromhex("80c900010000000b")
+
+
+def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
+    """What either end seals the other opens, and nothing of a picture can be read in between."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    sealed = server.cipher.seal(RTP)
+    assert b"a picture" not in sealed
+    assert client.open(sealed) == RTP
+    assert client.open(sealed) is None
+    assert client.open(RTP) is None
+    assert client.open_control(server.cipher.seal_control(RTCP)) == RTCP
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+    assert server.cipher.open_control(RTCP) is None
+
+
+def test_each_opening_has_keys_of_its_own() -> None:
+    """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    before = server.cipher.seal(RTP)
+    late = server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    reopened(server, client, ELSEWHERE, T0 + 1)
+    after = server.cipher.seal(RTP)
+    assert after != before
+    assert client.open(after) == RTP
+    assert client.open(late) is not None
+    assert client.open(before) == RTP
+    assert client.open(before) is None
+    assert server.cipher.open_control(client.seal_control(RTCP)) is None  # the last that came was under the old keys
+    server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.open(server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+
+
+def test_answers_that_are_lost_do_no_harm() -> None:
+    """A client whose newer answers never arrive still opens what comes under the keys of an older one."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    for later_ns in range(1, 4):
+        challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
+        assert client.answer(challenge or b"") is not None
+    assert client.open(server.cipher.seal(RTP)) == RTP
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+
+
 @pytest.mark.parametrize("token", [OTHER_TOKEN, TOKEN, None])
 def test_new_token(token: bytes | None) -> None:
     """A new token closes the path, and challenges from before it are worth nothing."""
@@ -237,25 +317,31 @@ def test_bad_token() -> None:
         new_server(b"")
 
 
+def test_a_lost_path_is_asked_for_long_before_the_vehicle_misses_a_command() -> None:
+    """A hello comes within half of the 300 ms after which a vehicle without a newer picture's command is degraded."""
+    assert HELLO_AGAIN_NS <= 300_000_000 // 2
+
+
 def test_when_to_say_hello() -> None:
-    """The client says hello at once, then every 500 ms, and again only when no video has come for 500 ms."""
+    """The client says hello at once, then every 500 ms; once video came, whenever none has come for 150 ms."""
     client = PathClient(TOKEN)
     assert client.next_hello_ns() == 0
     client.hello(T0)
     assert client.next_hello_ns() == T0 + HELLO_INTERVAL_NS
     client.video_arrived(T0 + 7)
-    assert client.next_hello_ns() == T0 + 7 + HELLO_INTERVAL_NS
+    assert client.next_hello_ns() == T0 + 7 + HELLO_AGAIN_NS
+    client.hello(T0 + 7 + HELLO_AGAIN_NS)
+    assert client.next_hello_ns() == T0 + 7 + 2 * HELLO_AGAIN_NS
 
 
-@given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT", b"LAVT\x01\x01", b"LAVT\x02\x01", b"LAVT\x03\x01"]))
+@given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT", b"LAVT\x01\x02", b"LAVT\x02\x02", b"LAVT\x03\x02"]))
 def test_any_bytes(data: bytes, head: bytes) -> None:
     """No bytes make the server answer, open or raise, and every such datagram is counted once."""
     server = opened()
     assert server.receive(head + data, ELSEWHERE, T0) is None
     assert server.open_address(T0) == HOME
     assert sum(refused(server).values()) == 1
-    answer = PathClient(TOKEN).answer(head + data)
-    assert answer is None or len(answer) == len(head + data) + 32
+    assert PathClient(TOKEN).answer(head + data) is None
 
 
 @given(st.integers(0, 61), st.integers(1, 255))

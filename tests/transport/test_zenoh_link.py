@@ -16,6 +16,7 @@ from lavt.config_file import shipped
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
+from lavt.transport.messages import MAX_MESSAGE_BYTES
 from lavt.transport.zenoh_link import Router, ZenohLink, quiet_logs
 
 ARRIVES_S = 10.0
@@ -74,10 +75,16 @@ def routers() -> Iterator[tuple[str, str]]:
 
 
 def link(
-    side: Literal["server", "client"], heard: Heard, router: str, *, vehicle: str = "vehicle-1", who: str | None = None
+    side: Literal["server", "client"],
+    heard: Heard,
+    router: str,
+    *,
+    vehicle: str = "vehicle-1",
+    who: str | None = None,
+    path: Path = SESSION,
 ) -> ZenohLink:
     return ZenohLink(
-        MachineClock(), heard, side=side, path=SESSION, router=router, vehicle=vehicle, who=who or f"{side}-1"
+        MachineClock(), heard, side=side, path=path, router=router, vehicle=vehicle, who=who or f"{side}-1"
     )
 
 
@@ -188,9 +195,11 @@ BAD_NAMES = ["a/b", "**", "*", "", "a" * 33, "-a", "_a", "a b", "a$*", "a#", "a?
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names(name: str) -> None:
     """A vehicle or client whose name could mean something in a key is refused before anything is opened."""
-    for names in ({"vehicle": name, "who": "operator-1"}, {"vehicle": "vehicle-1", "who": name}):
+    for vehicle, who in ((name, "operator-1"), ("vehicle-1", name)):
         with pytest.raises(UserError, match="1 to 32 letters"):
-            ZenohLink(MachineClock(), Heard(), side="client", path=SESSION, router="tcp/127.0.0.1:1", **names)
+            ZenohLink(
+                MachineClock(), Heard(), side="client", path=SESSION, router="tcp/127.0.0.1:1", vehicle=vehicle, who=who
+            )
 
 
 def is_a_sentence(error: pytest.ExceptionInfo[UserError]) -> bool:
@@ -211,6 +220,39 @@ def test_no_router() -> None:
     with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
         link("server", Heard(), endpoint)
     assert is_a_sentence(error)
+
+
+def test_waiting_for_a_router() -> None:
+    """A link that may wait says why once, counts what it cannot send, and carries messages once a router is there."""
+    endpoint, said, heard = f"tcp/127.0.0.1:{free_port()}", list[str](), Heard()
+    with ExitStack() as stack:
+        waiting = ZenohLink(
+            MachineClock(), Heard(), side="client", path=SESSION, router=endpoint, vehicle="late", who="client-1",
+            waiting=said.append,
+        )  # fmt: skip
+        stack.callback(waiting.close)
+        assert said == []
+        waiting.start()
+        waiting.send(Send("control", b"too early"), Send("session", b"too early"))
+        assert waiting.counts["control_not_sent"] == waiting.counts["session_not_sent"] == 1
+        stack.callback(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]}).close)
+        server = link("server", heard, endpoint, vehicle="late")
+        stack.callback(server.close)
+        server.start()
+        heard.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
+    assert len(said) == 1
+    assert f"no router answers at ['{endpoint}']" in said[0]
+
+
+def test_leaving_while_waiting_for_a_router() -> None:
+    """A link that still waits for its router can be closed."""
+    with closing(
+        ZenohLink(
+            MachineClock(), Heard(), side="server", path=SESSION, router=f"tcp/127.0.0.1:{free_port()}",
+            vehicle="late", who="server", waiting=lambda _: None,
+        )
+    ) as waiting:  # fmt: skip
+        waiting.start()
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "foo/127.0.0.1:1", "tcp/127.0.0.1", "tcp/127.0.0.1:99999"])
@@ -296,23 +338,49 @@ def test_port_in_use() -> None:
     assert is_a_sentence(error)
 
 
+ENCRYPTED = "quic/127.0.0.1:0?mixed_rel=1"
 OPENED = {
-    "router-server.json5": {"listen/endpoints": [LOCAL, BETWEEN]},
-    "router-client.json5": {"listen/endpoints": [LOCAL]},
-    "session.json5": None,
+    "router-server.json5": [LOCAL, BETWEEN],
+    "router-client.json5": [LOCAL],
+    "router-cloud.json5": [LOCAL, BETWEEN],
+    "router-server-to-cloud.json5": [LOCAL],
+    "router-server-tls.json5": ["unixsock-stream/{}/zenoh.sock", ENCRYPTED],
+    "router-client-tls.json5": ["unixsock-stream/{}/zenoh.sock"],
+    "router-cloud-tls.json5": [ENCRYPTED],
+    "router-server-to-cloud-tls.json5": ["unixsock-stream/{}/zenoh.sock"],
+    "session.json5": LOCAL,
+    "session-unix.json5": "unixsock-stream/{}/zenoh.sock",
 }
-"""Changes that put a shipped router on a free port; None: it is a session, opened at the router of the tests."""
+"""Free places for shipped routers to listen at, {} being a directory; for a session, that of its router."""
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys as the shipped configs want them, in a directory `keys`."""
+    pytest.importorskip("cryptography")
+    from lavt.cli.keys import keys
+
+    directory = tmp_path_factory.mktemp("made") / "keys"
+    keys(directory, vehicle=["vehicle-1"], operator=["operator-1"], cloud=["cloud-1"])
+    return directory
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
-def test_shipped_configs(name: str, routers: tuple[str, str]) -> None:
-    """Every file of zenoh-configs/ is one that Zenoh opens."""
-    changes = OPENED[name]
-    if changes is None:
-        link("server", Heard(), routers[0], vehicle="shipped").close()
+def test_shipped_configs(
+    name: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file of zenoh-configs/ is one that Zenoh opens, the encrypted ones with what `lavt keys` makes."""
+    places = OPENED[name]
+    if isinstance(places, str):
+        place = places.format(tmp_path)
+        with closing(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [place]})) as router:
+            at = local(router) if place == LOCAL else place
+            link("server", Heard(), at, vehicle="shipped", path=CONFIGS / name).close()
         return
-    with closing(Router(CONFIGS / name, changes)) as router:
-        assert len(router.locators()) >= len(changes["listen/endpoints"])
+    if "-tls" in name:
+        monkeypatch.chdir(request.getfixturevalue("keys").parent)
+    with closing(Router(CONFIGS / name, {"listen/endpoints": [each.format(tmp_path) for each in places]})) as router:
+        assert len(router.locators()) >= len(places)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
@@ -324,18 +392,69 @@ def test_shipped_configs_are_careful(name: str) -> None:
     assert json.loads(config.get_json("timestamping/enabled")) is False
 
 
-def test_one_side_dials() -> None:
-    """Of the two shipped routers only the client's dials, and both ends of the link between them say the same of it."""
+@pytest.mark.parametrize(
+    ("dialling", "dialled"),
+    [
+        ("router-client.json5", "router-server.json5"),
+        ("router-client.json5", "router-cloud.json5"),
+        ("router-server-to-cloud.json5", "router-cloud.json5"),
+    ],
+)
+def test_one_side_dials(dialling: str, dialled: str) -> None:
+    """Of two shipped routers with a link only one dials, and both say the same of the link."""
     endpoints = {
-        (side, way): json.loads(
-            zenoh.Config.from_file(str(CONFIGS / f"router-{side}.json5")).get_json(f"{way}/endpoints")
-        )
-        for side in ("server", "client")
+        (name, way): json.loads(zenoh.Config.from_file(str(CONFIGS / name)).get_json(f"{way}/endpoints"))
+        for name in (dialling, dialled)
         for way in ("listen", "connect")
     }
-    assert endpoints["server", "connect"] == []
-    (dialled,) = endpoints["client", "connect"]
-    listened = next(each for each in endpoints["server", "listen"] if each.startswith("udp/"))
-    for endpoint in (dialled, listened):
+    assert endpoints[dialled, "connect"] == []
+    (dials,) = endpoints[dialling, "connect"]
+    listens = next(each for each in endpoints[dialled, "listen"] if each.startswith("udp/"))
+    for endpoint in (dials, listens):
         assert set(endpoint.partition("?")[2].split(";")) == {"rel=1", "mixed_rel=1"}
-    assert all(each.startswith("tcp/127.0.0.1:") for each in endpoints["client", "listen"])
+    assert all(each.startswith("tcp/127.0.0.1:") for each in endpoints[dialling, "listen"])
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir() if "-tls" in path.name))
+def test_encrypted_configs_are_careful(name: str) -> None:
+    """An encrypted router has sessions by a unix socket only, wants certificates both ways, and limits lengths."""
+    config = zenoh.Config.from_file(str(CONFIGS / name))
+    listened = json.loads(config.get_json("listen/endpoints"))
+    assert {each.partition("/")[0] for each in listened} <= {"unixsock-stream", "quic"}
+    assert all("mixed_rel=1" in each for each in listened if each.startswith("quic"))
+    tls = json.loads(config.get_json("transport/link/tls"))
+    assert (tls["enable_mtls"], tls["verify_name_on_connect"], tls["close_link_on_expiration"]) == (True, True, True)
+    (limit,) = json.loads(config.get_json("low_pass_filter"))
+    assert limit["size_limit"] > MAX_MESSAGE_BYTES
+    access = json.loads(config.get_json("access_control"))
+    assert access["enabled"] is (name != "router-client-tls.json5")
+    assert access["default_permission"] == "deny"
+    ruled = {rule["id"] for rule in access["rules"] or ()}
+    assert ruled == {rule for policy in access["policies"] or () for rule in policy["rules"]}
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))
+def test_plain_configs_say_so(name: str) -> None:
+    """The first line of a router's config without encryption says that it is for a lab or a VPN."""
+    assert "plain" in (first := (CONFIGS / name).read_text().partition("\n")[0])
+    assert "a lab or a VPN" in first
+
+
+def test_both_dial_a_router_in_the_cloud() -> None:
+    """Where both sides' routers dial one in between, a command reaches the server, and a side's router has one link."""
+    with ExitStack() as stack:
+
+        def router(name: str, changes: dict[str, Any]) -> Router:
+            opened = Router(CONFIGS / name, changes)
+            stack.callback(opened.close)
+            return opened
+
+        cloud = router("router-cloud.json5", {"listen/endpoints": [BETWEEN]})
+        port = cloud.locators()[0].partition("?")[0].rpartition(":")[2]
+        dials = {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
+        sides = [router(name, dials) for name in ("router-server-to-cloud.json5", "router-client.json5")]
+        far = stack.enter_context(closing(Pair((local(sides[0]), local(sides[1])), "vehicle-1")))
+        far.server_heard.next(("control", b"far"), lambda: far.client.send(Send("control", b"far")))
+        found = far.client.routers()
+        assert found is not None
+        assert (found.linked, len(set(found.versions))) == (1, 1)

@@ -10,6 +10,7 @@ from lavt.build.addresses import resolved_address
 from lavt.build.entropy import Entropy
 from lavt.build.fidelity import VIDEO, Fidelity
 from lavt.build.injection import injection_client, injection_node
+from lavt.build.security import cipher_of
 from lavt.build.vehicles import check_vehicle, looks_of
 from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
@@ -27,26 +28,30 @@ from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient, InjectionNode
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
+from lavt.nodes.reports import Route
 from lavt.transport.fec import RepairSender
 from lavt.transport.reorder import ReorderBuffer
 from lavt.transport.rtp import Depacketizer, Packetizer
 from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.video_path import TOKEN_BYTES, PathServer
+from lavt.vehicle.camera import FrameTimes
+from lavt.vehicle.vehicle import Vehicle
 
 
 @dataclass(frozen=True, slots=True)
 class ServerNodes:
-    """The server's nodes."""
+    """The server's nodes; the actuator is None where it is in a process of its own."""
 
     camera: CameraNode
-    actuator: ActuatorNode
+    actuator: ActuatorNode | None
     clock_sync: ClockSyncNode
     injection: InjectionNode
 
     @property
     def all(self) -> Sequence[Node]:
         """All nodes, for a runtime."""
-        return (self.camera, self.actuator, self.clock_sync, self.injection)
+        actuator = () if self.actuator is None else (self.actuator,)
+        return (self.camera, *actuator, self.clock_sync, self.injection)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,16 +87,18 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
         LIMITS,
         lateral_acceleration_mps2=config.lateral_acceleration_mps2,
         picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
+        sight_m=config.sight_m,
     )
     wider = (
         limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
         or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
+        or limits.sight_m > LIMITS.sight_m
     )
     if wider and not simulated:
         raise UserError(
-            f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2 and "
-            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms: lower safety.lateral_acceleration_mps2 and "
-            "safety.picture_age_limit_ms"
+            f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
+            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.sight_m:.0f} m: lower "
+            "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and safety.sight_m"
         )
     return limits
 
@@ -115,7 +122,42 @@ def build_server(
     pictures = fidelity.sender(config)
     start = now()
     looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
-    vehicle = plant.start(start)
+    actuator = None
+    if plant.start is not None:
+        actuator = build_actuator(
+            config, plant.start(start), entropy, start, host=host, video_port=video_port, route=plant.route, looks=looks
+        )
+    return ServerNodes(
+        CameraNode(
+            plant.camera,
+            pictures,
+            StreamSender(
+                Packetizer(entropy.number(32), entropy.number(16)),
+                RepairSender(entropy.number(32), entropy.number(16)),
+                None if config.video.repair_packets == "auto" else config.video.repair_packets,
+            ),
+            PathServer(lambda: entropy.token(32), cipher_of(config)),
+            start_ns=start.mono_ns,
+            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
+        ),
+        actuator,
+        ClockSyncNode(start.mono_ns),
+        injection_node(config.injection, simulated=plant.simulated, video_port=video_port),
+    )
+
+
+def build_actuator(
+    config: ServerConfig,
+    vehicle: Vehicle,
+    entropy: Entropy,
+    start: Now,
+    *,
+    host: str,
+    video_port: int,
+    route: Route | None,
+    looks: Sequence[FrameTimes] = (),
+) -> ActuatorNode:
+    """Make the node that drives a vehicle; `looks` are the times for which it lives on, all where there are none."""
     able = vehicle.capabilities
     limits = limits_of(config.safety, simulated=able.simulated)
     limiter = Limiter(
@@ -131,30 +173,15 @@ def build_server(
         new_token=lambda: entropy.token(TOKEN_BYTES),
         host=host,
         video_port=video_port,
+        instance=entropy.number(64),
     )
-    return ServerNodes(
-        CameraNode(
-            plant.camera,
-            pictures,
-            StreamSender(
-                Packetizer(entropy.number(32), entropy.number(16)),
-                RepairSender(entropy.number(32), entropy.number(16)),
-                None if config.video.repair_packets == "auto" else config.video.repair_packets,
-            ),
-            PathServer(lambda: entropy.token(32)),
-            start_ns=start.mono_ns,
-            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
-        ),
-        ActuatorNode(
-            vehicle,
-            gate,
-            start_ns=start.mono_ns,
-            route=plant.route,
-            looks=looks,
-            after_collision=config.vehicle.after_collision,
-        ),
-        ClockSyncNode(start.mono_ns),
-        injection_node(config.injection, simulated=able.simulated, video_port=video_port),
+    return ActuatorNode(
+        vehicle,
+        gate,
+        start_ns=start.mono_ns,
+        route=route,
+        looks=looks,
+        after_collision=config.vehicle.after_collision,
     )
 
 
@@ -175,12 +202,14 @@ def build_client(
         start_ns=start.mono_ns,
         clear_stop=controller.clear_emergency_stop,
         waits=config.injection.condition != "",
+        take_over=config.take_over,
     )
     return ClientNodes(
         ReceiverNode(
             ReorderBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
             Depacketizer(),
             config.video.max_bit_rate_bps,
+            cipher_of(config),
         ),
         DriverNode(
             PictureReader(pictures),

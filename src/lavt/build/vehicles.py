@@ -8,7 +8,9 @@ from importlib.metadata import entry_points
 
 import numpy as np
 
-from lavt.build.cameras import camera_model
+from lavt.build.by_wire import check_by_wire, inside, is_simulated
+from lavt.build.cameras import build_camera, camera_model, check_own_camera
+from lavt.build.simulators import car_of, simulator_of
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
@@ -17,11 +19,8 @@ from lavt.perception.lane_detector import GRID
 from lavt.streams import stream
 from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
 from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.cars import named_car
-from lavt.vehicle.sim.dynamics import CarParameters
 from lavt.vehicle.sim.lane_camera import LaneCamera
 from lavt.vehicle.sim.road import Road, load_road
-from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 
 CUSTOM_VEHICLES = "lavt.vehicles"
@@ -35,31 +34,44 @@ ROUTE_STEP_M = 1.0
 class Plant:
     """A vehicle with its camera, and the road it drives where one is known.
 
-    `start` begins its time: building takes seconds, and a vehicle's time must not run before the loop does.
+    `start` begins its time: building takes seconds, and a vehicle's time must not run before the loop does. None: the
+    vehicle is in the actuator's own process (`actuator_process.py`).
     """
 
     camera: Camera
-    start: Callable[[Now], Vehicle]
+    start: Callable[[Now], Vehicle] | None
     route: Route | None
+    simulated: bool = False
     catches_up: bool = False
     """The vehicle loses nothing when `advance` is called later than it asked for."""
 
 
-def car_of(config: VehicleConfig) -> CarParameters:
-    """Take the configured car with the configured lags; raises `UserError` naming the known cars."""
-    given = {
-        "steering_dead_time_s": config.steering_dead_time_ms,
-        "steering_lag_s": config.steering_lag_ms,
-        "pedal_dead_time_s": config.pedal_dead_time_ms,
-        "throttle_lag_s": config.throttle_lag_ms,
-        "brake_lag_s": config.brake_lag_ms,
-    }
-    return replace(named_car(config.car), **{name: each / 1000 for name, each in given.items() if each is not None})
-
-
 def build_simulator(config: ServerConfig) -> Plant:
     """Make the built-in simulator and its camera."""
+    check_own_camera(config)
     road = load_road(config.vehicle.route)
+    return _simulated(config, road, _sim_camera(config, road))
+
+
+def build_dbw(config: ServerConfig) -> Plant:
+    """Make a by-wire vehicle and its camera: the simulator's, where a software car tells where it is."""
+    check_vehicle(config.vehicle)
+    asked = config.vehicle.dbw
+    if asked.is_inside:
+        return build_simulator(config)
+    if asked.truth:
+        check_own_camera(config)
+        return Plant(_sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(asked))
+    camera = build_camera(config)
+    if camera is None:
+        raise UserError(
+            "a real car needs a real camera: set camera.source device and camera.device; or vehicle.dbw.truth where "
+            "`lavt software-car` drives"
+        )
+    return Plant(camera, None, None)
+
+
+def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
     camera = SimCamera(
         model=camera_model(config.camera),
         rate_hz=config.camera.rate_hz,
@@ -72,15 +84,16 @@ def build_simulator(config: ServerConfig) -> Plant:
         sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
     camera.prepare()
-    return _simulated(config, road, camera)
+    return camera
 
 
 def build_unpictured(config: ServerConfig) -> Plant:
     """Make the built-in simulator with a camera that gives the lane itself; other vehicles' roads are not known."""
-    if config.vehicle.kind != "simulator":
+    kind = config.vehicle.kind
+    if kind != "simulator" and not (kind == "dbw" and config.vehicle.dbw.is_inside):
         raise UserError(
             f"fidelity geometry needs the road, which only the built-in simulator tells: choose vehicle.kind simulator "
-            f"instead of {config.vehicle.kind!r}, or another fidelity"
+            f"instead of {kind!r}, or another fidelity"
         )
     road = load_road(config.vehicle.route)
     camera = LaneCamera(
@@ -102,26 +115,31 @@ def camera_phase_ns(config: ServerConfig) -> int:
     return int(stream(config.seed, "camera phase").integers(round(NS_PER_S / config.camera.rate_hz)))
 
 
+def driven_route(config: ServerConfig) -> Route | None:
+    """Give the road that a software car on a bus drives; None for a real car."""
+    return route_of(config.vehicle.route, load_road(config.vehicle.route)) if config.vehicle.dbw.truth else None
+
+
+def route_of(name: str, road: Road) -> Route:
+    """Give the middle of a road's lane for the record."""
+    x_m, y_m, _, _ = road.point(np.arange(0.0, road.length_m, ROUTE_STEP_M))
+    return Route(name, road.length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
+
+
 def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
-    stations_m = np.arange(0.0, road.length_m, ROUTE_STEP_M)
-    x_m, y_m, _, _ = road.point(stations_m)
-    points = tuple(zip(x_m.tolist(), y_m.tolist(), strict=True))
+    route = route_of(config.vehicle.route, road)
+    if config.vehicle.kind == "dbw":
+
+        def start_inside(start: Now) -> Vehicle:
+            return inside(config, road, start)
+
+        return Plant(camera, start_inside, route, simulated=True)
     return Plant(
-        camera,
-        lambda start: Simulator(
-            road=road,
-            seed=config.seed,
-            start_mono_ns=start.mono_ns,
-            parameters=car_of(config.vehicle),
-            goes_on=config.vehicle.after_collision == "continue",
-            limit_s=config.vehicle.time_limit_s,
-        ),
-        Route(config.vehicle.route, road.length_m, points),
-        catches_up=True,
+        camera, lambda start: simulator_of(config, road, start.mono_ns), route, simulated=True, catches_up=True
     )
 
 
-VEHICLES: dict[str, Callable[[ServerConfig], Plant]] = {"simulator": build_simulator}
+VEHICLES: dict[str, Callable[[ServerConfig], Plant]] = {"simulator": build_simulator, "dbw": build_dbw}
 
 
 def build_plant(config: ServerConfig) -> Plant:
@@ -142,7 +160,9 @@ def _vehicle(kind: str) -> Callable[[ServerConfig], Plant]:
 def check_vehicle(config: VehicleConfig) -> None:
     """Raise `UserError` for a vehicle, road or car that does not exist, before any work is begun."""
     _vehicle(config.kind)
-    if config.kind == "simulator":
+    if config.kind == "dbw":
+        check_by_wire(config)
+    if config.kind == "simulator" or config.dbw.is_inside or config.dbw.truth:
         load_road(config.route)
         car_of(config)
 

@@ -26,19 +26,24 @@ def client(
     config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
     out: console.Out = None,
     changes: console.Set = None,
+    take_over: Annotated[bool, typer.Option("--take-over", help="Ask who holds the vehicle to hand it over.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Ask for the vehicle, arm it, and drive it by the video that comes. SIGUSR1 is an emergency stop.
+    """Ask for the vehicle, arm it, and drive it by the video that comes.
+
+    SIGUSR1 is an emergency stop, SIGUSR2 releases the vehicle and hands it to who asks for it, Ctrl-C releases it and
+    ends.
 
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
     console.take_precedence()
-    settings = load_config(ClientConfig, config, changes or [])
+    settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
     clock = MachineClock()
     with Side(settings, out, clock) as side:
         side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
         side.open_probe("probe_reply", bind=("", 0), remote=(settings.video.server, settings.clock.probe_port))
         nodes = build_client(settings, clock.now, MachineEntropy())
         signal.signal(signal.SIGUSR1, lambda *_: side.tell("operator", "emergency_stop"))
+        signal.signal(signal.SIGUSR2, lambda *_: side.tell("operator", "release"))
         run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)

@@ -85,10 +85,42 @@ def interruptible() -> Iterator[None]:
         raise WorkError("stopped; what was finished is kept") from None
 
 
+class Told:
+    """An event that a signal sets.
+
+    Its handler interrupts whatever the main thread does, another handler as well: a second signal often comes with the
+    first. `threading.Event.set` waits for a lock that the interrupted one may have, and so for ever; here nothing does.
+    """
+
+    def __init__(self) -> None:
+        self._not_yet = threading.Lock()
+        self._not_yet.acquire()
+
+    def set(self) -> None:
+        """Tell; to tell twice is to tell once."""
+        with suppress(RuntimeError):  # it was told already
+            self._not_yet.release()
+
+    def is_set(self) -> bool:
+        """Whether it was told."""
+        return not self._not_yet.locked()
+
+    def clear(self) -> None:
+        """Forget that it was told."""
+        self._not_yet.acquire(blocking=False)
+
+    def wait(self, pause_s: float | None = None) -> bool:
+        """Wait until told, and for `pause_s` at most; None: until told. Tells whether it was."""
+        told = self._not_yet.acquire(timeout=-1 if pause_s is None else pause_s)
+        if told:
+            self.set()
+        return told
+
+
 @contextmanager
-def until_told() -> Iterator[threading.Event]:
+def until_told() -> Iterator[Told]:
     """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until told to stop."""
-    told = threading.Event()
+    told = Told()
     with _handled(lambda *_: told.set(), signal.SIGINT, signal.SIGTERM):
         yield told
 

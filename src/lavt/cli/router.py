@@ -10,6 +10,9 @@ import typer
 from lavt.cli import console
 from lavt.config_file import shipped, split_change
 
+LOOK_S = 0.5
+"""A signal that the kernel gives to one of Zenoh's threads does not end the wait of this one, which then looks."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -38,7 +41,8 @@ def router(
                 console.show_json({"locators": locators})
             else:
                 console.show(f"routing at {', '.join(locators)}; Ctrl-C ends it")
-            told.wait()
+            while not told.wait(LOOK_S):
+                pass
     finally:
         opened.close()  # without it the process would not end
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from lavt.build.actuator_process import start_actuator
 from lavt.build.entropy import MachineEntropy
 from lavt.build.sides import build_server
 from lavt.cli import console
@@ -40,5 +41,14 @@ def server(
     with Side(settings, out, clock) as side:
         port = side.open_video("feedback", bind=(settings.video.bind, settings.video.port))
         probe_port = side.open_probe("probe_request", bind=(settings.video.bind, settings.clock.probe_port))
-        nodes = build_server(settings, clock.now, MachineEntropy(), host=kernel_identity(), video_port=port)
-        run_side(side, nodes.all, once=once, as_json=as_json, ready={"video_port": port, "probe_port": probe_port})
+        host = kernel_identity()
+        nodes = build_server(settings, clock.now, MachineEntropy(), host=host, video_port=port)
+        ready = {"video_port": port, "probe_port": probe_port}
+        if nodes.actuator is None:
+            side.elsewhere = actuator = start_actuator(settings, host=host, video_port=port)
+            side.in_force = lambda: actuator.in_force
+            ready |= {"actuator_pid": actuator.pid}
+        else:
+            gate = nodes.actuator.gate
+            side.in_force = lambda: gate.in_force
+        run_side(side, nodes.all, once=once, as_json=as_json, ready=ready)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import yaml
 
+from lavt.build.actuator_process import ActuatorProcess
 from lavt.build.clock_source import clock_source, interpreter
+from lavt.build.rendezvous import open_flow
+from lavt.build.security import door_of
 from lavt.cli import console
 from lavt.cli.router import find
+from lavt.cli.words import Narrator, end_words, release_words
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
-from lavt.domain import Now
+from lavt.control.limits import LIMITS
+from lavt.control.safety import ACTIVE
+from lavt.domain import NS_PER_S, Now, State
 from lavt.errors import WorkError
 from lavt.experiment.directory import check_directory, prepare_directory
 from lavt.experiment.live import LiveTap
@@ -27,10 +33,17 @@ from lavt.runtime.recording import QueuedRecorder
 from lavt.transport.injector import Injector
 from lavt.transport.netem import Port
 from lavt.transport.netem_control import Netem
+from lavt.transport.rendezvous import FlowName
+from lavt.transport.rendezvous_link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 STATUS_PERIOD_S = 0.2
+LOOK_S = 0.02
+RELEASE_S = 1.0
+"""So long a client that ends waits for the answer to its release; over any network that one can drive by it comes."""
+STOP_S = 6.0
+"""So long a server that ends waits for standstill: from 40 km/h with 4 m/s2 it takes 2.8 s."""
 
 
 class NoRecorder:
@@ -51,28 +64,36 @@ class Side:
     ) -> None:
         self.clock = clock
         self.runtime: RealRuntime | None = None
+        self.name = config.who if isinstance(config, ClientConfig) else "server"
+        """What the other side knows this one by."""
         self._name: Literal["server", "client"] = "client" if isinstance(config, ClientConfig) else "server"
         self._config = config
         self._out = out
         self._writer: RecordWriter | None = None
         self._queue: QueuedRecorder | None = None
-        self._udp: dict[str, UdpLink] = {}
+        self._udp: dict[str, UdpLink | RendezvousLink] = {}
         self._interpreter = interpreter(config.clock)
         if out is not None:
             check_directory(out)
         queues = _queues(config)
         quiet_logs()
+        self.in_force: Callable[[], tuple[int, int]] = lambda: (0, -1)
+        """The server's: epoch in force, and sequence of the command last obeyed."""
+        self._door = door_of(config, self._deliver, lambda *sends: self._zenoh.send(*sends), lambda: self.in_force())
         self._zenoh = ZenohLink(
             clock,
-            self._deliver,
+            self._door.let_in,
             side=self._name,
             path=find(Path(config.zenoh.session)),
             router=config.zenoh.router,
             vehicle=config.vehicle_id,
-            who=config.who if isinstance(config, ClientConfig) else self._name,
+            who=self.name,
+            waiting=lambda reason: console.say(f"lavt: {reason}; waiting until one does"),
         )
         self._injector = Injector(clock, self._deliver, queues, _never_delayed(config))
         self.tap = LiveTap(NoRecorder())
+        self.elsewhere: ActuatorProcess | None = None
+        """The server's actuator, where it is in a process of its own."""
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
         """Open the video's socket, whose datagrams come in on `channel`, and tell its port."""
@@ -82,9 +103,10 @@ class Side:
         """Open the socket over which the clocks are compared, and tell its port."""
         return self._open("probe", channel, bind, remote)
 
-    def _open(self, name: str, channel: str, bind: tuple[str, int], remote: tuple[str, int] | None) -> int:
-        self._udp[name] = UdpLink(self.clock, channel, self._deliver, bind=bind, remote=remote, name=name)
-        return self._udp[name].port
+    def _open(self, name: FlowName, channel: str, bind: tuple[str, int], remote: tuple[str, int] | None) -> int:
+        link = open_flow(self._config, self.clock, name, channel, self._deliver, bind=bind, remote=remote)
+        self._udp[name] = link
+        return link.port
 
     def start(self, nodes: Sequence[Node]) -> RealRuntime:
         """Begin the record, start the runtime, then let messages in."""
@@ -92,11 +114,13 @@ class Side:
             self._writer = self._open_record(self._out)
             self.tap = LiveTap(self._writer)
         self._queue = QueuedRecorder(self.tap)
-        self.runtime = RealRuntime(
-            self.clock, nodes, self._queue, clock_source(self._config.clock, self.clock, self._interpreter.run)
-        )
+        source = clock_source(self._config.clock, self.clock, self._interpreter.run)
+        away = {} if self.elsewhere is None else {self.elsewhere.name: self.elsewhere}
+        self.runtime = RealRuntime(self.clock, nodes, self._queue, source, away)
         self._zenoh.start()
-        self.runtime.start({**self._udp, "zenoh": self._zenoh, "netem": self._injector})
+        self.runtime.start({**self._udp, "zenoh": self._door, "netem": self._injector})
+        if self.elsewhere is not None:
+            self.elsewhere.start(self.runtime)
         for link in self._udp.values():
             link.start()
         return self.runtime
@@ -124,6 +148,8 @@ class Side:
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
+        if self.elsewhere is not None:
+            self.elsewhere.end()
         if self.runtime is not None:
             self.runtime.stop()
         self._injector.close()
@@ -132,7 +158,10 @@ class Side:
             each.close()
         self._zenoh.close()
         if self._queue is not None:
-            counts = {**{name: link.counts for name, link in self._udp.items()}, "zenoh": self._zenoh.counts}
+            counts = {
+                **{name: link.counts for name, link in self._udp.items()},
+                "zenoh": {**self._zenoh.counts, **self._door.counts},
+            }
             for name, counted in counts.items():
                 self._queue.write("counts", {"link": name, **counted}, self.clock.now())
             self._queue.close(self.clock.now())
@@ -155,12 +184,6 @@ def _never_delayed(config: ServerConfig | ClientConfig) -> list[Port]:
     return [Port("udp", port, "the clock probe")] if port else []
 
 
-def _in_words(status: Mapping[str, Any], ending: str | None) -> str:
-    """Say how things are, for a person who reads a line whenever it changes."""
-    state = f"{status.get('safety', 'waiting')}: {status.get('because', '')}"
-    return state if ending is None else f"{state} ({ending})"
-
-
 def run_side(
     side: Side,
     nodes: Sequence[Node],
@@ -170,22 +193,73 @@ def run_side(
     ready: Mapping[str, Any],
     session: ClientSession | None = None,
 ) -> None:
-    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print what happens."""
-    told_state = ""
+    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print what happens.
+
+    Before it ends a client releases the vehicle, and a server stops it; a second Ctrl-C does not wait for that.
+    """
+    narrator = Narrator(side.name if session is not None else "")
     with console.until_told() as told:
         runtime = side.start(nodes)
         if as_json:
             console.show_json({"ready": dict(ready)})
         while not told.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
-            status = side.tap.status()
-            if session is not None:
-                status |= {"phase": session.phase, "session": session.because}
-            if as_json:
-                console.show_json({"status": status, "ending": side.tap.ending})
-            elif (state := _in_words(status, side.tap.ending)) != told_state:
-                console.show(state)
-                told_state = state
+            _tell(side, narrator, session, as_json=as_json)
             if once and side.tap.ending is not None:
                 break
+        if not runtime.stopped.is_set():
+            told.clear()
+            last = _stop_vehicle(side, told) if session is None else _release(side, told, session)
+            _tell(side, narrator, session, as_json=as_json, last=last)
     if runtime.failed is not None:
         raise WorkError(f"stopped because a part failed: {runtime.failed}")
+
+
+def _tell(side: Side, narrator: Narrator, session: ClientSession | None, *, as_json: bool, last: str = "") -> None:
+    """Print what is new, and `last` at the very end; as JSON also how everything is."""
+    for heard, at in side.tap.take_heard():
+        if isinstance(heard, State):
+            narrator.state(heard, at.mono_ns, holds=session is not None and session.holds)
+        else:
+            narrator.refusal(heard)
+    narrator.ending(side.tap.ending)
+    status = side.tap.status()
+    if session is not None:
+        if not last:
+            narrator.phase(session.phase, session.because)
+        status |= {"phase": session.phase, "session": session.because}
+    lines = narrator.take(side.clock.now().mono_ns) + [last] * bool(last)
+    if as_json:
+        console.show_json({"status": status, "ending": side.tap.ending, "said": lines})
+        return
+    for line in lines:
+        console.show(line)
+
+
+def _release(side: Side, told: console.Told, session: ClientSession) -> str:
+    """Release the vehicle while the link is open: it stops at once, and somebody else may have it."""
+    if not session.holds:
+        return "the client ends; it held no vehicle"
+    side.tell("operator", "release")
+    _wait(side, told, RELEASE_S, lambda: session.released)
+    return release_words(released=session.released)
+
+
+def _stop_vehicle(side: Side, told: console.Told) -> str:
+    """Stop the vehicle, and wait until it stands."""
+    side.tell("server_ends", None)
+    _wait(side, told, STOP_S, lambda: _moves_mps(side) is None)
+    return end_words(_moves_mps(side))
+
+
+def _moves_mps(side: Side) -> float | None:
+    """Speed of a vehicle that is not at rest."""
+    status = side.tap.status()
+    speed_mps: float = status.get("speed_mps", 0.0)
+    return speed_mps if status.get("safety") in ACTIVE or abs(speed_mps) >= LIMITS.standstill_mps else None
+
+
+def _wait(side: Side, told: console.Told, limit_s: float, done: Callable[[], bool]) -> None:
+    """Wait until it is done, but not for long, and not for whom is told once more to end."""
+    end_ns = side.clock.now().mono_ns + round(limit_s * NS_PER_S)
+    while not done() and side.clock.now().mono_ns < end_ns and not told.wait(LOOK_S):
+        pass

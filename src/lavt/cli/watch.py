@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -88,7 +87,7 @@ def watch(
         console.say("no stamp was accepted: is there one in the pictures, and is --sender what it should be?")
 
 
-def _seconds(clock: MachineClock, told: threading.Event, limit_s: int | None) -> Iterator[int]:
+def _seconds(clock: MachineClock, told: console.Told, limit_s: int | None) -> Iterator[int]:
     """Count the seconds as they end, up to the limit or until told."""
     begin_ns = clock.now().mono_ns
     for number in count(1) if limit_s is None else range(1, limit_s + 1):

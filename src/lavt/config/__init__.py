@@ -7,6 +7,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from lavt.config.calibration import CalibrationConfig as CalibrationConfig
+from lavt.config.camera import CameraConfig as CameraConfig
+from lavt.config.camera import ClientCameraConfig as ClientCameraConfig
+from lavt.config.camera import ServerCameraConfig as ServerCameraConfig
+from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges
@@ -14,12 +18,16 @@ from lavt.config.injection import Impairment as Impairment
 from lavt.config.injection import InjectionConfig as InjectionConfig
 from lavt.config.injection import LinkConfig as LinkConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig
+from lavt.config.rendezvous import RendezvousConfig as RendezvousConfig
+from lavt.config.rendezvous import ServerRendezvousConfig as ServerRendezvousConfig
 from lavt.config.section import Section as Section
+from lavt.config.security import ClientSecurityConfig as ClientSecurityConfig
+from lavt.config.security import ServerSecurityConfig as ServerSecurityConfig
 from lavt.transport import clock_probe
 
 
 class VehicleConfig(Section):
-    """Which vehicle, and what it drives; all but `kind` is the built-in simulator's."""
+    """Which vehicle, and what it drives; all but `kind` and `dbw` is the built-in simulator's."""
 
     kind: str = "simulator"
     route: str = "a_key"
@@ -38,43 +46,8 @@ class VehicleConfig(Section):
     """Whether a collision ends the drive, or the car slides along what it has hit and goes on."""
     time_limit_s: float | None = Field(None, gt=0, le=86_400)
     """Of a drive, from the first movement; where nothing is given, the route's time at 10 km/h and 30 s more."""
-
-
-class CameraConfig(Section):
-    """The camera: where it sits (vehicle's frame) and what it gives."""
-
-    width_px: int = Field(640, ge=128, le=3840, multiple_of=2)
-    height_px: int = Field(480, ge=128, le=2160, multiple_of=2)
-    rate_hz: float = Field(30.0, ge=1, le=120)
-    field_of_view_deg: float = Field(90.0, gt=10, lt=150)
-    x_m: float = Field(1.6, ge=-10, le=10)
-    y_m: float = Field(0.0, ge=-5, le=5)
-    z_m: float = Field(1.4, gt=0, le=10)
-    yaw_deg: float = Field(0.0, ge=-180, le=180)
-    """Positive to the left."""
-    pitch_deg: float = Field(0.0, ge=-20, le=45)
-    """Positive downwards."""
-    roll_deg: float = Field(0.0, ge=-45, le=45)
-    """Positive leaning to the right."""
-    exposure_ms: float = Field(0.0, ge=0, le=500)
-    """A simulated camera's: how long the shutter is open; 0 is a moment."""
-    sensor_delay_ms: float = Field(0.0, ge=0, le=500)
-    """A simulated camera's: from the end of the exposure to the picture being there."""
-
-    @field_validator("exposure_ms")
-    @classmethod
-    def _fits(cls, exposure_ms: float, info: Any) -> float:
-        period_ms = 1000.0 / info.data.get("rate_hz", 1.0)
-        if exposure_ms > period_ms:
-            raise ValueError(f"must be at most the time between two frames, {period_ms:.3g} ms at camera.rate_hz")
-        return exposure_ms
-
-
-class ClientCameraConfig(CameraConfig):
-    """The camera as the client knows it."""
-
-    calibration: str = ""
-    """File of a calibration, which then says everything but the rate; empty: the keys above say it."""
+    dbw: DbwConfig = DbwConfig()
+    """Of kind `dbw`: a by-wire kit. The rest is its software car's then, where there is one."""
 
 
 ReorderHold = Literal["auto"] | Annotated[float, Field(ge=0, le=500)]
@@ -131,6 +104,8 @@ class SafetyConfig(Section):
 
     lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
+    sight_m: float = Field(20.0, gt=0, le=200)
+    """On so much of its path the car must be able to stop; beyond 20 m it goes faster than was shown to it."""
 
 
 class RecordConfig(Section):
@@ -305,14 +280,28 @@ class ServerConfig(Section):
 
     vehicle_id: str = "vehicle-1"
     vehicle: VehicleConfig = VehicleConfig()
-    camera: CameraConfig = CameraConfig()
+    camera: ServerCameraConfig = ServerCameraConfig()
     video: ServerVideoConfig = ServerVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
+    security: ServerSecurityConfig = ServerSecurityConfig()
+    rendezvous: ServerRendezvousConfig = ServerRendezvousConfig()
     injection: ServerInjectionConfig = ServerInjectionConfig()
     clock: ClockConfig = ClockConfig()
     safety: SafetyConfig = SafetyConfig()
     record: RecordConfig = RecordConfig()
     seed: int = Field(1, ge=0, lt=2**63)
+
+    @model_validator(mode="after")
+    def _encrypted(self) -> ServerConfig:
+        if self.security.key and self.video.send_to:
+            raise ValueError("video.send_to gets the video unencrypted: leave it out, or security.key")
+        return self
+
+    @model_validator(mode="after")
+    def _plain_for_netem(self) -> ServerConfig:
+        if self.rendezvous.host and self.injection.interface:
+            raise ValueError("netem finds no video that is wrapped: leave out rendezvous.host or injection.interface")
+        return self
 
 
 class ClientVideoConfig(Section):
@@ -331,10 +320,13 @@ class ClientConfig(Section):
 
     vehicle_id: str = "vehicle-1"
     who: str = "operator-1"
+    take_over: bool = False
+    """Ask whoever holds the vehicle to hand it over, see `docs/session.md`."""
     controller: ControllerConfig = ControllerConfig()
     camera: ClientCameraConfig = ClientCameraConfig()
     video: ClientVideoConfig = ClientVideoConfig()
     zenoh: ZenohConfig = ZenohConfig()
+    security: ClientSecurityConfig = ClientSecurityConfig()
     injection: ClientInjectionConfig = ClientInjectionConfig()
     clock: ClientClockConfig = ClientClockConfig()
     record: RecordConfig = RecordConfig()

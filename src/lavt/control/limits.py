@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, PATH_STEP_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +19,12 @@ class Limits:
     """Gentle: most silences end by themselves."""
     stop_deceleration_mps2: float = 4.0
     """From 30 km/h to standstill in 2.1 s and 9 m, and leaves grip for steering."""
+    sight_m: float = PATH_STEP_M * PATH_POINTS
+    """The path in a command: what the car would cover until it stands has to lie on it (`sight_limit_mps`). Only a
+    simulated vehicle may be configured beyond it, for studies of what the loop bears at more speed and delay."""
+    sight_settling_s: float = 0.25
+    """Speed beyond that is braked away so fast. The brake's lag is 0.2 s: quicker would swing, and 1 m/s too much
+    already brakes like a safe stop, which is the most."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
     """A command from an older picture is refused. Only a simulated vehicle may be configured up to 2 s."""
     stamp_memory_ns: int = 5 * NS_PER_S
@@ -31,6 +37,10 @@ class Limits:
     """No throttle above it; the controllers drive 30 km/h."""
     arming_hold_ns: int = NS_PER_S
     """For how long all conditions of arming must hold."""
+    ask_lapses_ns: int = 3 * NS_PER_S
+    """Who asks for the vehicle asks again each second; after three that did not come it counts as gone."""
+    kept_ns: int = 5 * NS_PER_S
+    """So long a released vehicle is kept for who asked: it tries each second, and one reply may be lost."""
     arming_brake: float = 0.3
     """The brake counts as on from here."""
     arming_steering_rad: float = 0.1

@@ -16,7 +16,8 @@ from lavt.experiment.table import MISSING, IntArray, Table
 Hop = tuple[str, str]
 """Node or "network", and what it did."""
 
-AFTER_LOOP: frozenset[Hop] = frozenset({("actuator", "report")})
+TO_WHEEL: Hop = ("vehicle", "command to wheel")
+AFTER_LOOP: frozenset[Hop] = frozenset({("actuator", "report"), TO_WHEEL})
 """What happens once the command is applied, which ends the loop."""
 
 Durations = list[tuple[Hop, IntArray]]
@@ -38,6 +39,7 @@ def hop_percentiles(
         client_hops(client, frames),
         [(("network", "control link"), tau_c_ns)],
         actuator_hops(server, frames),
+        [(TO_WHEEL, wheel_ns(server, frames))],
     )
     return [_entry(hop, durations_ns) for hop, durations_ns in life if len(durations_ns)]
 
@@ -62,6 +64,13 @@ def client_hops(client: Record, frames: Table) -> Durations:
 def actuator_hops(server: Record, frames: Table) -> Durations:
     """Time the actuator's hops for the first command made from each frame."""
     return _timed(server.table("timeline"), "actuator", frames)
+
+
+def wheel_ns(server: Record, frames: Table) -> IntArray:
+    """Time from a command being obeyed to the vehicle's report that it steers by it, as far as the vehicle tells it."""
+    wheel = server.table("wheel")
+    known = np.isin(wheel.ints("stamp_ns"), frames.ints("stamp_ns"))
+    return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[known], np.int64)
 
 
 def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: Offset) -> IntArray:

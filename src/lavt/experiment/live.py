@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from typing import Any
 
-from lavt.domain import NS_PER_MS, Now
+from lavt.domain import NS_PER_MS, Now, State
 from lavt.runtime.recording import Recorder
+
+KEPT = 4096
+"""Of what nobody has taken yet, the newest: more than ten seconds of states and commands."""
+
+Heard = tuple[State | str, Now]
+"""A state of the vehicle, or why a command was refused, and when."""
 
 
 class LiveTap:
@@ -20,6 +27,7 @@ class LiveTap:
         self._recorder = recorder
         self._lock = threading.Lock()
         self._status: dict[str, Any] = {}
+        self._heard: deque[Heard] = deque(maxlen=KEPT)
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Write one entry."""
@@ -30,6 +38,13 @@ class LiveTap:
             with self._lock:
                 look(payload, now)
 
+    def take_heard(self) -> list[Heard]:
+        """Take the states and refusals since the last call, in order."""
+        with self._lock:
+            heard = list(self._heard)
+            self._heard.clear()
+        return heard
+
     def status(self) -> dict[str, Any]:
         """Copy the newest figures."""
         with self._lock:
@@ -38,14 +53,21 @@ class LiveTap:
     def _truth(self, truth: Any, _now: Now) -> None:
         self._status.update(cross_track_m=truth.cross_track_m, progress_m=truth.progress_m)
 
-    def _state(self, state: Any, _now: Now) -> None:
-        if hasattr(state, "safety"):
-            self._status.update(speed_mps=state.speed_mps, safety=state.safety, because=state.because)
+    def _state(self, state: Any, now: Now) -> None:
+        if isinstance(state, State):
+            self._status.update(
+                speed_mps=state.speed_mps, safety=state.safety, because=state.because,
+                holder=state.holder, asked_by=state.asked_by, limited=state.limited,
+            )  # fmt: skip
+            if state.refused:
+                self._status["refused"] = state.refused
+            self._heard.append((state, now))
 
-    def _admission(self, admission: Any, _now: Now) -> None:
+    def _admission(self, admission: Any, now: Now) -> None:
         self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
         if admission.reason:
             self._status["refused"] = admission.reason
+            self._heard.append((admission.reason, now))
 
     def _picture(self, picture: Any, _now: Now) -> None:
         if picture.readable:

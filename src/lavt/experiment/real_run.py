@@ -61,6 +61,8 @@ class Loop:
     """Endpoint of the client's router: for whoever else is on the client's machine."""
     dialled: str
     """Endpoint that the client's router dials: the server's router, or the relay in front of it."""
+    server_ready: Mapping[str, Any]
+    """What the server told of itself when it was ready."""
 
 
 def start_loop(
@@ -102,7 +104,7 @@ def start_loop(
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
     client.ready()
-    return Loop(server_router, server, relay, client_router, client, local, dialled)
+    return Loop(server_router, server, relay, client_router, client, local, dialled, ready)
 
 
 def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:

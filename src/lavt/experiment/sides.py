@@ -9,6 +9,7 @@ from lavt.config import (
     ClientVideoConfig,
     ClockConfig,
     RunConfig,
+    ServerCameraConfig,
     ServerConfig,
     ServerVideoConfig,
     ZenohConfig,
@@ -20,7 +21,7 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
     """Give the server's part of a run: any free port, loopback only."""
     return ServerConfig(
         vehicle=run.vehicle,
-        camera=run.camera,
+        camera=ServerCameraConfig(**run.camera.model_dump()),
         video=ServerVideoConfig(bind="127.0.0.1", port=0, **run.video.model_dump()),
         zenoh=ZenohConfig(router=router),
         clock=ClockConfig(probe_port=0),

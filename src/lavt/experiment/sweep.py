@@ -112,6 +112,7 @@ class _Work:
                     self.take(planned, drive)
         except KeyboardInterrupt:
             workers.stop()
+            _remove_unfinished(todo, self.runs_dir)  # files that came from far may be there in part
             raise
         return broken
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from lavt.build.vehicles import car_of
+from lavt.build.simulators import car_of
 from lavt.config import RunConfig
 from lavt.control.drive_controller import find_preset
 from lavt.control.pure_pursuit import lookahead_m

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from lavt.control.safety import ACTIVE, SafetyGate, Verdict
-from lavt.domain import NS_PER_MS, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
+from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.reports import Admission, Event, FrameWritten, Rest, Route
+from lavt.nodes.reports import Admission, AtWheel, Event, FrameWritten, Rest, Route
 from lavt.transport.messages import decode, encode
 from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
-from lavt.vehicle.vehicle import Vehicle
+from lavt.vehicle.vehicle import CountingVehicle, Vehicle
 
 STATE_PERIOD_NS = 20 * NS_PER_MS
 LATE_NS = 50 * NS_PER_MS
 """Physics that is this late is counted: the vehicle stood still in the world for so long."""
+REFUSED_FOR_NS = NS_PER_S
+"""So long the state tells of a refused command."""
+REMEMBERED = 64
+"""Commands of more than a second: what has not reached the wheels by then never will."""
 POSE_AHEAD_NS = NS_PER_MS // 2
 """So much before a frame its pose is told: a command that comes just then takes 0.2 ms of the node's time."""
 
@@ -88,6 +92,10 @@ class ActuatorNode:
         self._ending: str | None = None
         self._rest: Rest | None = None
         self._driving = False
+        self._limited: tuple[str, ...] = ()
+        self._refused_ns = start_ns
+        self._applied: deque[tuple[int, int, int]] = deque(maxlen=REMEMBERED)
+        """When commands were obeyed, their sequences and stamps: until they are seen to have reached the wheels."""
         self.chains: Mapping[str, Sequence[Hop]] = {
             "control": (
                 ("decode", self._decode),
@@ -96,6 +104,7 @@ class ActuatorNode:
                 ("report", self._report),
             ),
             "session": (("answer", self._answer),),
+            "server_ends": (("stop", self._stop_for_good),),
             "frame": (("note", self._note_frame),),
             WAKE: (("advance", self._advance), ("publish", self._publish)),
         }
@@ -103,7 +112,8 @@ class ActuatorNode:
     @property
     def counts(self) -> Mapping[str, int]:
         """What was counted here, and what the safety gate has decided."""
-        return {**self._counts, **self.gate.counts}
+        counted = self.vehicle.counts if isinstance(self.vehicle, CountingVehicle) else {}
+        return {**self._counts, **self.gate.counts, **counted}
 
     def next_wake_ns(self) -> int:
         """When the vehicle, the watchdog or the state is due."""
@@ -123,13 +133,17 @@ class ActuatorNode:
 
     def _admit(self, received: Received, _now: Now) -> Judged:
         verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
+        if not verdict.obeyed:
+            self._refused_ns = received.arrived.mono_ns
         return Judged(received, received.stamp_ns, verdict)
 
     def _apply(self, judged: Judged, now: Now) -> Judged:
         if not judged.verdict.obeyed:
             return judged
-        self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
-        return Judged(judged.received, judged.stamp_ns, judged.verdict, self.gate.limiter.changed)
+        self._act(now.mono_ns)
+        self._applied.append((now.mono_ns, judged.received.command.sequence, judged.stamp_ns))
+        self._limited = self.gate.limiter.changed
+        return Judged(judged.received, judged.stamp_ns, judged.verdict, self._limited)
 
     def _report(self, judged: Judged, now: Now) -> list[Send]:
         command, arrived = judged.received.command, judged.received.arrived
@@ -163,7 +177,7 @@ class ActuatorNode:
             self._counts["session_requests_unreadable"] += 1
             return []
         token = self.gate.token
-        reply = self.gate.answer(request, self.vehicle.state())
+        reply = self.gate.answer(request, self.vehicle.state(), now.mono_ns)
         sends = [*self._changes(now), Send("session_reply", encode(reply), message.peer)]
         if self.gate.token != token:
             sends.append(Send("video_token", self.gate.token or None))
@@ -171,9 +185,13 @@ class ActuatorNode:
         sends.append(Send("event", Event(now.mono_ns, "session", f"{request.operation} by {request.who} {said}")))
         return sends
 
+    def _stop_for_good(self, _message: Message, now: Now) -> list[Send]:
+        self.gate.end()
+        return [*self._changes(now), Send("video_token", None)]
+
     def _note_frame(self, message: Message, now: Now) -> None:
         frame: FrameWritten = message.payload
-        self.gate.written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+        self.gate.written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc, frame.capture_ns)
         self.gate.watch(now.mono_ns)  # before the next frame, which may hide that these were all equal
 
     # Time goes on.
@@ -190,8 +208,15 @@ class ActuatorNode:
             late_ms = (now.mono_ns - due_ns) // NS_PER_MS
             events.append(VehicleEvent(now.mono_ns, "late", f"{late_ms} ms"))
         self.gate.watch(now.mono_ns)
-        self.vehicle.apply(self.gate.actuation(self.vehicle.state(), now.mono_ns), now.mono_ns)
+        self._act(now.mono_ns)
         return events
+
+    def _act(self, now_ns: int) -> None:
+        """Have the vehicle do what it shall do now."""
+        state = self.vehicle.state()
+        actuation = self.gate.actuation(state, now_ns)
+        self.vehicle.engage(self.gate.needs(state), now_ns)
+        self.vehicle.apply(actuation, now_ns)
 
     def _publish(self, events: list[VehicleEvent], now: Now) -> list[Send]:
         sends = []
@@ -204,6 +229,7 @@ class ActuatorNode:
             if event.kind in self._endings:
                 sends += self._end(self._endings[event.kind], event.mono_ns)
         sends += self._changes(now)
+        sends += self._reached()
         if told:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
@@ -220,6 +246,7 @@ class ActuatorNode:
 
     def _state(self, now: Now) -> State:
         vehicle = self.vehicle.state()
+        holder, holder_instance = self.gate.holder or ("", 0)
         return State(
             sent_wall_ns=now.wall_ns,
             state_mono_ns=vehicle.mono_ns,
@@ -229,8 +256,24 @@ class ActuatorNode:
             safety=self.gate.state,
             because=self.gate.because,
             applied_sequence=self.gate.applied_sequence,
-            refused=self.gate.refused,
+            refused=self.gate.refused if now.mono_ns - self._refused_ns < REFUSED_FOR_NS else "",
+            limited=", ".join(self._limited),
+            holder=holder,
+            holder_instance=holder_instance,
+            asked_by=self.gate.claims.asked_by(now.mono_ns),
+            instance=self.gate.instance,
         )
+
+    def _reached(self) -> list[Send]:
+        """Tell which commands were seen to have reached the wheels, and when."""
+        sends = []
+        for reached in self.vehicle.take_reached():
+            while self._applied and self._applied[0][0] < reached.applied_ns:
+                self._applied.popleft()
+            if self._applied and self._applied[0][0] == reached.applied_ns:
+                applied_ns, sequence, stamp_ns = self._applied.popleft()
+                sends.append(Send("wheel", AtWheel(sequence, stamp_ns, applied_ns, reached.reached_ns)))
+        return sends
 
     # What changed is told.
 

@@ -14,7 +14,7 @@ from lavt.transport.rtcp import is_rtcp, parse_feedback
 from lavt.transport.rtp_stream import StreamSender
 from lavt.transport.video_path import PathServer
 from lavt.value import value
-from lavt.vehicle.camera import Camera, CapturedFrame, FrameTimes, TimedCamera, newest_pose
+from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 
 KEYFRAME_PAUSE_NS = NS_PER_S // 10
 """No more than one keyframe on request in this time, so that requests cannot fill the link; nor for a new bit rate."""
@@ -66,6 +66,7 @@ class CameraNode:
     ) -> None:
         self._counts: Counter[str] = Counter()
         self._take = camera.capture
+        self._counting = camera if isinstance(camera, CountingCamera) else None
         self._pictures = pictures
         self._there_after_ns, self._expose = 0, self._take_at_once
         if isinstance(camera, TimedCamera):
@@ -97,10 +98,12 @@ class CameraNode:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted here, and what the video's path has refused."""
+        """What was counted here, what the camera has, and what the video's path has refused."""
         path = self._path
+        counted = {} if self._counting is None else self._counting.counts
         return {
             **self._counts,
+            **{f"camera_{name}": number for name, number in counted.items()},
             "path_malformed": path.malformed,
             "path_wrong_token": path.wrong_token,
             "path_wrong_address": path.wrong_address,
@@ -167,12 +170,15 @@ class CameraNode:
             stamped.frame.number, encoded.stamp_ns, stamped.stamped_mono_ns, stamped.frame.capture_ns,
             stamped.pixel_crc, len(unit),
         )  # fmt: skip
-        sends = []
+        # Before its first packet leaves: 5 ms later a command from it may come, and the safety must know its stamp.
+        sends = [Send("frame", frame)]
         if proven is not None:
-            sends += [Send("rtp", each, proven) for each in (*packets.media, *packets.repair, *packets.report)]
+            cipher = self._path.cipher
+            sends += [Send("rtp", cipher.seal(each), proven) for each in (*packets.media, *packets.repair)]
+            sends += [Send("rtp", cipher.seal_control(each), proven) for each in packets.report]
         plain = [*packets.media, *packets.report]
         sends += [Send("rtp", each, address) for address in self._send_to for each in plain]
-        return [*sends, Send("frame", frame), Send("video", VideoUnit(encoded.stamp_ns, unit))]
+        return [*sends, Send("video", VideoUnit(encoded.stamp_ns, unit))]
 
     def _note_pose(self, message: Message, _now: Now) -> None:
         self._poses.append(message.payload)
@@ -189,8 +195,12 @@ class CameraNode:
         if not self._path.rtcp_admitted(message.peer):
             self._counts["feedback_from_strangers"] += 1
             return None
+        packet = self._path.cipher.open_control(message.payload)
+        if packet is None:
+            self._counts["feedback_forged"] += 1
+            return None
         try:
-            feedback = parse_feedback(message.payload)
+            feedback = parse_feedback(packet)
         except BadPacket:
             self._counts["feedback_unreadable"] += 1
             return None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, Literal, Protocol
 
 from lavt.control.drive_controller import DriveController
 from lavt.control.lane_watch import LaneState, LaneWatch
@@ -18,6 +18,9 @@ from lavt.nodes.reports import LaneSeen, PathToken, View
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
 from lavt.value import value
+
+OperatorAsks = Literal["emergency_stop", "release"]
+"""What a person beside the client can ask for, on the channel `operator`."""
 
 
 class Detector(Protocol):
@@ -79,7 +82,7 @@ class DriverNode:
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),
             "session_reply": (("note", self._note_reply),),
-            "operator": (("stop", self._stop_now),),
+            "operator": (("obey", self._obey_operator),),
             "condition_in_force": (("note", self._note_condition),),
             WAKE: (("command", self._wake),),
         }
@@ -120,13 +123,14 @@ class DriverNode:
     # A command is due.
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
-        sends = []
+        sends: list[Send] = []
         if self._command_ns is not None and now.mono_ns >= self._command_ns:
             sends += self._command(now)
+        return sends + self._wake_session(now)
+
+    def _wake_session(self, now: Now) -> list[Send]:
         request = self.session.request_due(now.mono_ns)
-        if request is not None:
-            sends.append(Send("session", encode(request)))
-        return sends
+        return [] if request is None else [Send("session", encode(request))]
 
     def _command(self, now: Now) -> list[Send]:
         """Make the command of this moment from what is known; none without a session or a picture."""
@@ -165,9 +169,24 @@ class DriverNode:
             return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
         return "drive", decision
 
-    def _stop_now(self, _message: Message, now: Now) -> list[Send]:
+    # The person beside it asks for something.
+
+    def _obey_operator(self, message: Message, now: Now) -> list[Send]:
+        return self._FOR_THE_OPERATOR[message.payload](self, now)
+
+    def _stop_now(self, now: Now) -> list[Send]:
         """Raise an emergency stop: by a query at once, and by a flag in every command from now on."""
-        return [Send("session", encode(self.session.stop_now(now.wall_ns))), *self._command(now)]
+        return [Send("session", encode(self.session.stop_now(now))), *self._command(now)]
+
+    def _release(self, now: Now) -> list[Send]:
+        """Give the vehicle up: it stops, and no more commands are made."""
+        self.session.release(now.mono_ns)
+        return self._wake_session(now)
+
+    _FOR_THE_OPERATOR: ClassVar[dict[OperatorAsks, Callable[..., list[Send]]]] = {
+        "emergency_stop": _stop_now,
+        "release": _release,
+    }
 
     # The vehicle tells.
 

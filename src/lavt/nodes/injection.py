@@ -6,7 +6,7 @@ back. Neither node touches a queue; the link that carries `inject` does, and tel
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Literal
@@ -26,6 +26,8 @@ ASK_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
 """The client asks once a second: four may be lost."""
 LONGEST_BECAUSE = 300
+QUESTIONS_KEPT = 64
+"""So many wait for the queues; as many as the link keeps."""
 
 
 class _Queues:
@@ -107,7 +109,7 @@ class InjectionNode:
         self._queues = _Queues()
         self._lease: Lease | None = None
         self._rest = Rest(False, None)
-        self._waiting: list[Peer] = []
+        self._waiting: deque[Peer] = deque(maxlen=QUESTIONS_KEPT)
         self.chains: Mapping[str, Sequence[Hop]] = {
             "netem": (("answer", self._answer),),
             "injected": (("note", self._note_injected),),
@@ -182,8 +184,8 @@ class InjectionNode:
         sends = self._queues.note(done, now)
         if sends is None:
             return []
-        waiting, self._waiting = self._waiting, []
-        sends += [_reply(done.because, peer) for peer in waiting]
+        sends += [_reply(done.because, peer) for peer in self._waiting]
+        self._waiting.clear()
         if not done.because:
             return sends
         self.counts["netem_failed"] += 1

@@ -14,6 +14,7 @@ from lavt.transport.reception import Reception
 from lavt.transport.reorder import Ordered, ReorderBuffer
 from lavt.transport.rtcp import is_rtcp, max_bit_rate, parse_announcement, picture_loss, receiver_report
 from lavt.transport.rtp import Depacketizer, parse_packet
+from lavt.transport.video_cipher import NewCipher, plain_cipher
 from lavt.transport.video_path import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
@@ -38,13 +39,20 @@ class ReceiverNode:
 
     name = "receiver"
 
-    def __init__(self, reorder: ReorderBuffer, depacketizer: Depacketizer, max_bit_rate_bps: int | None = None) -> None:
+    def __init__(
+        self,
+        reorder: ReorderBuffer,
+        depacketizer: Depacketizer,
+        max_bit_rate_bps: int | None = None,
+        new_cipher: NewCipher = plain_cipher,
+    ) -> None:
         self._counts: Counter[str] = Counter()
         self._reorder = reorder
         self._repair = RepairReceiver()
         self._depacketizer = depacketizer
         self._reception = Reception(reorder)
         self._max_bit_rate_bps = max_bit_rate_bps
+        self._new_cipher = new_cipher
         self._path: PathClient | None = None
         self._token = b""
         self._port = 0
@@ -87,18 +95,24 @@ class ReceiverNode:
         token: PathToken = message.payload
         if self._path is None or token.token != self._token:
             self._token = token.token
-            self._path = PathClient(token.token)
+            self._path = PathClient(token.token, self._new_cipher)
             self._port = token.port
 
     def _receive(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]] | None:
         """Sort out what came; what is not understood is counted and dropped."""
-        datagram: bytes = message.payload
-        if is_path_datagram(datagram):
-            answer = None if self._path is None else self._path.answer(datagram)
+        datagram: bytes | None = message.payload
+        if is_path_datagram(message.payload):
+            answer = None if self._path is None else self._path.answer(message.payload)
             self._counts["challenges_unreadable"] += answer is None
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
+        control = is_rtcp(message.payload)
+        if self._path is not None:
+            datagram = (self._path.open_control if control else self._path.open)(message.payload)
+        if datagram is None:
+            self._counts["packets_forged"] += 1
+            return None
         try:
-            if is_rtcp(datagram):
+            if control:
                 announcement = parse_announcement(datagram)
                 # Without a path nothing was reported: what a sender answers is another receiver's.
                 own_ssrc = None if self._path is None else SSRC
@@ -179,14 +193,17 @@ class ReceiverNode:
             return []
         self._asked_ns = now_ns
         self._counts["picture_loss_requests"] += 1
-        return [self._feedback(picture_loss(SSRC, self._media_ssrc))]
+        return [self._control(picture_loss(SSRC, self._media_ssrc))]
 
     def _report(self, media_ssrc: int, now_ns: int) -> list[Send]:
         report = self._reception.report(now_ns)
-        sends = [] if report is None else [self._feedback(receiver_report(SSRC, report, clock_ns=now_ns))]
+        sends = [] if report is None else [self._control(receiver_report(SSRC, report, clock_ns=now_ns))]
         if self._max_bit_rate_bps is not None:
-            sends.append(self._feedback(max_bit_rate(SSRC, media_ssrc, self._max_bit_rate_bps, overhead_bytes=0)))
+            sends.append(self._control(max_bit_rate(SSRC, media_ssrc, self._max_bit_rate_bps, overhead_bytes=0)))
         return sends
+
+    def _control(self, packet: bytes) -> Send:
+        return self._feedback(packet if self._path is None else self._path.seal_control(packet))
 
     def _feedback(self, datagram: bytes) -> Send:
         return Send("feedback", datagram, self._port)

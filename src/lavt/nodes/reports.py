@@ -99,6 +99,18 @@ class Admission:
 
 
 @value
+class AtWheel:
+    """A command was seen to have reached the wheels; the times are the server's monotonic clock."""
+
+    sequence: int
+    stamp_ns: int
+    applied_mono_ns: int
+    """As in its `Admission`."""
+    wheel_mono_ns: int
+    """When the vehicle's own report came, that it steers by it."""
+
+
+@value
 class Event:
     """Something worth a line in the record of the server."""
 

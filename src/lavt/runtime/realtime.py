@@ -8,6 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from lavt.clock import Clock
@@ -34,11 +35,19 @@ class Link(Protocol):
         ...
 
 
+class Receiver(Protocol):
+    """Who takes messages for a node."""
+
+    def put(self, message: Message) -> None:
+        """Take a message; never waits."""
+        ...
+
+
 class RealRuntime:
     """Drives the nodes of one side by the machine's clocks.
 
     `links` carries what crosses the network, by carrier; `recorder` gets messages as they are, and must not wait. A
-    node that fails ends the run: `failed` says why.
+    node that fails ends the run: `failed` says why. `elsewhere` takes messages for nodes in other processes.
     """
 
     def __init__(
@@ -47,6 +56,7 @@ class RealRuntime:
         nodes: Sequence[Node],
         recorder: Recorder,
         clock_source: Callable[[], ClockReport | None],
+        elsewhere: Mapping[str, Receiver] = MappingProxyType({}),
     ) -> None:
         self.links: dict[str, Link] = {}
         self.failed: BaseException | None = None
@@ -55,6 +65,7 @@ class RealRuntime:
         self._recorder = recorder
         self._clock_source = clock_source
         self._workers = {node.name: _Worker(self, node) for node in nodes}
+        self._receivers: dict[str, Receiver] = {**elsewhere, **self._workers}
 
     def start(self, links: Mapping[str, Link]) -> None:
         """Begin: from here on nodes are woken and messages delivered."""
@@ -80,16 +91,27 @@ class RealRuntime:
 
     def deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer = None) -> None:
         """Let a message wait for its receivers; links call this, from threads of their own."""
-        row = CHANNELS[channel]
-        if row.carrier != "local":
+        if CHANNELS[channel].carrier != "local":
             self._recorder.write(channel, payload, arrived)
-        for receiver in row.receivers:
-            self._workers[receiver].put(Message(channel, payload, arrived, peer))
+        self.put(Message(channel, payload, arrived, peer))
+
+    def put(self, message: Message) -> None:
+        """Let a message wait for its receivers, and write nothing down."""
+        for receiver in CHANNELS[message.channel].receivers:
+            self._receivers[receiver].put(message)
+
+    def record(self, topic: str, payload: Any, now: Now) -> None:
+        """Write down what happened in another process."""
+        self._recorder.write(topic, payload, now)
+
+    def carry(self, carrier: Carrier, sends: Sequence[Send]) -> None:
+        """Send what another process has written down."""
+        self.links[carrier].send(*sends)
 
     def fail(self, error: BaseException) -> None:
         """A thread ended with an error: so does the run."""
         log.critical("%s: %s", type(error).__name__, error, exc_info=error)
-        self.failed = error
+        self.failed = self.failed or error  # what comes after is of the first
         self.stopped.set()
 
     def run_chain(self, node: Node, message: Message) -> None:

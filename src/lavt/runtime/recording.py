@@ -77,7 +77,7 @@ WIRE: dict[str, Callable[[bytes], object]] = {
 UNRECORDED = frozenset(
     {
         "pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "rest", "condition_in_force",
-        "clock_query", "clock_report", "probe_request", "probe_reply", "inject", "injected",
+        "server_ends", "clock_query", "clock_report", "probe_request", "probe_reply", "inject", "injected",
     }
 )  # fmt: skip
 """Written down elsewhere (the truth, the pictures' units, samples of clocks and queues, exchanges), or secret."""

@@ -41,11 +41,12 @@ CHANNELS: dict[str, Channel] = {
     "frame": Channel("local", "camera", ("actuator",), at_once=True),
     "video_token": Channel("local", "actuator", ("camera",)),
     "rest": Channel("local", "actuator", ("injection",)),  # in order with requests: a flood of these must not hide it
+    "server_ends": Channel("local", "operator", ("actuator",)),  # the vehicle is stopped before the server ends
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),
     "picture_lost": Channel("local", "driver", ("receiver",)),
-    "operator": Channel("local", "operator", ("driver",)),  # a person asks for an emergency stop
+    "operator": Channel("local", "operator", ("driver",)),  # a person stops or releases the vehicle
     "path_token": Channel("local", "driver", ("receiver",)),
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # across the network
@@ -68,6 +69,7 @@ CHANNELS: dict[str, Channel] = {
     # written down only
     "video": Channel("record", "camera"),
     "admission": Channel("record", "actuator"),
+    "wheel": Channel("record", "actuator"),
     "truth": Channel("record", "actuator"),
     "route": Channel("record", "actuator"),
     "event": Channel("record", "actuator"),

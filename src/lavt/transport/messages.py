@@ -19,7 +19,7 @@ import msgpack
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest, State
 from lavt.errors import BadMessage
 
-VERSION = 1
+VERSION = 2
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
 """What a vehicle and a client may be called: nothing that means something in a Zenoh key."""
@@ -51,6 +51,14 @@ def _name(value: object) -> bool:
     return type(value) is str and NAME.match(value) is not None
 
 
+def _name_or_none(value: object) -> bool:
+    return value == "" or _name(value)
+
+
+def _bytes(*lengths: int) -> Check:
+    return lambda value: type(value) is bytes and len(value) in lengths
+
+
 def _curvatures(value: object) -> bool:
     """Check all at once: the sum of what holds one that is no number, or infinite, is not finite."""
     return (
@@ -65,6 +73,8 @@ def _curvatures(value: object) -> bool:
 
 U64 = _integer(0, 2**64 - 1)
 TIME = _integer(0, 2**63 - 1)
+LAST_STOP = _integer(0, 2**62)
+"""No vehicle tells of an emergency stop with a higher number: its operator's next one must still be a `TIME`."""
 ROAD_WHEEL = _number(-1.0, 1.0)
 UNIT = _number(0.0, 1.0)
 RATE = _integer(10_000, 10**11)
@@ -93,9 +103,14 @@ CHECKS: dict[type, dict[str, Check]] = {
         "because": _text(200),
         "applied_sequence": _integer(-1, 2**63 - 1),
         "refused": _text(200),
+        "limited": _text(100),
+        "holder": _name_or_none,
+        "holder_instance": U64,
+        "asked_by": _name_or_none,
+        "instance": U64,
     },
     SessionRequest: {
-        "operation": _one_of("hold", "release", "emergency_stop", "clear_emergency_stop"),
+        "operation": _one_of("hold", "ask", "release", "emergency_stop", "clear_emergency_stop"),
         "who": _name,
         "instance": U64,
         "number": TIME,
@@ -104,10 +119,10 @@ CHECKS: dict[type, dict[str, Check]] = {
         "granted": lambda value: type(value) is bool,
         "because": _text(200),
         "epoch": U64,
-        "token": lambda value: type(value) is bytes and len(value) in (0, 16),
+        "token": _bytes(0, 16),
         "video_port": _integer(0, 65535),
         "host": _text(64),
-        "emergency_stop": TIME,
+        "emergency_stop": LAST_STOP,
     },
     NetemRequest: {
         "who": _name,

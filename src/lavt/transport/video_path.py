@@ -3,7 +3,7 @@
 The session reply, over Zenoh, gives the client a token. Then, between the client's video socket and the server's:
 
     client -> server   hello      proof(token, "hello")
-    server -> client   challenge  issued_ns, seal
+    server -> client   challenge  issued_ns, seal, proof(token, "challenge", issued_ns, seal) cut to 8 bytes
     client -> server   answer     issued_ns, seal, proof(token, "answer", issued_ns, seal)
 
 proof is HMAC-SHA256 under the token. seal is HMAC-SHA256, cut to 16 bytes, over the time and the address *the server
@@ -17,7 +17,11 @@ answer that comes from there. The server keeps nothing for a hello, however many
   gets no reply. No reply is longer than what it replies to.
 * Steal it by replay: an answer counts only from the address in its seal, within 2 s, and only when its challenge is
   newer than the one that opened the path. A restart or a new token makes all older seals worthless.
-* Not covered: somebody on the way who reads, sends and swallows datagrams can also do so with the video itself.
+* Make the client take another path for open: a challenge counts only with its proof, and newer than any before.
+* Not covered without encryption: who reads, sends and swallows datagrams on the way can do so with the video itself.
+
+Where the video is encrypted, its keys are made of the token and of the challenge that opened the path: each opening has
+its own. So the client, which cannot know whether its answer arrives, keeps those of its last few answers.
 
 These datagrams begin with b"LAVT"; the first byte tells them from RTP and RTCP, whose version there is 2.
 """
@@ -30,22 +34,30 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
+from lavt.transport.video_cipher import Cipher, NewCipher, NoCipher, plain_cipher
 
 Address = tuple[str, int]
 
 TOKEN_BYTES: Final = 16
 HELLO_INTERVAL_NS: Final = 500 * NS_PER_MS
+"""Until the first video comes, which under delay takes a while."""
+HELLO_AGAIN_NS: Final = 150 * NS_PER_MS
+"""Without video, once it came. Half of what a vehicle waits for commands: a client whose address changes has its video
+back before the vehicle is stopped."""
 CHALLENGE_LIFETIME_NS: Final = 2 * NS_PER_S
 REPORT_TIMEOUT_NS: Final = 2 * NS_PER_S
 
 _MAGIC: Final = b"LAVT"
-_VERSION: Final = 1
+_VERSION: Final = 2
 _HELLO: Final = _MAGIC + bytes([1, _VERSION])
 _CHALLENGE: Final = _MAGIC + bytes([2, _VERSION])
 _ANSWER: Final = _MAGIC + bytes([3, _VERSION])
 _TIME_BYTES: Final = 8
 _SEAL_BYTES: Final = 16
 _PROOF_BYTES: Final = 32
+_CLIENT_PROOF_BYTES: Final = 8
+_CIPHERS_KEPT: Final = 16
+"""Two seconds of hellos: after that the server takes no answer to them."""
 
 
 def is_path_datagram(datagram: bytes) -> bool:
@@ -59,36 +71,70 @@ class PathClient:
     Raises `UserError` for a token of another length.
     """
 
-    def __init__(self, token: bytes) -> None:
+    def __init__(self, token: bytes, new_cipher: NewCipher = plain_cipher) -> None:
         _check_token(token)
         self._token = token
+        self._new_cipher = new_cipher
+        self._ciphers = [new_cipher(token, b"")]
+        """The one that is in use first, then those that may come into use, or were; one without a challenge is none."""
+        self._answered_ns: int | None = None
+        self._interval_ns = HELLO_INTERVAL_NS
         self._next_hello_ns = 0
 
     def hello(self, now_ns: int) -> bytes:
         """Write the datagram that asks for a challenge, to be sent to the server at `now_ns`."""
-        self._next_hello_ns = now_ns + HELLO_INTERVAL_NS
+        self._next_hello_ns = now_ns + self._interval_ns
         return _HELLO + _proof(self._token, _HELLO)
 
     def answer(self, challenge_datagram: bytes) -> bytes | None:
-        """Write the answer to a challenge, to be sent to the server; None when it is no challenge."""
-        if len(challenge_datagram) != len(_CHALLENGE) + _TIME_BYTES + _SEAL_BYTES:
+        """Write the answer to a challenge, to be sent to the server; None when it is none of the server's, or old."""
+        said, proof = challenge_datagram[:-_CLIENT_PROOF_BYTES], challenge_datagram[-_CLIENT_PROOF_BYTES:]
+        if len(said) != len(_CHALLENGE) + _TIME_BYTES + _SEAL_BYTES or not said.startswith(_CHALLENGE):
             return None
-        if not challenge_datagram.startswith(_CHALLENGE):
+        if not hmac.compare_digest(proof, _proof(self._token, said)[:_CLIENT_PROOF_BYTES]):
             return None
-        answer = _ANSWER + challenge_datagram[len(_CHALLENGE) :]
+        challenge = said[len(_CHALLENGE) :]
+        issued_ns = int.from_bytes(challenge[:_TIME_BYTES], "big", signed=True)
+        if self._answered_ns is not None and issued_ns <= self._answered_ns:
+            return None
+        self._answered_ns = issued_ns
+        self._ciphers = [self._new_cipher(self._token, challenge), *self._ciphers[: _CIPHERS_KEPT - 1]]
+        answer = _ANSWER + challenge
         return answer + _proof(self._token, answer)
+
+    def open(self, packet: bytes) -> bytes | None:
+        """Give the RTP packet of what came from the server; None where it is not the server's."""
+        return self._first(lambda cipher: cipher.open(packet))
+
+    def open_control(self, packet: bytes) -> bytes | None:
+        """Give the RTCP packet of what came from the server; None where it is not the server's."""
+        return self._first(lambda cipher: cipher.open_control(packet))
+
+    def _first(self, opened: Callable[[Cipher], bytes | None]) -> bytes | None:
+        for cipher in self._ciphers:
+            packet = opened(cipher)
+            if packet is not None:
+                if cipher is not self._ciphers[0]:
+                    self._ciphers = [cipher, *(each for each in self._ciphers if each is not cipher)]
+                return packet
+        return None
+
+    def seal_control(self, packet: bytes) -> bytes:
+        """Make what is sent of an RTCP packet."""
+        return self._ciphers[0].seal_control(packet)
 
     def video_arrived(self, now_ns: int) -> None:
         """Note that the path works: no hello is needed for a while."""
-        self._next_hello_ns = now_ns + HELLO_INTERVAL_NS
+        self._interval_ns = HELLO_AGAIN_NS
+        self._next_hello_ns = now_ns + HELLO_AGAIN_NS
 
     def next_hello_ns(self) -> int:
-        """Tell when the next hello is due: 500 ms after the last hello or video packet; at first 0, at once."""
+        """Tell when the next hello is due: at first 0, at once; then 500 ms later, or 150 ms after video or a hello."""
         return self._next_hello_ns
 
 
 class PathServer:
-    """The server's end: finds out where to send the video.
+    """The server's end: finds out where to send the video, and under which `cipher`.
 
     `new_secret` gives 16 or more unpredictable bytes at each call. All times are of the server's monotonic clock.
     Public counters, in datagrams: `malformed` are not ours, `wrong_token` have no valid proof, `wrong_address` answer
@@ -96,13 +142,14 @@ class PathServer:
     `foreign_reports` are reports from where no path is open.
     """
 
-    def __init__(self, new_secret: Callable[[], bytes]) -> None:
+    def __init__(self, new_secret: Callable[[], bytes], new_cipher: NewCipher = plain_cipher) -> None:
         self.malformed = 0
         self.wrong_token = 0
         self.wrong_address = 0
         self.stale = 0
         self.foreign_reports = 0
         self._new_secret = new_secret
+        self._new_cipher = new_cipher
         self.set_token(None)
 
     def set_token(self, token: bytes | None) -> None:
@@ -113,6 +160,7 @@ class PathServer:
         if token is not None:
             _check_token(token)
         self._token = token
+        self.cipher: Cipher = NoCipher()
         self._secret = self._new_secret()
         self._address: Address | None = None
         self._opened_by_ns: int | None = None
@@ -157,7 +205,8 @@ class PathServer:
     def _challenge(self, address: Address, now_ns: int) -> bytes:
         """Write the challenge for `address`."""
         issued = now_ns.to_bytes(_TIME_BYTES, "big", signed=True)
-        return _CHALLENGE + issued + self._seal(issued, address)
+        said = _CHALLENGE + issued + self._seal(issued, address)
+        return said + _proof(self._token or b"", said)[:_CLIENT_PROOF_BYTES]
 
     def _open(self, answer: bytes, address: Address, now_ns: int) -> None:
         """Open the path to `address` if `answer`, whose proof is right, is to a challenge sent there just now."""
@@ -172,6 +221,7 @@ class PathServer:
             self.stale += 1
             return
         self._address = address
+        self.cipher = self._new_cipher(self._token or b"", answer[len(_ANSWER) : -_PROOF_BYTES])
         self._opened_by_ns = issued_ns
         self._last_report_ns = now_ns
 

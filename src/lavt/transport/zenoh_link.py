@@ -14,7 +14,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import zenoh
 
@@ -28,6 +28,10 @@ Deliver = Callable[[str, Any, Now, Any], None]
 
 REPLY_TIMEOUT_S = 2.0
 ROUTER_READY_S = 5.0
+RETRY_S = 1.0
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
+"""What an endpoint with a host and a port may begin with; Zenoh itself calls a wrong one unreachable."""
+PROTOCOLS_OF_PATHS = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANSWERS = {"session": "session_reply", "netem": "netem_reply"}
 """The queries, by the last part of their keys, and what answers them."""
 ASKED = {answer: query for query, answer in ANSWERS.items()}
@@ -93,6 +97,20 @@ def _listens(config: zenoh.Config) -> bool:
     return bool(named.get("router") if isinstance(named, dict) else named)
 
 
+def _check_endpoints(config: zenoh.Config) -> Any:
+    """Give the endpoints that a session connects to; raises `UserError` for one that nobody could ever answer at."""
+    endpoints = json.loads(config.get_json("connect/endpoints"))
+    for endpoint in endpoints if isinstance(endpoints, list) else []:
+        protocol, _, address = endpoint.partition("/")
+        port = re.split(r"[?#]", address)[0].rpartition(":")[2]
+        if protocol in PROTOCOLS_OF_PATHS or (protocol in PROTOCOLS and port.isdecimal() and 0 < int(port) < 65_536):
+            continue
+        raise UserError(
+            f"zenoh.router cannot be {endpoint!r}: write PROTOCOL/HOST:PORT with one of {', '.join(PROTOCOLS)}"
+        )
+    return endpoints
+
+
 class Router:
     """A Zenoh router in this process, from a config file with `mode: "router"`."""
 
@@ -125,8 +143,22 @@ class Router:
         self._session.close()
 
 
+class Routers(NamedTuple):
+    """What the router of a session tells."""
+
+    linked: int
+    """How many other routers it has a link to."""
+    versions: tuple[str, ...]
+    """Zenoh's, of every router that tells it: its own first."""
+
+
 class ZenohLink:
-    """One side's session: publishes and subscribes what the side sends and hears, and carries the session query."""
+    """One side's session: publishes and subscribes what the side sends and hears, and carries the session query.
+
+    Raises `UserError` for a config that cannot work and, where no router answers, too. With `waiting`, `start` calls
+    that with the reason instead and opens the session in the background as soon as a router answers; what is to be
+    sent before then is counted as not sent.
+    """
 
     def __init__(
         self,
@@ -138,6 +170,7 @@ class ZenohLink:
         router: str,
         vehicle: str,
         who: str,
+        waiting: Callable[[str], None] | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._clock = clock
@@ -148,27 +181,55 @@ class ZenohLink:
         self._queries: dict[str, dict[int, zenoh.Query]] = {channel: {} for channel in ANSWERS}
         self._queries_lock = threading.Lock()
         self._number = itertools.count()
-        config = _load(path, {"connect/endpoints": [router]} if router else {})
-        endpoints = json.loads(config.get_json("connect/endpoints"))
+        self._config = _load(path, {"connect/endpoints": [router]} if router else {})
+        endpoints = _check_endpoints(self._config)
+        self._session: Any = None
+        self._publisher: Any = None
+        self._declared: list[Any] = []
+        self._closing = threading.Event()
+        self._opener: threading.Thread | None = None
+        self._waiting = waiting
+        self._waits_because = ""
         try:
-            self._session = zenoh.open(config)
+            self._session = zenoh.open(self._config)
         except zenoh.ZError as error:
-            raise UserError(
+            self._waits_because = (
                 f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or name another "
                 f"({_plain(error)})"
-            ) from error
-        self._declared: list[Any] = []
+            )
+            if waiting is None:
+                raise UserError(self._waits_because) from error
 
     def start(self) -> None:
         """Begin to send and to hear; from here on messages are delivered."""
+        if self._session is not None:
+            self._declare(self._session)
+        elif self._waiting is not None:
+            self._waiting(self._waits_because)
+            self._opener = threading.Thread(target=self._open_later, name="zenoh opener", daemon=True)
+            self._opener.start()
+
+    def _open_later(self) -> None:
+        """Try again and again; one try takes at most the config's open_timeout."""
+        while not self._closing.wait(RETRY_S):
+            try:
+                session = zenoh.open(self._config)
+            except zenoh.ZError:
+                self.counts["router_unreachable"] += 1
+            else:
+                self._declare(session)
+                self._session = session
+                return
+
+    def _declare(self, session: zenoh.Session) -> None:
         heard, said, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
         listener: Any = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
-        self._publisher = self._session.declare_publisher(f"{self._base}/{said}", **qos)
-        self._declared.append(self._session.declare_subscriber(f"{self._base}/{heard}", listener))
+        self._publisher = session.declare_publisher(f"{self._base}/{said}", **qos)
+        self._declared.append(session.declare_subscriber(f"{self._base}/{heard}", listener))
         for channel in ANSWERS if self._side == "server" else ():
             asked: Any = zenoh.handlers.Callback(functools.partial(self._asked, channel), indirect=False)
-            self._declared.append(self._session.declare_queryable(f"{self._base}/{channel}", asked))
-        self._declared.append(self._session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
+            self._declared.append(session.declare_queryable(f"{self._base}/{channel}", asked))
+        self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, *sends: Send) -> None:
         """Carry messages of this side; what cannot be sent now is counted, for there is always a newer one."""
@@ -177,7 +238,9 @@ class ZenohLink:
 
     def _send(self, send: Send) -> None:
         try:
-            if send.channel in ANSWERS:
+            if self._session is None:  # no router has answered yet
+                self.counts[f"{send.channel}_not_sent"] += 1
+            elif send.channel in ANSWERS:
                 self._ask(send.channel, send.payload)
             elif send.channel in ASKED:
                 self._reply(ASKED[send.channel], send.peer, send.payload)
@@ -186,8 +249,27 @@ class ZenohLink:
         except zenoh.ZError:
             self.counts[f"{send.channel}_not_sent"] += 1
 
+    def routers(self) -> Routers | None:
+        """Ask the routers what they are linked to; None where that of this session does not tell."""
+        own = {str(zid) for zid in self._session.info.routers_zid()}
+        told = [
+            json.loads(reply.ok.payload.to_string())
+            for reply in self._session.get("@/*/router", timeout=REPLY_TIMEOUT_S)
+            if reply.ok is not None
+        ]
+        told.sort(key=lambda router: router["zid"] not in own)
+        if not told or told[0]["zid"] not in own:
+            return None
+        linked = sum(session["whatami"] == "router" for session in told[0]["sessions"])
+        return Routers(linked, tuple(router["version"].partition("-")[0] for router in told))
+
     def close(self) -> None:
         """Leave: without it the process would not end."""
+        self._closing.set()
+        if self._opener is not None:
+            self._opener.join()
+        if self._session is None:
+            return
         for declared in self._declared:
             declared.undeclare()
         self._session.close()
@@ -200,6 +282,7 @@ class ZenohLink:
         self._session.get(
             f"{self._base}/{channel}", answered, payload=payload, timeout=REPLY_TIMEOUT_S,
             consolidation=zenoh.ConsolidationMode.NONE,
+            target=zenoh.QueryTarget.ALL,  # the nearest alone might be somebody who only says that he is the vehicle
         )  # fmt: skip
 
     def _answered(self, channel: str, reply: zenoh.Reply) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
@@ -12,6 +12,9 @@ from lavt.value import value
 @value
 class CapturedFrame:
     """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known.
+
+    Of a V4L2 device it is what its driver says, the beginning of the exposure or the end of the transfer
+    (docs/camera.md).
 
     The picture is (height, width, 3), blue green red, or what the camera gives in I420, (height * 3 / 2, width): that
     goes into the encoder as it is.
@@ -84,4 +87,14 @@ class TimedCamera(Camera, Protocol):
 
         `poses` are those known by then, oldest first; only a simulated camera has to do with them.
         """
+        ...
+
+
+@runtime_checkable
+class CountingCamera(Camera, Protocol):
+    """A camera of which pictures can get lost before anybody asks for them; the others need not count."""
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What has happened to it so far; for the record."""
         ...

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from lavt.domain import Actuation, GroundTruth, VehicleEvent, VehicleState
+from lavt.value import value
+
+
+@value
+class Reached:
+    """At `reached_ns` the vehicle said that it steers by what was applied at `applied_ns`."""
+
+    applied_ns: int
+    reached_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +52,18 @@ class Vehicle(Protocol):
         """Obey `actuation` from `now_ns` on, until the next one."""
         ...
 
+    def engage(self, wanted: bool, now_ns: int) -> None:
+        """Be ready to obey, or need not be any more; may be called again and again.
+
+        A vehicle that takes time for it says in its state when it is engaged. One that is not wanted any more obeys
+        nothing but a brake, and holds itself once it stands.
+        """
+        ...
+
+    def take_reached(self) -> list[Reached]:
+        """Take what of the applied was seen to reach the wheels since the last call; empty where it cannot be seen."""
+        ...
+
     def state(self) -> VehicleState:
         """Tell the newest state the vehicle reports of itself."""
         ...
@@ -52,4 +74,14 @@ class Vehicle(Protocol):
 
     def next_wake_ns(self) -> int:
         """Tell when the vehicle wants `advance` called next."""
+        ...
+
+
+@runtime_checkable
+class CountingVehicle(Vehicle, Protocol):
+    """A vehicle that counts what goes wrong on the way to it; the others need not."""
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was counted so far; for the record."""
         ...

@@ -11,7 +11,7 @@ from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import Car, CarMotion, CarParameters
 from lavt.vehicle.sim.judge import Judge
 from lavt.vehicle.sim.road import Road
-from lavt.vehicle.vehicle import Capabilities
+from lavt.vehicle.vehicle import Capabilities, Reached
 
 STEPS_PER_S = 240
 
@@ -119,6 +119,13 @@ class Simulator:
         """
         self._steering.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
         self._pedals.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
+
+    def engage(self, wanted: bool, now_ns: int) -> None:
+        """Do nothing: it always obeys."""
+
+    def take_reached(self) -> list[Reached]:
+        """Tell nothing: what is applied is in force after the dead times."""
+        return []
 
     def _obey(self, at_ns: int) -> None:
         """Take over what has become due."""

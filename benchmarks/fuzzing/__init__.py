@@ -1,0 +1,1 @@
+"""What `benchmarks/fuzz.py` is made of: how inputs are damaged, and what takes them."""

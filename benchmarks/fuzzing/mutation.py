@@ -1,0 +1,182 @@
+"""Makes inputs that are nearly right: valid ones, damaged in a way that follows from a seed and from nothing else."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar
+
+import msgpack
+import numpy as np
+
+from lavt.streams import stream
+
+LONGEST_RANDOM = 1500
+MOST_MUTATIONS = 3
+"""Of one input."""
+
+INTEGERS: Final = (
+    0, 1, -1, 2, 127, 128, 255, 256, 65_535, 65_536, 2**31 - 1, 2**31, 2**32, 2**53 + 1, 2**62, 2**62 + 1, 2**63 - 1,
+    2**63, 2**64 - 1, -(2**31), -(2**63),
+)  # fmt: skip
+NUMBERS: Final = (0.0, -0.0, 0.1, 1.0, -1.0, 1.0000001, 100.0, 1e308, -1e308, 5e-324, float("inf"), -float("inf"),
+                  float("nan"))  # fmt: skip
+WORDS: Final = (
+    "", "a", "arm", "drive", "stop", "hold", "ask", "release", "emergency_stop", "clear_emergency_stop", "driving",
+    "arming", "degraded", "safe_stop", "disarmed", "park", "reverse", "pareto", "uniform", "**", "lavt/**", "\x00",
+    "x" * 33, "x" * 200, "x" * 201, "é" * 100, "\U0001f697" * 50, "1e5", "None",
+)  # fmt: skip
+OTHERS: Final[tuple[Any, ...]] = (
+    None, True, False, b"", bytes(16), bytes(32), b"\xff\xfe", bytes(300), [], [0] * 10, [float("nan")] * 10,
+    [1.0] * 9 + [float("inf")], ["x"] * 10, [[[[]]]], {}, {"a": 1}, {1: 2}, msgpack.ExtType(5, b"x"),
+    msgpack.Timestamp(0),
+)  # fmt: skip
+VALUES: Final[tuple[Any, ...]] = (*INTEGERS, *NUMBERS, *WORDS, *OTHERS)
+
+BOMBS: Final = (
+    b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 1000,
+    b"\x81" * 1000, b"\xc7\xff\x01", b"\xc1", b"\xd8\xff", b"",
+)  # fmt: skip
+"""Beginnings that announce more than there is, or nest deeper than any message does."""
+
+Item = TypeVar("Item")
+
+
+class Chance:
+    """Random numbers of a named stream, some thousands at a time: one by one they would take longer than parsers."""
+
+    def __init__(self, seed: int, name: str) -> None:
+        self._generator = stream(seed, f"fuzz {name}")
+        self._next = _numbers(self._generator).__next__
+
+    def below(self, bound: int) -> int:
+        """Give an integer in [0, bound)."""
+        return self._next() % bound
+
+    def choice(self, items: Sequence[Item]) -> Item:
+        """Give one of the items."""
+        return items[self._next() % len(items)]
+
+    def bytes(self, length: int) -> bytes:
+        """Give random bytes."""
+        return self._generator.bytes(length)
+
+
+def _numbers(generator: np.random.Generator) -> Iterator[int]:
+    while True:
+        yield from generator.integers(0, 2**32, size=8192).tolist()
+
+
+@dataclass
+class Corpus:
+    """Valid inputs of one channel.
+
+    `fields` are offsets and lengths of what means something in a binary layout; of `packed` inputs, which are msgpack
+    arrays, single values are replaced. `heard` are inputs that are said again just as they were, and never changed.
+    """
+
+    entries: Sequence[bytes]
+    fields: Sequence[tuple[int, int]] = ()
+    packed: bool = False
+    heard: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+
+
+Mutation = Callable[[bytes, Corpus, Chance], bytes]
+
+
+def an_input(corpus: Corpus, chance: Chance) -> bytes:
+    """Give the next input: a valid one with up to three mutations, one said again, or mere noise."""
+    kind = chance.below(16)
+    if kind == 0:
+        return chance.bytes(chance.below(LONGEST_RANDOM))
+    if kind <= 2 and corpus.heard:
+        return chance.choice(corpus.heard)
+    data = chance.choice(corpus.entries)
+    mutations = PACKED if corpus.packed else BINARY if corpus.fields else PLAIN
+    for _ in range(chance.below(MOST_MUTATIONS + 1)):
+        data = chance.choice(mutations)(data, corpus, chance)
+    return data
+
+
+def _flip(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    if not data:
+        return data
+    changed = bytearray(data)
+    for _ in range(1 + chance.below(8)):
+        changed[chance.below(len(changed))] ^= 1 << chance.below(8)
+    return bytes(changed)
+
+
+def _cut(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    return data[: chance.below(len(data) + 1)]
+
+
+def _lengthen(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    return data + chance.bytes(chance.below(64))
+
+
+def _splice(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
+    other = chance.choice(corpus.entries)
+    return data[: chance.below(len(data) + 1)] + other[chance.below(len(other) + 1) :]
+
+
+def _overwrite(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    at, length = chance.below(len(data) + 1), 1 + chance.below(8)
+    filled = chance.choice((b"\x00", b"\xff", b"\x7f", b"\x80")) * length
+    return data[:at] + (filled if chance.below(2) else chance.bytes(length)) + data[at + length :]
+
+
+def _leave_out(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    at = chance.below(len(data) + 1)
+    return data[:at] + data[at + 1 + chance.below(16) :]
+
+
+def _change_field(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
+    """Put something else into a field: near to what was there, or far from it."""
+    at, length = chance.choice(corpus.fields)
+    if at + length > len(data):
+        return data
+    was, most = int.from_bytes(data[at : at + length], "big"), (1 << 8 * length) - 1
+    near, half = chance.below(32), 1 << (8 * length - 1)
+    new: int = chance.choice((was + near, was - near, was + half, half, most, chance.choice(INTEGERS)))
+    return data[:at] + (new & most).to_bytes(length, "big") + data[at + length :]
+
+
+def _change_value(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    """Replace single values of a message, so that its shape stays right."""
+    try:
+        values = msgpack.unpackb(data)
+        for _ in range(1 + chance.below(2)):
+            values[chance.below(len(values))] = chance.choice(VALUES)
+        packed: bytes = msgpack.packb(values, use_bin_type=chance.below(8) > 0)
+    except Exception:  # what an earlier mutation has left of the message
+        return data
+    return packed
+
+
+def _change_shape(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    """Let a message have a value more, one less, or two in each other's place."""
+    try:
+        values = msgpack.unpackb(data)
+        at, other = chance.below(len(values)), chance.below(len(values))
+        kind = chance.below(3)
+        if kind == 0:
+            values.insert(at, chance.choice(VALUES))
+        elif kind == 1:
+            values.pop(at)
+        else:
+            values[at], values[other] = values[other], values[at]
+        packed: bytes = msgpack.packb(values)
+    except Exception:  # as above
+        return data
+    return packed
+
+
+def _announce(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+    return chance.choice(BOMBS) + data
+
+
+PLAIN: Final[tuple[Mutation, ...]] = (_flip, _cut, _lengthen, _splice, _overwrite, _leave_out)
+BINARY: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_field,) * len(PLAIN))
+PACKED: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_value,) * len(PLAIN), _change_shape, _announce)

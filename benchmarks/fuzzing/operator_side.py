@@ -1,0 +1,349 @@
+"""Fuzzes what the operator's side reads: states, replies, the video, answers of the clock probe, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from benchmarks.fuzzing.mutation import Chance, Corpus
+from benchmarks.fuzzing.target import START, Bench, Target, expect, of, total
+
+from lavt.control.drive_controller import PRESETS, make_controller
+from lavt.control.limits import CLIENT_LIMITS
+from lavt.domain import (
+    NS_PER_MS,
+    NS_PER_S,
+    Command,
+    Lane,
+    NetemReply,
+    Picture,
+    SessionReply,
+    SessionRequest,
+    Sight,
+    State,
+)
+from lavt.errors import BadPacket
+from lavt.node import Send
+from lavt.nodes.client_session import ClientSession
+from lavt.nodes.clock_sync import ProbingClockSyncNode
+from lavt.nodes.driver import DriverNode
+from lavt.nodes.injection import InjectionClient
+from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.receiver import ReceiverNode
+from lavt.nodes.reports import PathToken, ReceivedUnit, View
+from lavt.streams import stream
+from lavt.transport.clock_probe import ProbeReply, decode_request, encode_reply
+from lavt.transport.extended_reports import ReferenceAnswer
+from lavt.transport.fec import RepairSender
+from lavt.transport.h264 import Decoder, Encoder
+from lavt.transport.injector import Injected
+from lavt.transport.messages import decode, encode
+from lavt.transport.netem import Flow, Law
+from lavt.transport.pictures import RenderedPicture, VideoReceiver
+from lavt.transport.reorder import ReorderBuffer
+from lavt.transport.rtcp import parse_feedback, sender_report
+from lavt.transport.rtp import Depacketizer, Packetizer
+from lavt.transport.stamp import (
+    STAMP_PX,
+    read_clear_stamp,
+    read_stamp,
+    rtp_timestamp,
+    stamp_agrees,
+    write_stamp,
+    write_stamp_luma,
+)
+from lavt.transport.video_path import PathClient, PathServer, is_path_datagram
+
+FRAME_NS = NS_PER_S // 30
+STEP_NS = NS_PER_MS
+ANEW = 2000
+"""A client that is told that it has lost the vehicle is started anew after so many inputs."""
+WIDTH_PX, HEIGHT_PX = 128, 96
+TOKEN = bytes(range(16))
+
+
+class AlwaysALane:
+    """Sees the same lane in whatever it is shown."""
+
+    def forget(self) -> None:
+        """Forget nothing."""
+
+    def detect(self, _picture: Sight) -> Lane:
+        """Give the lane."""
+        return Lane((0.3, 0.01, 0.001), 3.5, 3.6, 20.0, 1.0)
+
+
+def new_driver() -> DriverNode:
+    """Make a driver with the real controller and the real decoder."""
+    return DriverNode(
+        PictureReader(VideoReceiver(Decoder(), (HEIGHT_PX, WIDTH_PX))),
+        AlwaysALane(),
+        make_controller("lane_keeper", PRESETS["designed"], 2.8448),
+        ClientSession("alice", 7, rearm=True, start_ns=START.mono_ns, clear_stop=True),
+        CLIENT_LIMITS,
+    )
+
+
+def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG001 (there is no chance in it)
+    """States and replies: whatever they say, each command and query that is sent can be read by the vehicle.
+
+    After so many inputs a person stops the vehicle; None: never, but the client is started anew again and again, since
+    a state may tell it that it has lost the vehicle.
+    """
+    commands = modes = unreadable = 0
+
+    def hear(send: Send) -> None:
+        nonlocal commands, modes
+        if send.channel == "control":
+            command = decode(Command, send.payload)
+            commands += 1
+            modes += command.mode == "drive"
+        elif send.channel == "session":
+            decode(SessionRequest, send.payload)
+        elif send.channel == "path_token":
+            PathClient(send.payload.token)
+
+    bench = Bench(new_driver(), hear)
+    wall_ns = START.wall_ns
+    state = State(wall_ns, START.mono_ns, 8.0, 0.01, "drive", "driving", "armed by the client", 12, "", holder="alice")
+    stopped = replace(state, speed_mps=0.0, safety="safe_stop", refused="not the epoch in force", asked_by="bob")
+    reply = SessionReply(True, "", 2**63 + 1, TOKEN, 5600, "kernel", 0)
+    states = Corpus([encode(each) for each in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True)
+    replies = Corpus([encode(each) for each in (reply, SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns))],
+                     packed=True)  # fmt: skip
+    picture = RenderedPicture(np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8))
+    inputs = 0
+
+    def feed(channel: str, data: bytes, _chance: Chance) -> None:
+        nonlocal inputs, unreadable
+        inputs += 1
+        if stops_after is None and inputs % ANEW == 0:
+            unreadable = refused()
+            bench.node = new_driver()
+        bench.give(channel, data)
+        bench.go(STEP_NS)
+        if inputs % 33 == 0:
+            bench.give("view", View(bench.now.wall_ns, bench.now.wall_ns, picture))
+        if inputs == stops_after:
+            bench.give("operator", "emergency_stop")
+
+    def refused() -> int:
+        return unreadable + total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
+
+    def finish() -> str:
+        expect(inputs < 1000 or commands > 0, "the driver said nothing")
+        return f"{commands} commands, {modes} of them to drive"
+
+    return Target({"state": states, "session_reply": replies}, feed, refused, finish)
+
+
+def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
+    """Answers to queries for the network's condition: each is in force or is not, in words."""
+    node = InjectionClient(
+        "alice", 7, condition="L4", control=Flow("control", "udp", 7448, "destination", Law(75.0)), video=Law(150.0),
+        state_delay_ms=0.0, start_ns=START.mono_ns,
+    )  # fmt: skip
+    bench = Bench(node)
+    inputs = told = 0
+
+    def feed(channel: str, data: bytes, _chance: Chance) -> None:
+        nonlocal inputs, told
+        inputs += 1
+        told += len(of(bench.give(channel, data), "condition_in_force"))
+        bench.go(STEP_NS)
+        if inputs % 500 == 0:
+            bench.give("injected", Injected(1, "", "", (("control", 75.1),)))
+
+    def refused() -> int:
+        return node.counts["netem_replies_unreadable"]
+
+    def finish() -> str:
+        expect(told + refused() == inputs, "replies were lost")
+        return f"{told} told to the driver"
+
+    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob holds the vehicle"))], packed=True)
+    return Target({"netem_reply": corpus}, feed, refused, finish)
+
+
+def units(seed: int, number: int) -> list[tuple[int, bytes]]:
+    """Give access units of small noisy pictures, each with its stamp; a keyframe every ten."""
+    encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=10)
+    generator = stream(seed, "fuzz pictures")
+    made = []
+    for frame in range(number):
+        picture: Picture = generator.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+        stamp_ns = START.wall_ns + frame * FRAME_NS
+        write_stamp(picture, stamp_ns)
+        made.append((stamp_ns, encoder.encode(picture)))
+    return made
+
+
+HEADER = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
+"""Fields of an RTP packet, and the first ones of its payload."""
+
+
+def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
+    """Datagrams of a stream of another sender's, and of one with the true one's name: media, repair, RTCP."""
+    media, repair = [], []
+    for stray in (Packetizer(99, 5), Packetizer(77, 65_100)):
+        frames = [stray.packetize(unit, 3000 * each) for each, unit in enumerate(encoded)]
+        media += [datagram for frame in frames for datagram in frame]
+        repair += RepairSender(98, 0).repair(frames[0], 2)
+    answered = [ReferenceAnswer(0x4C415654, 12345, NS_PER_MS)]
+    reports = [
+        sender_report(77, wall_ns=START.wall_ns, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=each)
+        for each in ([], answered)
+    ]
+    server = PathServer(lambda: bytes(32))
+    server.set_token(TOKEN)
+    challenge = server.receive(PathClient(TOKEN).hello(0), ("198.51.100.2", 4000), START.mono_ns) or b""
+    words = tuple((at, 4) for at in range(4, 64, 4))
+    return {
+        "rtp": Corpus(media, fields=HEADER),
+        "repair": Corpus(repair, fields=(*HEADER, (16, 4), (20, 2), (22, 1), (23, 1))),
+        "rtcp": Corpus([*reports, challenge], fields=((0, 1), (1, 1), (2, 2), *words)),
+    }
+
+
+def video(seed: int) -> Target:
+    """Datagrams at the client's video port, a true stream among them: what is reported can be read by the sender."""
+    node = ReceiverNode(ReorderBuffer(), Depacketizer(), 2_000_000)
+    shown = whole = inputs = frame = 0
+
+    def hear(send: Send) -> None:
+        nonlocal shown, whole
+        if send.channel == "feedback" and not is_path_datagram(send.payload):
+            parse_feedback(send.payload)
+        elif send.channel == "access_unit":
+            shown += 1
+            whole += send.payload.complete
+
+    bench = Bench(node, hear)
+    bench.give("path_token", PathToken(TOKEN, 5600))
+    packetizer, repairs = Packetizer(77, 65_000), RepairSender(78, 0)
+    encoded = [unit for _, unit in units(seed, 30)]
+    corpora = video_corpora(encoded[:10])
+
+    def true_frame() -> None:
+        """Of every second frame the first packet is lost."""
+        nonlocal frame
+        datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
+        protecting = repairs.repair(datagrams, frame % 3)
+        corpora["rtp"].heard.extend(datagrams)
+        corpora["repair"].heard.extend(protecting)
+        for datagram in (*datagrams[frame % 2 :], *protecting):
+            bench.give("rtp", datagram)
+        frame += 1
+
+    def feed(_channel: str, data: bytes, _chance: Chance) -> None:
+        nonlocal inputs
+        inputs += 1
+        bench.give("rtp", data)
+        bench.go(STEP_NS)
+        if inputs % 33 == 0:
+            true_frame()
+
+    def refused() -> int:
+        unreadable = total(node.counts, "packets_unreadable", "challenges_unreadable")
+        return unreadable + total(node.counts, "repair_malformed", "payloads_malformed")
+
+    def finish() -> str:
+        recovered = node.counts["packets_recovered"]
+        return f"{shown} access units, {whole} whole, {recovered} packets made again"
+
+    return Target(corpora, feed, refused, finish)
+
+
+def pictures(seed: int) -> Target:
+    """Access units into the decoder: no picture is shown whose stamp is not the one that its packets say."""
+    node = new_driver()
+    bench = Bench(node)
+    true_units = units(seed, 40)
+    corpus = Corpus([unit for _, unit in true_units], fields=tuple((at, 1) for at in range(64)))
+    inputs = views = 0
+
+    def decoded(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[View]:
+        unit = ReceivedUnit(data, rtp_timestamp(stamp_ns), complete, complete, bench.now.mono_ns)
+        shown: Sequence[View] = of(bench.give("access_unit", unit), "view")
+        for view in shown:
+            expect(stamp_agrees(view.stamp_ns, unit.rtp_timestamp), "a picture was shown with another's stamp")
+        return shown
+
+    def feed(_channel: str, data: bytes, chance: Chance) -> None:
+        nonlocal inputs, views
+        inputs += 1
+        decoded(data, chance.choice(true_units)[0], complete=bool(chance.below(2)))
+        bench.go(STEP_NS)
+        if inputs % 20 == 0:
+            views += sum(len(decoded(unit, stamp_ns, complete=True)) for stamp_ns, unit in true_units[:2])
+
+    def finish() -> str:
+        expect(inputs < 1000 or views > 0, "no true picture was shown")
+        return f"{views} of {inputs // 20 * 2} true pictures shown"
+
+    return Target({"access_unit": corpus}, feed, lambda: node.counts["frames_unreadable"], finish)
+
+
+def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
+    """Answers to probes of the clock: each request is answered once at most."""
+    node = ProbingClockSyncNode(START.mono_ns)
+    corpus = Corpus(
+        [
+            encode_reply(ProbeReply(each, START.wall_ns, START.wall_ns + 5, START.wall_ns + 9, 0.1, 0.2))
+            for each in range(8)
+        ],
+        fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
+    )
+    asked = taken = inputs = 0
+
+    def hear(send: Send) -> None:
+        nonlocal asked, taken
+        taken += send.channel == "clock_probe"
+        if send.channel == "probe_request":
+            asked += 1
+            sequence, sent_wall_ns = decode_request(send.payload)
+            corpus.heard.append(
+                encode_reply(ProbeReply(sequence, sent_wall_ns, sent_wall_ns + 5, sent_wall_ns + 9, None, None))
+            )
+
+    bench = Bench(node, hear)
+
+    def feed(channel: str, data: bytes, _chance: Chance) -> None:
+        nonlocal inputs
+        inputs += 1
+        bench.give(channel, data)
+        bench.go(STEP_NS)
+
+    def finish() -> str:
+        expect(taken <= asked, "a request was answered twice")
+        expect(taken + node.counts["probes_refused"] == inputs, "answers were lost")
+        return f"{taken} of {asked} probes answered"
+
+    return Target({"probe_reply": corpus}, feed, lambda: node.counts["probes_refused"], finish)
+
+
+def stamps(seed: int) -> Target:
+    """Planes of any shape with the remains of a stamp: what is read is a number of 64 bits."""
+    generator = stream(seed, "fuzz planes")
+    planes = []
+    for each in range(16):
+        luma = generator.integers(0, 256, (STAMP_PX, STAMP_PX), dtype=np.uint8)
+        write_stamp_luma(luma, START.wall_ns + each)
+        planes.append(bytes((STAMP_PX, STAMP_PX)) + luma.tobytes())
+    refusals = 0
+
+    def feed(_channel: str, data: bytes, _chance: Chance) -> None:
+        nonlocal refusals
+        sides = (data[0], data[1]) if len(data) > 1 else (0, 0)
+        pixels = np.frombuffer(data[2:], np.uint8)
+        whole = sides[0] * sides[1] > 0 and pixels.size >= sides[0] * sides[1]
+        luma = pixels[: sides[0] * sides[1]].reshape(sides) if whole else pixels
+        for read in (read_stamp, read_clear_stamp):
+            try:
+                expect(0 <= read(luma) < 2**64, "a stamp of more than 64 bits")
+            except BadPacket:
+                refusals += 1
+
+    corpus = Corpus(planes, fields=((0, 1), (1, 1), (2, 8)))
+    return Target({"luma": corpus}, feed, lambda: refusals)

@@ -1,0 +1,105 @@
+"""Measures how much later a video's packets arrive that go through `lavt rendezvous`, on the loopback of one machine.
+
+    python benchmarks/rendezvous.py [--seconds 20]
+
+Pictures of 14 packets of 1216 bytes, 30 a second (4 Mbit/s), go from a socket that has registered as the vehicle to a
+client's: straight, and through the process, in turns. A packet's time is from its sending to its arrival by the
+kernel's stamp. So what is told is the work of the machine in between; the way to it and on is the network's.
+Prints a row for each; last, one line of JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import struct
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from lavt.cli.console import take_precedence
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US
+from lavt.experiment.processes import Processes
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
+from lavt.transport.rendezvous import REGISTER_EVERY_NS, Address, wrap, write_registration
+from lavt.transport.video_path import PathClient
+
+HERE = "127.0.0.1"
+PACKETS, PACKET_BYTES, RATE_HZ = 14, 1216, 30
+WAIT_S = 1.0
+CHANGES = (f"bind={HERE}", "video_port=0", "probe_port=0")
+PERCENTILES = (50, 95, 99)
+
+
+class Ends:
+    """The sockets of the vehicle and of a client, with a rendezvous between them."""
+
+    def __init__(self, vehicle: socket.socket, client: socket.socket, between: Address) -> None:
+        self._clock = MachineClock()
+        self._vehicle, self._client, self._between = vehicle, client, between
+        want_arrival_times(client)
+        for each in (vehicle, client):
+            each.bind((HERE, 0))
+            each.settimeout(WAIT_S)
+        self._registered_ns = 0
+
+    def meet(self) -> None:
+        """Register, and let the client ask: it is answered from now on."""
+        now = self._clock.now()
+        if now.mono_ns - self._registered_ns < REGISTER_EVERY_NS:
+            return
+        self._registered_ns = now.mono_ns
+        self._vehicle.sendto(write_registration("vehicle-1", "video", now.wall_ns, None), self._between)
+        self._client.sendto(PathClient(bytes(16)).hello(0), self._between)
+        self._vehicle.recv(2000)
+
+    def picture(self, *, through: bool) -> list[int]:
+        """Send a picture, and tell how long each of its packets took, in nanoseconds."""
+        client = self._client.getsockname()
+        for number in range(PACKETS):
+            packet = struct.pack(">Bq", number, self._clock.now().wall_ns).ljust(PACKET_BYTES, b"\0")
+            self._vehicle.sendto(wrap(client, packet) if through else packet, self._between if through else client)
+        return [self._took_ns() for _ in range(PACKETS)]
+
+    def _took_ns(self) -> int:
+        packet, ancillary, _flags, _sender = self._client.recvmsg(2000, ANCILLARY_BYTES)
+        return arrival(ancillary, self._clock.now()).wall_ns - int(struct.unpack_from(">xq", packet)[0])
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
+    take_precedence()
+    took_ns: dict[str, list[int]] = {"straight": [], "through": []}
+    config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
+    sets = [word for change in CHANGES for word in ("--set", change)]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Processes(Path(folder)) as processes,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
+    ):
+        port = processes.start("rendezvous", "rendezvous", str(config), *sets).ready()["ready"]["video_port"]
+        ends = Ends(vehicle, client, (HERE, port))
+        for number in range(pictures):
+            ends.meet()
+            way = ("straight", "through")[number % 2]
+            took_ns[way] += ends.picture(through=way == "through")
+            pause(NS_PER_S // RATE_HZ - NS_PER_MS)
+    told = {
+        way: {f"p{each}": round(float(np.percentile(times_ns, each)) / NS_PER_US, 1) for each in PERCENTILES}
+        for way, times_ns in took_ns.items()
+    }
+    for way, percentiles in told.items():
+        print(f"{way:>8}  " + "  ".join(f"{name} {us:7.1f} us" for name, us in percentiles.items()))
+    print(json.dumps({"us": told, "pictures": pictures, "python": sys.version.split()[0]}))
+
+
+if __name__ == "__main__":
+    main()

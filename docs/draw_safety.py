@@ -1,0 +1,12 @@
+"""Draws the marked blocks of docs/safety.md anew, from the code: python docs/draw_safety.py."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lavt.control.safety_page import drawn
+
+PAGE = Path(__file__).with_name("safety.md")
+
+if __name__ == "__main__":
+    PAGE.write_text(drawn(PAGE.read_text()))

@@ -1,0 +1,239 @@
+"""`lavt doctor`: whether a machine, or a pair, is fit for driving, and what to do about what is not."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import lavt
+from lavt.build.by_wire import listen
+from lavt.build.cameras import client_camera
+from lavt.cli import console, examine
+from lavt.cli.clock import probe
+from lavt.cli.router import find
+from lavt.clock import MachineClock
+from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
+from lavt.config_file import load_config, read_yaml, split_change
+from lavt.domain import NS_PER_S
+from lavt.errors import LavtError, UserError
+from lavt.experiment import checkup
+from lavt.experiment.checkup import Check
+from lavt.experiment.clock_check import compare
+from lavt.transport.clock_offset import ClockReport
+from lavt.transport.udp_link import look_up
+from lavt.transport.zenoh_link import ZenohLink, quiet_logs
+
+PROBING_NS = NS_PER_S
+LISTEN_NS = NS_PER_S
+"""A kit's slowest report comes each 0.1 s."""
+WHO = "doctor"
+EVERYWHERE = "0.0.0.0"  # noqa: S104 (compared with, not bound)
+Settings = ServerConfig | ClientConfig
+CLIENT_ONLY = {*(ClientConfig.model_fields.keys() - ServerConfig.model_fields.keys()), "video.server"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("doctor")(doctor)
+
+
+def doctor(
+    config: Annotated[
+        Path | None, typer.Argument(help="A server or client config; without one this machine alone is looked at.")
+    ] = None,
+    changes: console.Set = None,
+    as_json: console.Json = False,
+) -> None:
+    """Look at this machine and, with a config, at its side and the peer; ends with 1 where there is a problem.
+
+    With a client's config the vehicle's side is asked too; nobody takes the vehicle, and nothing is changed.
+
+    Example: lavt doctor configs/client.yaml --set video.server=192.0.2.7
+    """
+    console.keep_stdout_for_results()
+    console.take_precedence()
+    if config is None and changes:
+        raise UserError("--set changes a config: name one before it")
+    settings = None if config is None else _load(config, changes or [])
+    quiet_logs()
+    checks = []
+    for check in _checks(settings, MachineClock()):
+        checks.append(check)
+        if not as_json:
+            _show(check)
+    problems = sum(check.verdict == "problem" for check in checks)
+    if as_json:
+        console.show_json({"good": problems == 0, "checks": [asdict(check) for check in checks]})
+    if problems:
+        raise typer.Exit(1)
+
+
+def _load(path: Path, changes: list[str]) -> Settings:
+    """Read a config: a client's where it has what only a client's has, else a server's."""
+    data = read_yaml(path)
+    video = data.get("video")
+    keys = {*data, *(f"video.{key}" for key in (video if isinstance(video, dict) else {}))}
+    for parts, _ in map(split_change, changes):
+        keys |= {parts[0], ".".join(parts[:2])}
+    if keys & CLIENT_ONLY:
+        return load_config(ClientConfig, path, changes)
+    return load_config(ServerConfig, path, changes)
+
+
+def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
+    config = ServerConfig() if settings is None else settings
+    yield from _machine(config, "" if settings is None else _side(settings), clock)
+    report = examine.clock_report(config.clock, clock)
+    yield checkup.check_clock(report)
+    yield checkup.check_netem(examine.netem_refusal(config.injection.interface), config.injection.interface)
+    if settings is None:
+        return
+    yield from _security(settings, clock)
+    if isinstance(settings, ServerConfig):
+        if settings.camera.source == "device":
+            yield _camera(settings, clock)
+        if settings.vehicle.kind == "dbw" and not settings.vehicle.dbw.is_inside:
+            yield _by_wire(settings, clock)
+        yield from _ports(settings, clock)
+        yield from _zenoh(settings, clock)
+    else:
+        yield from _zenoh(settings, clock)
+        yield _probe(settings, report, clock)
+        yield checkup.check_video(settings.video.server, settings.video.port)
+
+
+def _side(settings: Settings) -> str:
+    return "client" if isinstance(settings, ClientConfig) else "server"
+
+
+def _machine(config: Settings, side: str, clock: MachineClock) -> Iterator[Check]:
+    found, requirements = examine.packages()
+    yield checkup.check_versions(platform.python_version(), found, requirements)
+    yield _codec(config, side, clock)
+    yield checkup.check_buffer(examine.receive_buffer_bytes())
+    yield checkup.check_arrival(examine.arrivals_are_stamped())
+    yield checkup.check_timer(*examine.timer(clock))
+    yield checkup.check_precedence(examine.niceness())
+    yield checkup.check_governor(examine.governors())
+
+
+def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
+    """Time the codec at the config's own settings; what a client does not know of the video is as shipped."""
+    server = config if isinstance(config, ServerConfig) else _as_sent(config)
+    size = f"{server.camera.width_px}x{server.camera.height_px}"
+    try:
+        times = examine.codec_times(server, clock)
+    except (LavtError, OSError, ValueError) as error:  # PyAV's own errors are both of these
+        do = "see that PyAV has libx264 (`pip install --force-reinstall av`), and that the camera's size is possible"
+        return Check("processor", "problem", f"pictures of {size} cannot be encoded and decoded here: {error}", do)
+    cores = len(os.sched_getaffinity(0))
+    return checkup.check_codec(times, size=size, rate_hz=server.camera.rate_hz, side=side, cores=cores)
+
+
+def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
+    camera = settings.camera
+    size = f"{camera.width_px}x{camera.height_px}"
+    seen = examine.camera_seen(settings, clock)
+    return checkup.check_camera(seen, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
+
+
+def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
+    bus = f"{settings.vehicle.dbw.interface} {settings.vehicle.dbw.channel}"
+    try:
+        heard, hindrance = listen(settings.vehicle, clock, LISTEN_NS)
+    except UserError as error:
+        heard, hindrance = 0, str(error)
+    return checkup.check_by_wire(heard, hindrance, name=bus)
+
+
+def _as_sent(config: ClientConfig) -> ServerConfig:
+    camera = client_camera(config.camera)
+    return ServerConfig(
+        camera=ServerCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=config.camera.rate_hz)
+    )
+
+
+def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
+    files = examine.key_files(settings.security)
+    yield checkup.check_plain(bool(files))
+    for key, path, private in files:
+        refusal, mode = examine.file_state(path)
+        yield checkup.check_key_file(key, path, refusal=refusal, mode=mode, private=private)
+    refusal = examine.keys_refusal(settings)
+    if refusal:
+        yield Check("keys", "problem", refusal, "copy what `lavt keys` made for this machine (docs/deployment.md)")
+    for folder in sorted({path.parent for _, path, _ in files}):
+        for path, days_left in examine.certificates(folder, clock.now().wall_ns):
+            yield checkup.check_certificate(path, days_left)
+
+
+def _ports(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
+    host, probe_port = settings.video.bind, settings.clock.probe_port
+    ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
+    refusals = {key: examine.bind_refusal(host, port) for _, key, port in ports}
+    served = False
+    if any(refusals.values()) and probe_port:
+        served = bool(probe(clock, "127.0.0.1" if host == EVERYWHERE else host, probe_port, PROBING_NS // 10)[0])
+    for name, key, port in ports:
+        yield checkup.check_port(name, key, host, port, refusal=refusals[key], served=served)
+
+
+def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
+    endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
+    if examine.keys_refusal(settings):
+        yield Check("router", "not checked", "the keys must be put right before")
+        return
+    listener = examine.Listener(settings)
+    try:
+        link = ZenohLink(
+            clock,
+            listener.let_in,
+            side="client",
+            path=find(Path(settings.zenoh.session)),
+            router=settings.zenoh.router,
+            vehicle=settings.vehicle_id,
+            who=WHO,
+        )
+    except UserError as error:
+        yield checkup.check_router(endpoint, str(error))
+        return
+    with closing(link):
+        yield checkup.check_router(endpoint, "")
+        if isinstance(settings, ServerConfig):
+            yield checkup.check_link(link.routers(), heard=False)
+            return
+        heard = listener.hear(link, clock)
+        yield checkup.check_vehicle(heard, settings.vehicle_id, lavt.__version__)
+        yield checkup.check_link(link.routers(), heard=bool(heard.states or heard.unreadable))
+
+
+def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClock) -> Check:
+    host, port = settings.video.server, settings.clock.probe_port
+    try:
+        address = look_up("video.server", host)
+    except UserError as error:
+        return Check("clock probe", "problem", str(error), "put the vehicle's address into video.server")
+    probes, latest = probe(clock, address, port, PROBING_NS)
+    report = examine.clock_report(settings.clock, clock)
+    if latest is None or report is None:
+        return checkup.check_probe(None, host, port)
+    return checkup.check_probe(compare(before or report, report, probes, latest, address), host, port)
+
+
+def _show(check: Check) -> None:
+    """Print one line for a program; for a person fold what is long."""
+    indent = " " * 30
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 10**6
+    lines = [check.found, *([f"-> {check.do}"] if check.do else [])]
+    folded = [part for line in lines for part in textwrap.wrap(line, max(30, width - len(indent)))]
+    console.show(f"{check.verdict:<12}{check.name:<17} " + f"\n{indent}".join(folded))

@@ -1,0 +1,213 @@
+"""A test authority, the certificates it signs for routers (X.509, EC P-256), and keys for signatures (Ed25519).
+
+All is PEM: certificates, private keys as PKCS 8 without a password, public keys as SubjectPublicKeyInfo. Access lists
+of Zenoh see the common name (CN) of a certificate. Only those that are dialled get the addresses at which they are, and
+may stand as servers: an operator's stolen key cannot play the vehicle's router.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Iterable
+from typing import Final, TypeVar
+
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from lavt.clock import calendar_time
+from lavt.domain import NS_PER_S
+from lavt.errors import UserError
+from lavt.value import value
+
+NS_PER_DAY: Final = 86_400 * NS_PER_S
+CLOCKS_DIFFER_NS: Final = NS_PER_DAY
+"""Certificates hold from so long ago: the clock of a vehicle that just started may be behind."""
+AUTHORITY: Final = "lavt test authority"
+LOOPBACK: Final = ("127.0.0.1", "localhost")
+_LABEL: Final = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST: Final = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\Z")
+Kind = TypeVar("Kind", bound=x509.ExtensionType)
+
+
+@value
+class Pair:
+    """A private key, and what may be shown of it: a certificate, or a public key. Both PEM."""
+
+    private: bytes
+    shown: bytes
+
+
+@value
+class Described:
+    """What a certificate says."""
+
+    name: str
+    role: str
+    hosts: tuple[str, ...]
+    """Where it may be dialled; empty where it never is."""
+    expires: str
+    """Day, as 2027-01-31 (UTC)."""
+
+
+def new_authority(now_wall_ns: int, days: int) -> Pair:
+    """Make an authority that signs itself and holds for `days`; it can sign certificates, but no other authority."""
+    key = generate_private_key(SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, AUTHORITY)])
+    builder = (
+        _builder(name, name, key, now_wall_ns)
+        .not_valid_after(calendar_time(now_wall_ns + days * NS_PER_DAY))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_key_usage(authority=True), critical=True)
+    )
+    return Pair(_private(key), _certificate(builder.sign(key, hashes.SHA256())))
+
+
+def new_certificate(
+    authority: Pair, name: str, role: str, *, dialled_at: Iterable[str] | None, now_wall_ns: int, days: int
+) -> Pair:
+    """Make a key and its certificate for `name`, which is the CN; the role is its organizational unit (OU).
+
+    `dialled_at` are the addresses and host names beside the loopback's; None: it is never dialled. It holds for
+    `days`, but not longer than the authority. Raises `UserError` for an authority that cannot be read or has expired.
+    """
+    issuer, issuer_key = _authority(authority)
+    begins, ends = calendar_time(now_wall_ns), issuer.not_valid_after_utc
+    if ends <= begins:
+        raise UserError(f"the authority expired on {_day(issuer)}: make a new one, in another directory")
+    key = generate_private_key(SECP256R1())
+    subject = x509.Name(
+        [x509.NameAttribute(NameOID.COMMON_NAME, name), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role)]
+    )
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([] if dialled_at is None else [ExtendedKeyUsageOID.SERVER_AUTH])
+    hosts = [name] if dialled_at is None else [name, *LOOPBACK, *dialled_at]
+    builder = (
+        _builder(subject, issuer.subject, key, now_wall_ns)
+        .not_valid_after(min(calendar_time(now_wall_ns + days * NS_PER_DAY), ends))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_key_usage(authority=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([_general_name(host) for host in dict.fromkeys(hosts)]), critical=False
+        )
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()), critical=False)
+    )
+    return Pair(_private(key), _certificate(builder.sign(issuer_key, hashes.SHA256())))
+
+
+def new_signing_pair() -> Pair:
+    """Make a key to sign with and the public key that others check it by (Ed25519)."""
+    key = Ed25519PrivateKey.generate()
+    public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    return Pair(_private(key), public)
+
+
+def described(certificate: bytes, where: str) -> Described:
+    """Read what a certificate says; raises `UserError`, which says `where` it is, for bytes that are none."""
+    read = _read(certificate, where)
+    server = _extension(read, x509.ExtendedKeyUsage)
+    dialled = server is not None and ExtendedKeyUsageOID.SERVER_AUTH in server
+    names = _extension(read, x509.SubjectAlternativeName) if dialled else None
+    return Described(
+        name=_subject(read, NameOID.COMMON_NAME),
+        role=_subject(read, NameOID.ORGANIZATIONAL_UNIT_NAME),
+        hosts=tuple(str(each.value) for each in names or ()),
+        expires=_day(read),
+    )
+
+
+def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
+    """Tell for how many days a certificate holds from now on, negative where it has ended; errors as `described`."""
+    return _read(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY - now_wall_ns / NS_PER_DAY
+
+
+def is_host(text: str) -> bool:
+    """Whether it is an IP address or a host name, without a port."""
+    return _address(text) is not None or _HOST.match(text) is not None
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: EllipticCurvePrivateKey, now_wall_ns: int
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(calendar_time(now_wall_ns - CLOCKS_DIFFER_NS))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _key_usage(*, authority: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=authority,
+        crl_sign=authority,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(text)
+    except ValueError:
+        return None
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    address = _address(host)
+    return x509.DNSName(host) if address is None else x509.IPAddress(address)
+
+
+def _private(key: EllipticCurvePrivateKey | Ed25519PrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _certificate(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def _read(certificate: bytes, where: str) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(certificate)
+    except ValueError as error:
+        raise UserError(f"{where} is no certificate in PEM: copy it back, or move it away") from error
+
+
+def _authority(authority: Pair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
+    certificate = _read(authority.shown, "that of the authority")
+    try:
+        key = serialization.load_pem_private_key(authority.private, password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise UserError("the authority's key is no private key in PEM without a password") from error
+    if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise UserError("the authority's key is not that of its certificate")
+    return certificate, key
+
+
+def _day(certificate: x509.Certificate) -> str:
+    return certificate.not_valid_after_utc.strftime("%Y-%m-%d")
+
+
+def _subject(certificate: x509.Certificate, part: x509.ObjectIdentifier) -> str:
+    return next((str(each.value) for each in certificate.subject.get_attributes_for_oid(part)), "")
+
+
+def _extension(certificate: x509.Certificate, kind: type[Kind]) -> Kind | None:
+    try:
+        return certificate.extensions.get_extension_for_class(kind).value
+    except x509.ExtensionNotFound:
+        return None

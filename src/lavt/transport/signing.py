@@ -1,0 +1,144 @@
+"""Keys that say who somebody is (Ed25519), and secrets agreed on for one session (X25519, HKDF, AES-GCM).
+
+With `certificates.py` the only module that knows `cryptography`, which is an extra: who signs nothing does not need it.
+"""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from lavt.errors import UserError
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+SIGNATURE_BYTES: Final = 64
+PUBLIC_KEY_BYTES: Final = 32
+NONCE_BYTES: Final = 12
+SECRET_BYTES: Final = 32
+
+_INSTALL: Final = "signing needs the package cryptography: pip install 'lavt[secure]'"
+
+
+class PrivateKey:
+    """An Ed25519 key that signs (RFC 8032)."""
+
+    def __init__(self, key: Ed25519PrivateKey) -> None:
+        self._key = key
+
+    def sign(self, data: bytes) -> bytes:
+        """Sign `data`; the signature has 64 bytes."""
+        return self._key.sign(data)
+
+    @property
+    def public(self) -> PublicKey:
+        """What verifies its signatures."""
+        return PublicKey(self._key.public_key())
+
+
+class PublicKey:
+    """An Ed25519 key that verifies."""
+
+    def __init__(self, key: Ed25519PublicKey) -> None:
+        self._key = key
+
+    def verifies(self, signature: bytes, data: bytes) -> bool:
+        """Tell whether `signature` is that of `data`; anything else than a signature is not."""
+        from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 (an extra)
+
+        try:
+            self._key.verify(signature, data)
+        except InvalidSignature:
+            return False
+        return True
+
+
+def load_private(path: Path) -> PrivateKey:
+    """Read an Ed25519 private key (PEM, PKCS8); raises `UserError`, also for one that others may read."""
+    data = _read(path)
+    if path.stat().st_mode & 0o077:
+        raise UserError(f"others may read the private key {path}: chmod 600 it, and make new keys if they have")
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 (an extra)
+        from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415
+    except ImportError as error:
+        raise UserError(_INSTALL) from error
+    try:
+        key = load_pem_private_key(data, None)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise UserError(f"{path} is not a private key: give a NAME.sign.key that `lavt keys` has made") from error
+    if not isinstance(key, ed25519.Ed25519PrivateKey):
+        raise UserError(f"{path} is a key of another kind than Ed25519: give a NAME.sign.key that `lavt keys` has made")
+    return PrivateKey(key)
+
+
+def load_public(path: Path) -> PublicKey:
+    """Read an Ed25519 public key (PEM); raises `UserError`."""
+    data = _read(path)
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 (an extra)
+        from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
+        from cryptography.hazmat.primitives.serialization import load_pem_public_key  # noqa: PLC0415
+    except ImportError as error:
+        raise UserError(_INSTALL) from error
+    try:
+        key = load_pem_public_key(data)
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise UserError(f"{path} is not a public key: give a NAME.sign.pub that `lavt keys` has made") from error
+    if not isinstance(key, ed25519.Ed25519PublicKey):
+        raise UserError(f"{path} is a key of another kind than Ed25519: give a NAME.sign.pub that `lavt keys` has made")
+    return PublicKey(key)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"the key {path} cannot be read ({error.strerror}): make keys with `lavt keys DIR`") from error
+
+
+class Agreement:
+    """One end of an agreement on a secret that nobody in between learns (X25519, RFC 7748); used for one session."""
+
+    def __init__(self) -> None:
+        from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey  # noqa: PLC0415 (an extra)
+
+        self._key = X25519PrivateKey.generate()
+        self.public = self._key.public_key().public_bytes_raw()
+
+    def secret(self, other: bytes, context: bytes) -> bytes | None:
+        """Give the 32 bytes shared with whoever has the public key `other`; None where that is no key.
+
+        `context` is what both ends know: another one gives another secret (HKDF-SHA256, RFC 5869).
+        """
+        from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey  # noqa: PLC0415 (an extra)
+        from cryptography.hazmat.primitives.hashes import SHA256  # noqa: PLC0415
+        from cryptography.hazmat.primitives.kdf.hkdf import HKDF  # noqa: PLC0415
+
+        try:
+            shared = self._key.exchange(X25519PublicKey.from_public_bytes(other))
+        except ValueError:  # of another length, or a point that gives the same secret to everybody
+            return None
+        return HKDF(SHA256(), SECRET_BYTES, None, context).derive(shared)
+
+
+def encrypt(secret: bytes, text: bytes, context: bytes) -> bytes:
+    """Encrypt and authenticate `text` (AES-256-GCM): 12 bytes nonce, then as many as `text` has, and 16 more."""
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM  # noqa: PLC0415 (an extra)
+
+    nonce = secrets.token_bytes(NONCE_BYTES)
+    return nonce + AESGCM(secret).encrypt(nonce, text, context)
+
+
+def decrypt(secret: bytes, data: bytes, context: bytes) -> bytes | None:
+    """Undo `encrypt`; None for what is not authentic."""
+    from cryptography.exceptions import InvalidTag  # noqa: PLC0415 (an extra)
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM  # noqa: PLC0415
+
+    try:
+        return AESGCM(secret).decrypt(data[:NONCE_BYTES], data[NONCE_BYTES:], context)
+    except (InvalidTag, ValueError):
+        return None

@@ -1,0 +1,1 @@
+"""Drive-by-wire on CAN: messages and their CRC (`docs/can.md`)."""

@@ -1,0 +1,134 @@
+"""Who drives: which axes of a kit obey, why it lets go of them, and the watchdog that brakes then."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lavt.domain import NS_PER_MS
+from lavt.vehicle.software_car.generations import Generation
+from lavt.vehicle.software_car.state import AXES, Axis, KitState, Reason, System, SystemOrder
+
+COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
+"""An actuator disables itself this long after its last valid command; a request to enable is as old at most."""
+WATCHDOG_BRAKE: Final = 0.5
+"""Ours: how hard the watchdog brakes."""
+ENABLE, DISABLE = 1, 2
+PAUSED, REMOTE, CONTROL_ALLOWED = 1, 2, 3
+"""States of the remote's switch; 0 is its emergency stop."""
+
+
+class Authority:
+    """Decides over the axes of a kit's state; `settle` after whatever has changed.
+
+    Without `has_watchdog` nothing brakes by itself.
+    """
+
+    def __init__(self, state: KitState, generation: Generation, *, has_watchdog: bool) -> None:
+        self._state, self._generation, self.has_watchdog = state, generation, has_watchdog
+        self.hindrance = Reason.NONE
+        """Why generation 2 is not ready, if nothing in the state says so."""
+        self._system_count: int | None = None
+        self._asked_ns: int | None = None
+        """When the newest request to enable came, while they keep coming."""
+        self._is_asked, self._is_spent = False, False
+        """Whether the system is to become active; whether it was, so that requests have to begin anew."""
+
+    def request(self, order: SystemOrder, now_ns: int) -> None:
+        """Take generation 2's request to the system."""
+        if not order.is_valid or order.count == self._system_count:
+            return
+        self._system_count = order.count
+        if order.request == ENABLE:
+            self._asked_ns, self._is_asked = now_ns, not self._is_spent
+            return
+        self._asked_ns, self._is_asked, self._is_spent = None, False, False
+        if order.request == DISABLE and self._state.system == System.ACTIVE:
+            self.lose("steering", Reason.ASKED)
+
+    def live(self, now_ns: int) -> None:
+        """Forget a request to enable that is too old."""
+        if self._asked_ns is not None and self._asked_ns + COMMAND_TIMEOUT_NS <= now_ns:
+            self._asked_ns, self._is_asked, self._is_spent = None, False, False
+
+    def settle(self) -> None:
+        """Let go of what may be enabled no longer, enable what may be, and see what comes out."""
+        state = self._state
+        for axis in AXES:
+            if not state.actuators[axis].may_be_enabled:
+                self.lose(axis, Reason.FAULT if state.actuators[axis].faults else Reason.DISABLED)
+        state.not_ready = self._why_not_ready()
+        if state.not_ready != Reason.NONE and self._generation.is_one_system:
+            self.lose("steering", state.not_ready)
+        ready = [axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == Reason.NONE]
+        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_asked):
+            self._enable(ready)
+        state.system = self._system_state()
+        state.throttle, state.brake = self._pedals()
+
+    def _why_not_ready(self) -> Reason:
+        """Tell what hinders the kit as a whole."""
+        state = self._state
+        if state.watchdog != Reason.NONE or not self._generation.is_one_system:
+            return state.watchdog
+        if state.gear_faults or any(actuator.faults for actuator in state.actuators.values()):
+            return Reason.FAULT
+        if state.is_overridden:
+            return Reason.OVERRIDE
+        return Reason.REMOTE if state.remote_state <= PAUSED else self.hindrance
+
+    def _system_state(self) -> System:
+        if self._state.actuators["steering"].is_enabled:
+            return System.ACTIVE
+        if self._state.watchdog != Reason.NONE or self._state.not_ready == Reason.FAULT:
+            return System.FAULT
+        return System.READY if self._state.not_ready == Reason.NONE else System.MANUAL
+
+    def _enable(self, axes: list[Axis]) -> None:
+        for axis in axes:
+            if axis == "steering" and not self._state.actuators[axis].is_enabled:
+                self._state.held_rad = self._state.wheel_rad
+            self._state.actuators[axis].is_enabled = True
+
+    def lose(self, axis: Axis, reason: Reason) -> None:
+        """Let go of an enabled axis: with the watchdog's brakes, unless somebody wanted it or has taken over."""
+        state = self._state
+        if not state.actuators[axis].is_enabled:
+            return
+        is_wanted = reason in {Reason.ASKED, Reason.OVERRIDE} or (
+            reason == Reason.DISABLED
+            and (self._generation.is_one_system or (state.is_standing and not state.is_in_gear))
+        )
+        is_trip = self.has_watchdog and not is_wanted and not state.is_overridden
+        if is_trip:
+            state.watchdog, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
+        state.disengaged = reason
+        self._is_asked, self._is_spent = False, self._asked_ns is not None
+        for each in AXES if is_trip or self._generation.is_one_system else (axis,):
+            state.actuators[each].is_enabled = False
+            if each == "steering":
+                self._state.held_rad = state.wheel_rad
+
+    def override(self, axis: Axis) -> None:
+        """Latch that the driver has taken an axis over, and let go of it."""
+        self.lose(axis, Reason.OVERRIDE)
+        self._state.actuators[axis].is_overridden = True
+
+    def clear(self, axis: Axis) -> None:
+        """Forget overrides, once hands and feet are off, and the watchdog, once somebody has taken over."""
+        state = self._state
+        for each in AXES if self._generation.is_one_system else (axis,):
+            state.actuators[each].is_overridden &= state.actuators[each].driver_acts
+        if self._generation.is_one_system:  # its command for the gear has no such bit
+            state.is_gear_overridden = False
+        if not state.watchdog_brakes:
+            state.watchdog, state.watchdog_axis = Reason.NONE, None
+
+    def _pedals(self) -> tuple[float, float]:
+        """Give throttle and brake: the kit's and the driver's, whichever is more; without a gear nothing drives."""
+        state, asked = self._state, dict.fromkeys(AXES, 0.0)
+        for axis, actuator in state.actuators.items():
+            if actuator.is_enabled and actuator.order is not None:
+                asked[axis] = actuator.order.target
+        watchdog = WATCHDOG_BRAKE if state.watchdog_brakes else 0.0
+        throttle = max(asked["throttle"], state.driver_throttle) if state.is_in_gear else 0.0
+        return throttle, max(asked["brake"], state.driver_brake, watchdog)

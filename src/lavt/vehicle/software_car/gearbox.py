@@ -1,0 +1,36 @@
+"""The gearbox: it shifts, or says why not."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, KitState, Reject
+
+GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
+"""Ours: the simulator's car has no reverse and no low gear."""
+
+
+def shift(state: KitState, order: GearOrder) -> None:
+    """Shift, or say why not."""
+    if not order.is_valid:
+        return
+    if order.is_clearing:
+        state.is_gear_overridden = False
+    state.gear_order, state.gear_reject = order.gear, reject(state, order.gear)
+    if order.gear != Gear.NONE and state.gear_reject == Reject.NONE:
+        state.gear = Gear(order.gear)
+
+
+def reject(state: KitState, gear: int) -> Reject:
+    """Tell why a gear cannot be had now."""
+    if gear in {Gear.NONE, state.gear}:
+        return Reject.NONE
+    if state.gear_faults:
+        return Reject.FAULT
+    if state.is_gear_overridden:
+        return Reject.OVERRIDE
+    if gear not in GEARS:
+        return Reject.UNSUPPORTED
+    if state.brake < OVERRIDE_PEDAL or (gear == Gear.PARK and not state.is_standing):
+        return Reject.VEHICLE
+    return Reject.NONE

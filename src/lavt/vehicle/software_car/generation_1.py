@@ -1,0 +1,239 @@
+"""The messages of Dataspeed's generation 1, as a kit reads and writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.software_car.frames import Field, Layout, pack, unpack
+from lavt.vehicle.software_car.mechanics import (
+    Mechanics,
+    hundredths_of_kmh,
+    tenths_of_degree,
+    wheel_angle,
+    within,
+)
+from lavt.vehicle.software_car.state import AXES, Axis, GearOrder, KitState, Order, Reason, SystemOrder
+
+FULL_PEDAL = 65535
+FULL_TORQUE_NM = 3412
+UNKNOWN: Final = -0x8000
+CLEARING_LENGTH = 4
+"""A command of this length has no counter and asks only to clear."""
+
+PEDAL_COMMAND = (
+    Field("command", 0, 16),
+    Field("type", 20, 4),
+    Field("enable", 24, 1),
+    Field("clear", 25, 1),
+    Field("ignore", 26, 1),
+    Field("count", 56, 8),
+)
+STEERING_COMMAND = (
+    Field("command", 0, 16, is_signed=True),
+    Field("enable", 16, 1),
+    Field("clear", 17, 1),
+    Field("ignore", 18, 1),
+    Field("type", 23, 1),
+    Field("rate", 24, 8),
+    Field("count", 56, 8),
+)
+COMMANDS: dict[int, tuple[Axis, Layout]] = {
+    0x060: ("brake", Layout(8, PEDAL_COMMAND)),
+    0x062: ("throttle", Layout(8, PEDAL_COMMAND)),
+    0x064: ("steering", Layout(8, STEERING_COMMAND)),
+}
+GEAR_COMMAND_ID = 0x066
+GEAR_COMMAND = Layout(1, (Field("gear", 0, 3), Field("clear", 7, 1)))
+
+PEDAL_REPORT = (
+    Field("input", 0, 16),
+    Field("command", 16, 16),
+    Field("output", 32, 16),
+    Field("watchdog_source", 52, 4),
+    Field("enabled", 56, 1),
+    Field("override", 57, 1),
+    Field("driver", 58, 1),
+    Field("FLTWDC", 59, 1),
+    Field("FLT1", 60, 1),
+    Field("FLT2", 61, 1),
+    Field("FLTPWR", 62, 1),
+    Field("timeout", 63, 1),
+)
+BRAKE_REPORT = Layout(8, (*PEDAL_REPORT, Field("watchdog_brakes", 51, 1)))
+THROTTLE_REPORT = Layout(8, PEDAL_REPORT)
+STEERING_REPORT = Layout(
+    8,
+    (
+        Field("angle", 0, 16, is_signed=True),
+        Field("command", 16, 15, is_signed=True),
+        Field("is_torque", 31, 1),
+        Field("speed", 32, 16, is_signed=True),
+        Field("torque", 48, 8, is_signed=True),
+        Field("enabled", 56, 1),
+        Field("override", 57, 1),
+        Field("FLTPWR", 58, 1),
+        Field("FLTWDC", 59, 1),
+        Field("FLTBUS1", 60, 1),
+        Field("FLTBUS2", 61, 1),
+        Field("FLTCAL", 62, 1),
+        Field("timeout", 63, 1),
+    ),
+)
+GEAR_REPORT = Layout(
+    2,
+    (
+        Field("gear", 0, 3),
+        Field("override", 3, 1),
+        Field("command", 4, 3),
+        Field("FLTBUS", 7, 1),
+        Field("reject", 8, 3),
+        Field("ready", 15, 1),
+    ),
+)
+WHEEL_SPEEDS = Layout(8, tuple(Field(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
+
+FAULTS: dict[str, tuple[str, ...]] = {
+    "steering": ("FLTPWR", "FLTBUS1", "FLTBUS2", "FLTCAL"),
+    "brake": ("FLT1", "FLT2", "FLTPWR"),
+    "throttle": ("FLT1", "FLT2", "FLTPWR"),
+    "gear": ("FLTBUS",),
+}
+"""Faults of each part, by the bit that reports them; FLTWDC is the watchdog's own."""
+
+PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
+"""From where to where a pedal goes, as a fraction of its number (CMD_TYPE 1)."""
+
+SOURCES: dict[tuple[Axis, Reason], int] = {
+    (axis, reason): 1 + 4 * place + kind
+    for place, axis in enumerate(AXES)
+    for kind, reason in enumerate((Reason.COUNTER, Reason.DISABLED, Reason.TIMEOUT, Reason.FAULT))
+}
+"""Numbers of the watchdog's sources, 1 to 15: the facts give the range and the kinds, the numbers are ours."""
+
+
+def pedal_fraction(axis: Axis, kind: int, command: int, mechanics: Mechanics) -> float | None:
+    """Give how much of a pedal a command asks for; None for a type that the kit has not."""
+    if kind == 1:
+        released, full = PEDAL_TRAVEL[axis]
+        return within((command / FULL_PEDAL - released) / (full - released), 0.0, 1.0)
+    if kind == 2:
+        return command / FULL_PEDAL
+    if axis == "brake" and kind == 3:
+        return within(command / FULL_TORQUE_NM, 0.0, 1.0)
+    if axis == "brake" and kind == 6:
+        return within(min(command * 0.001, 10.0) / mechanics.max_braking_mps2, 0.0, 1.0)
+    return None
+
+
+def read(frame: Frame, mechanics: Mechanics, _: bool) -> Order | GearOrder | SystemOrder | None:
+    """Give what a frame orders; None for one that is not for the kit."""
+    if frame.is_extended:
+        return None
+    if frame.identifier == GEAR_COMMAND_ID and len(frame.data) == GEAR_COMMAND.length:
+        asked = unpack(GEAR_COMMAND, frame.data)
+        return GearOrder(is_valid=True, gear=asked["gear"], is_clearing=bool(asked["clear"]))
+    if frame.identifier not in COMMANDS:
+        return None
+    axis, layout = COMMANDS[frame.identifier]
+    if len(frame.data) == CLEARING_LENGTH:
+        asked = unpack(layout, frame.data + bytes(layout.length - CLEARING_LENGTH))
+        return Order(axis, is_valid=True, is_clearing=bool(asked["clear"]))
+    if len(frame.data) != layout.length:
+        return None
+    asked = unpack(layout, frame.data)
+    target: float | None
+    if axis == "steering":
+        target = wheel_angle(asked["command"]) if asked["type"] == 0 else None
+    else:
+        target = pedal_fraction(axis, asked["type"], asked["command"], mechanics)
+    return Order(
+        axis,
+        is_valid=True,
+        target=target or 0.0,
+        is_enabling=bool(asked["enable"]) and target is not None,
+        is_clearing=bool(asked["clear"]),
+        ignores_driver=bool(asked["ignore"]),
+        rate_radps=mechanics.rate_radps(asked.get("rate", 0), mechanics.steering_rate_step_deg),
+        count=asked["count"],
+    )
+
+
+def flags(state: KitState, axis: Axis) -> dict[str, int]:
+    """Give the bits that all three axes report."""
+    actuator = state.actuators[axis]
+    return {
+        "enabled": actuator.is_enabled,
+        "override": actuator.is_overridden,
+        "FLTWDC": state.watchdog != Reason.NONE,
+        "timeout": actuator.has_timed_out,
+        **dict.fromkeys(actuator.faults, 1),
+    }
+
+
+def pedal(state: KitState, axis: Axis, driver: float, output: float) -> dict[str, int]:
+    """Give what the reports of both pedals have in common."""
+    actuator = state.actuators[axis]
+    source = SOURCES.get((state.watchdog_axis, state.watchdog), 0) if state.watchdog_axis else 0
+    return {
+        "input": round(driver * FULL_PEDAL),
+        "command": round(actuator.order.target * FULL_PEDAL) if actuator.order else 0,
+        "output": round(output * FULL_PEDAL),
+        "watchdog_source": source,
+        "driver": actuator.driver_acts,
+        **flags(state, axis),
+    }
+
+
+def brake_report(state: KitState, _: Mechanics) -> bytes:
+    """Tell about the brake."""
+    values = pedal(state, "brake", state.driver_brake, state.brake)
+    return pack(BRAKE_REPORT, values | {"watchdog_brakes": state.watchdog_brakes})
+
+
+def throttle_report(state: KitState, _: Mechanics) -> bytes:
+    """Tell about the throttle."""
+    return pack(THROTTLE_REPORT, pedal(state, "throttle", state.driver_throttle, state.throttle))
+
+
+def steering_report(state: KitState, _: Mechanics) -> bytes:
+    """Tell about the steering wheel, and the car's speed."""
+    order = state.actuators["steering"].order
+    values = {
+        "angle": UNKNOWN if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
+        "command": tenths_of_degree(order.target) if order else 0,
+        "speed": UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps),
+        "torque": round(within(state.driver_torque_nm / 0.0625, -127, 127)),
+        **flags(state, "steering"),
+    }
+    return pack(STEERING_REPORT, values)
+
+
+def gear_report(state: KitState, _: Mechanics) -> bytes:
+    """Tell about the gearbox."""
+    values = {
+        "gear": int(state.gear),
+        "override": state.is_gear_overridden,
+        "command": state.gear_order,
+        "reject": int(state.gear_reject),
+        "ready": not state.gear_faults,
+        **dict.fromkeys(state.gear_faults, 1),
+    }
+    return pack(GEAR_REPORT, values)
+
+
+def wheel_speeds(state: KitState, mechanics: Mechanics) -> bytes:
+    """Tell how fast each tyre turns: all alike."""
+    speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
+    return pack(WHEEL_SPEEDS, dict.fromkeys((f"wheel_{index}" for index in range(4)), speed))
+
+
+REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
+    0x061: (20, brake_report),
+    0x063: (20, throttle_report),
+    0x065: (10, steering_report),
+    0x067: (100, gear_report),
+    0x06A: (10, wheel_speeds),
+}
+"""What the kit sends, and every how many milliseconds. The facts give no periods: those of generation 2 are taken."""

@@ -1,0 +1,200 @@
+"""The messages of Dataspeed's generation 2, as a kit reads and writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.software_car.frames import is_sealed, pack, sealed, unpack
+from lavt.vehicle.software_car.generation_2_layouts import (
+    GEAR_COMMAND,
+    PEDAL_COMMAND,
+    REPORT_LAYOUTS,
+    STEERING_COMMAND,
+    SYSTEM_COMMAND,
+    WHEEL_SPEEDS,
+)
+from lavt.vehicle.software_car.mechanics import (
+    Mechanics,
+    hundredths_of_kmh,
+    tenths_of_degree,
+    wheel_angle,
+    within,
+)
+from lavt.vehicle.software_car.state import (
+    AXES,
+    Axis,
+    GearOrder,
+    KitState,
+    Order,
+    Reason,
+    SystemOrder,
+)
+
+USER_SET, REMOTE_SET = 0x210, 0x200
+PARTS: Final[tuple[Axis | None, ...]] = ("steering", "brake", "throttle", None)
+"""What the commands of a set are for, by what is added to the set's identifier; the last is the gearbox."""
+SYSTEM_COMMAND_ID = 0x216
+UNKNOWN: Final = -0x8000
+
+ALL_OR_NONE = 2
+"""The third of the modes that the facts name: the number is ours."""
+ANGLE, PERCENT = 2, 14
+"""The types of command that the kit obeys, of those that the facts list."""
+FULL_PEDAL = {"brake": 10_000, "throttle": 4_000}
+"""A whole pedal in steps of percent commands: 0.01 % and 0.025 %."""
+
+FAULTS: dict[str, tuple[str, ...]] = {
+    "steering": ("fault",),
+    "brake": ("fault",),
+    "throttle": ("fault",),
+    "gear": ("fault",),
+}
+
+
+def read(frame: Frame, mechanics: Mechanics, is_remote: bool) -> Order | GearOrder | SystemOrder | None:
+    """Give what a frame orders; None for one that is not for the kit, or is of the other set."""
+    if frame.is_extended:
+        return None
+    if frame.identifier == SYSTEM_COMMAND_ID and len(frame.data) == SYSTEM_COMMAND.length:
+        asked = unpack(SYSTEM_COMMAND, frame.data)
+        return SystemOrder(is_sealed(frame), asked["command"], asked["count"])
+    part = frame.identifier - (REMOTE_SET if is_remote else USER_SET)
+    if not 0 <= part < len(PARTS):
+        return None
+    axis = PARTS[part]
+    layout = GEAR_COMMAND if axis is None else STEERING_COMMAND if axis == "steering" else PEDAL_COMMAND
+    if len(frame.data) != layout.length:
+        return None
+    asked = unpack(layout, frame.data)
+    if axis is None:
+        return GearOrder(is_sealed(frame), asked["command"])
+    if axis == "steering":
+        is_known, target = asked["type"] == ANGLE, wheel_angle(asked["command"])
+    else:
+        is_known, target = asked["type"] == PERCENT, within(asked["command"] / FULL_PEDAL[axis], 0.0, 1.0)
+    return Order(
+        axis,
+        is_valid=is_sealed(frame),
+        target=target,
+        is_enabling=bool(asked["enable"]) and is_known,
+        is_clearing=bool(asked["clear"]),
+        ignores_driver=bool(asked["ignore"]),
+        rate_radps=mechanics.rate_radps(asked.get("rate", 0), 4.0),
+        count=asked["count"],
+    )
+
+
+def flags(state: KitState, axis: Axis) -> dict[str, int]:
+    """Give the bits that all three axes report."""
+    actuator = state.actuators[axis]
+    others = (state.actuators[other] for other in AXES if other != axis)
+    return {
+        "ready": not (actuator.faults or actuator.is_overridden or actuator.driver_acts),
+        "enabled": actuator.is_enabled,
+        "fault": bool(actuator.faults),
+        "timeout": actuator.has_timed_out,
+        "bad_crc": actuator.is_crc_bad,
+        "bad_rc": actuator.is_count_bad,
+        "override_active": actuator.driver_acts,
+        "override_other": state.is_gear_overridden or any(other.is_overridden for other in others),
+        "override_latched": actuator.is_overridden,
+        "external_control": actuator.is_enabled,
+    }
+
+
+def steering_report(state: KitState, _: Mechanics) -> dict[str, int]:
+    """Tell about the steering wheel."""
+    order = state.actuators["steering"].order
+    return {
+        "angle": -0x2000 if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
+        "command": tenths_of_degree(order.target) if order else 0,
+        "torque": round(state.driver_torque_nm / 0.0625),
+        **flags(state, "steering"),
+    }
+
+
+def pedal_report(axis: Axis, state: KitState, driver: float, output: float) -> dict[str, int]:
+    """Tell about a pedal in steps of 0.025 %."""
+    order = state.actuators[axis].order
+    return {
+        "input": round(driver * 4_000),
+        "command": round(order.target * 4_000) if order else 0,
+        "output": round(output * 4_000),
+        **flags(state, axis),
+    }
+
+
+def gear_report(state: KitState, _: Mechanics) -> dict[str, int]:
+    """Tell about the gearbox."""
+    return {
+        "gear": int(state.gear),
+        "command": state.gear_order,
+        "ready": not state.gear_faults,
+        "fault": bool(state.gear_faults),
+        "override_latched": state.is_gear_overridden,
+    }
+
+
+def reported(reason: Reason) -> int:
+    """Give the number of a reason; 0 for one that the facts do not name."""
+    return reason if reason <= Reason.LOCKOUT_REVERSE else 0
+
+
+def system_report(state: KitState, _: Mechanics) -> dict[str, int]:
+    """Tell about the kit as a whole."""
+    return {
+        "state": int(state.system),
+        "reason_disengage": reported(state.disengaged),
+        "reason_not_ready": reported(state.not_ready),
+        "sync_mode": ALL_OR_NONE,
+    }
+
+
+def velocity_report(state: KitState, _: Mechanics) -> dict[str, int]:
+    """Tell how fast the car goes."""
+    speed = UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps)
+    return {"by_brakes": speed, "by_propulsion": speed}
+
+
+def wheel_speeds(state: KitState, mechanics: Mechanics) -> dict[str, int]:
+    """Tell how fast each tyre turns: all alike."""
+    speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
+    return dict.fromkeys((f"wheel_{index}" for index in range(4)), speed)
+
+
+def remote_report(state: KitState, _: Mechanics) -> dict[str, int]:
+    """Tell who may command: the remote's switch."""
+    return {"state": state.remote_state}
+
+
+def made(
+    identifier: int, values: Callable[[KitState, Mechanics], dict[str, int]]
+) -> Callable[[KitState, Mechanics], bytes]:
+    """Pack what a report tells, with counter and checksum where there is room."""
+    layout = REPORT_LAYOUTS[identifier]
+    if layout == WHEEL_SPEEDS:  # full
+        return lambda state, mechanics: pack(layout, values(state, mechanics))
+
+    def report(state: KitState, mechanics: Mechanics) -> bytes:
+        count = {"count": state.sent.get(identifier, 0) % 16}
+        return sealed(identifier, pack(layout, values(state, mechanics) | count))
+
+    return report
+
+
+REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
+    identifier: (period_ms, made(identifier, values))
+    for identifier, (period_ms, values) in {
+        0x100: (10, steering_report),
+        0x101: (20, lambda state, _: pedal_report("brake", state, state.driver_brake, state.brake)),
+        0x102: (20, lambda state, _: pedal_report("throttle", state, state.driver_throttle, state.throttle)),
+        0x103: (100, gear_report),
+        0x106: (100, system_report),
+        0x107: (20, velocity_report),
+        0x2A4: (10, wheel_speeds),
+        0x2D8: (100, remote_report),
+    }.items()
+}
+"""What the kit sends, and every how many milliseconds."""

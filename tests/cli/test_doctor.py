@@ -1,0 +1,523 @@
+from __future__ import annotations
+
+import json
+import socket
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+from pydantic import Field
+from tests.field import by_wire
+from tests.vehicle.moving_video import write_video
+
+from lavt.build.by_wire import listen
+from lavt.cli import doctor, examine
+from lavt.clock import MachineClock
+from lavt.config import Section, ServerConfig
+from lavt.config_file import load_config, parse_config, shipped
+from lavt.domain import NS_PER_MS, NS_PER_S, Now, State
+from lavt.experiment import checkup
+from lavt.experiment.checkup import Check, CodecTimes, Heard, Seen
+from lavt.experiment.clock_check import Finding, Opinion
+from lavt.node import Message, Send
+from lavt.nodes.clock_sync import ClockSyncNode
+from lavt.transport import chrony
+from lavt.transport.clock_offset import ClockReport, unknown_clock
+from lavt.transport.messages import encode
+from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES, UdpLink
+from lavt.transport.zenoh_link import Router, Routers, ZenohLink, quiet_logs
+
+STATE = State(1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", holder="operator-1")
+NOW = Now(1, 1)
+REQUIREMENTS = ["av>=14", "numpy>=1.26", "cryptography>=42; extra == 'secure'"]
+INSTALLED = {"lavt": "0.1.0", "av": "14.0.1", "numpy": "2.0", "cryptography": None}
+
+
+def times(encode_ms: float, decode_ms: float = 1.0) -> CodecTimes:
+    return CodecTimes([round(encode_ms * NS_PER_MS)] * 20, [round(decode_ms * NS_PER_MS)] * 20)
+
+
+def check_codec(measured: CodecTimes, side: str = "", cores: int = 2) -> Check:
+    return checkup.check_codec(measured, size="640x480", rate_hz=50.0, side=side, cores=cores)
+
+
+def known(bound_s: float) -> ClockReport:
+    return ClockReport(1, 1, "here", "chrony", 0.001, bound_s, follows="192.0.2.1")
+
+
+def check_port(refusal: str, served: bool) -> Check:
+    return checkup.check_port("video port", "video.port", "0.0.0.0", 5600, refusal=refusal, served=served)
+
+
+def check_key_file(refusal: str = "", mode: int = 0o600, private: bool = True) -> Check:
+    return checkup.check_key_file("security.key", Path("a.key"), refusal=refusal, mode=mode, private=private)
+
+
+def check_camera(seen: Seen | str) -> Check:
+    return checkup.check_camera(seen, name="/dev/video0", size="640x480", rate_hz=30.0)
+
+
+def came(rate_hz: float, timed: int = 0) -> Seen:
+    return Seen([round(number * 1e9 / rate_hz) for number in range(61)], timed)
+
+
+FOUND = Finding(True, ("this clock", "these two agree"), None, Opinion(1.0, 0.5), 1.0)
+
+VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
+    (lambda: checkup.check_versions("3.11", INSTALLED, REQUIREMENTS), "ok", "Python 3.11, lavt 0.1.0, av 14.0.1"),
+    (lambda: checkup.check_versions("3.11", INSTALLED | {"av": "9.2"}, REQUIREMENTS), "problem", "at least 14 is need"),
+    (lambda: checkup.check_versions("3.11", INSTALLED | {"numpy": None}, REQUIREMENTS), "problem", "numpy is missing"),
+    (
+        lambda: checkup.check_versions("3.11", INSTALLED | {"cryptography": "41"}, REQUIREMENTS),
+        "problem",
+        "at least 42",
+    ),
+    (lambda: checkup.check_versions("3.11", INSTALLED, []), "ok", "Python 3.11"),
+    (lambda: check_codec(times(2.0)), "ok", "to encode takes 2.0 ms (95 %: 2.0 ms), 10% of a frame"),
+    (lambda: check_codec(times(11.0)), "warning", "55% of a frame"),
+    (lambda: check_codec(times(21.0)), "problem", "105% of a frame"),
+    (lambda: check_codec(times(21.0), "client"), "ok", "2 cores"),
+    (lambda: check_codec(times(1.0, 21.0), "server"), "ok", "2 cores"),
+    (lambda: check_codec(times(1.0, 21.0), "client"), "problem", "to decode takes 21.0 ms"),
+    (lambda: check_codec(times(2.0), cores=1), "warning", "1 core"),
+    (lambda: check_camera(came(30.0)), "ok", "640x480, 30.0 pictures a second; when each was taken is not known"),
+    (lambda: check_camera(came(29.0, 61)), "ok", "29.0 pictures a second; when each was taken is known"),
+    (lambda: check_camera(came(15.0)), "warning", "15.0 pictures a second"),
+    (lambda: check_camera(Seen([], 0)), "warning", "0.0 pictures a second"),
+    (lambda: check_camera(Seen([5], 0)), "warning", "0.0 pictures a second"),
+    (lambda: check_camera("/dev/video0 cannot be opened"), "problem", "/dev/video0 cannot be opened"),
+    (lambda: checkup.check_by_wire(300, "", name="socketcan can0"), "ok", "300 frames were heard on socketcan can0"),
+    (
+        lambda: checkup.check_by_wire(0, "no BrakeReport for 200 ms", name="can0"),
+        "problem",
+        "no BrakeReport for 200 ms",
+    ),
+    (lambda: checkup.check_buffer(RECEIVE_BUFFER_BYTES), "ok", "4194304 are asked for"),
+    (lambda: checkup.check_buffer(212_992), "warning", "may keep 212992 bytes"),
+    (lambda: checkup.check_arrival(True), "ok", "stamps datagrams"),
+    (lambda: checkup.check_arrival(False), "warning", "does not stamp"),
+    (lambda: checkup.check_timer(400, [NS_PER_MS // 10] * 20), "ok", "0.10 ms late (95 %: 0.10 ms)"),
+    (lambda: checkup.check_timer(400, [0] * 18 + [5 * NS_PER_MS] * 2), "warning", "95 %: 5.00 ms"),
+    (lambda: checkup.check_timer(400, [21 * NS_PER_MS] * 20), "problem", "21.00 ms late"),
+    (lambda: checkup.check_precedence(-10), "ok", "nice -10"),
+    (lambda: checkup.check_precedence(0), "warning", "wait like ordinary ones"),
+    (lambda: checkup.check_governor(["performance"] * 2), "ok", "performance"),
+    (lambda: checkup.check_governor(["performance", "powersave"]), "warning", "performance, powersave"),
+    (lambda: checkup.check_governor([]), "not checked", "does not tell"),
+    (lambda: checkup.check_clock(known(0.0001)), "ok", "follows 192.0.2.1"),
+    (lambda: checkup.check_clock(known(0.01)), "warning", "too wide"),
+    (lambda: checkup.check_clock(unknown_clock(NOW, "here", "chrony", chrony.ABSENT)), "warning", "not installed"),
+    (lambda: checkup.check_clock(unknown_clock(NOW, "here", "probe", "left to the probe")), "ok", "left to the probe"),
+    (lambda: checkup.check_clock(None), "warning", "did not answer in time"),
+    (lambda: checkup.check_netem("", "eth0"), "ok", "can delay packets"),
+    (lambda: checkup.check_netem("no netem", ""), "ok", "not needed unless a delay is to be injected"),
+    (lambda: checkup.check_netem("no netem", "eth0"), "problem", "no netem"),
+    (lambda: check_port("", False), "ok", "UDP 0.0.0.0:5600 can be opened"),
+    (lambda: check_port("Address already in use", True), "ok", "a `lavt server` that runs here already"),
+    (lambda: check_port("Address already in use", False), "problem", "cannot be opened: Address already in use"),
+    (lambda: checkup.check_router("tcp/127.0.0.1:7447", ""), "ok", "a router answers at tcp/127.0.0.1:7447"),
+    (lambda: checkup.check_router("tcp/127.0.0.1:7447", "no router answers"), "problem", "no router answers"),
+    (lambda: checkup.check_link(Routers(1, ("v1", "v1")), heard=False), "ok", "linked to 1 other router; Zenoh v1, v1"),
+    (lambda: checkup.check_link(Routers(0, ("v1",)), heard=True), "ok", "linked to 0 other routers"),
+    (lambda: checkup.check_link(Routers(0, ("v1",)), heard=False), "warning", "no link to another one"),
+    (lambda: checkup.check_link(Routers(1, ("v1", "v2")), heard=True), "warning", "Zenoh v1, v2"),
+    (lambda: checkup.check_link(None, heard=True), "not checked", "does not tell"),
+    (
+        lambda: checkup.check_vehicle(Heard([STATE] * 50), "v-1", "1"),
+        "ok",
+        "50 times a second: disarmed, held by op",
+    ),
+    (lambda: checkup.check_vehicle(Heard([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
+    (lambda: checkup.check_vehicle(Heard([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
+    (lambda: checkup.check_vehicle(Heard(), "v-1", "1"), "problem", "v-1 tells no state"),
+    (
+        lambda: checkup.check_vehicle(Heard([], {"of another version": 50}), "v-1", "1"),
+        "problem",
+        "another version (50)",
+    ),
+    (lambda: checkup.check_probe(FOUND, "car", 5602), "ok", "these two agree"),
+    (lambda: checkup.check_probe(replace(FOUND, good=False), "car", 5602), "warning", "these two agree"),
+    (lambda: checkup.check_probe(None, "car", 5602), "problem", "nobody answers at UDP car:5602"),
+    (lambda: checkup.check_video("car", 0), "not checked", "video.port (5600 as shipped)"),
+    (lambda: checkup.check_video("car", 5601), "not checked", "UDP car:5601"),
+    (lambda: checkup.check_plain(True), "ok", "messages are signed"),
+    (lambda: checkup.check_plain(False), "warning", "whoever reaches the vehicle's router can drive"),
+    (lambda: check_key_file(), "ok", "a.key is there"),
+    (lambda: check_key_file(mode=0o640), "problem", "a private key that others may read (mode 640)"),
+    (lambda: check_key_file(mode=0o644, private=False), "ok", "a.key is there"),
+    (lambda: check_key_file("No such file or directory"), "problem", "cannot be read: No such file"),
+    (lambda: checkup.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
+    (lambda: checkup.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
+    (lambda: checkup.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
+]
+"""What is measured, the verdict on it, and a part of the words."""
+
+
+@pytest.mark.parametrize(("check", "verdict", "words"), VERDICTS)
+def test_verdicts(check: Callable[[], Check], verdict: str, words: str) -> None:
+    """Every check tells good from bad, says what was found, and where it is bad what to do."""
+    said = check()
+    assert (said.verdict, words in said.found) == (verdict, True), said
+    assert bool(said.do) == (verdict in {"warning", "problem"} or said.name == "video")
+
+
+def test_every_check_has_verdicts() -> None:
+    """Every check is in the table with two verdicts, but that of the video, of which nothing is known beforehand."""
+    verdicts: dict[str, set[str]] = {}
+    for check, verdict, _ in VERDICTS:
+        for name in check.__code__.co_names:
+            verdicts.setdefault(name, set()).add(verdict)
+    checks = {name for name in vars(checkup) if name.startswith("check_")} - {"check_host", "check_video"}
+    assert {name for name in checks if len(verdicts[name]) < 2} == set()
+
+
+def lavt_doctor(*arguments: str) -> subprocess.Popen[str]:
+    program = [sys.executable, "-m", "lavt", "doctor", *arguments]
+    return subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=60)
+    assert "Traceback" not in err
+    return process.returncode, out, err
+
+
+MACHINE = [
+    "versions", "processor", "receive buffer", "arrival times", "timer", "precedence", "frequency", "clock", "netem",
+]  # fmt: skip
+
+
+def test_this_machine() -> None:
+    """Without a config this machine is looked at; the exit code is 1 exactly where a check has found a problem."""
+    code, out, _ = ended(lavt_doctor("--json"))
+    said = json.loads(out)
+    assert [check["name"] for check in said["checks"]] == MACHINE
+    problems = [check for check in said["checks"] if check["verdict"] == "problem"]
+    assert (code, said["good"]) == ((1, False) if problems else (0, True))
+    processor = said["checks"][1]["measured"]
+    assert 0 < processor["encode_ms"] <= processor["encode_p95_ms"]
+    assert 0 < processor["decode_ms"] <= processor["decode_p95_ms"]
+
+
+def test_a_person_reads_lines() -> None:
+    """Without --json each check is a line that begins with its verdict, and what to do follows behind an arrow."""
+    _, out, _ = ended(lavt_doctor())
+    first = [line for line in out.splitlines() if not line.startswith(" ")]
+    assert [line[12:30].strip() for line in first] == MACHINE
+    assert {line[:12].strip() for line in first} <= {"ok", "warning", "problem", "not checked"}
+    assert all(line.strip().startswith("-> ") for line in out.splitlines() if line.startswith(" "))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nothing.yaml",), "nothing.yaml cannot be read"),
+        (("--set", "seed=1"), "--set changes a config: name one before it"),
+        ((str(shipped("configs/client.yaml")), "--set", "whom=me"), "unknown key 'whom': did you mean 'who'?"),
+        ((str(shipped("configs/server.yaml")), "--set", "nothing"), "is not of the form a.b=value"),
+        ((str(shipped("configs/demo.yaml")),), "unknown key"),
+    ],
+)
+def test_bad_input(arguments: tuple[str, ...], said: str) -> None:
+    """A config that cannot be loaded is refused in one sentence, with exit code 2, before anything is looked at."""
+    code, out, err = ended(lavt_doctor(*arguments))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert said in err
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The machine itself is not looked at, and a peer is waited for a second only."""
+    monkeypatch.setattr(doctor, "_machine", lambda *_: iter(()))
+    monkeypatch.setattr(doctor, "PROBING_NS", 100 * NS_PER_MS)
+    monkeypatch.setattr(examine, "FIRST_STATE_NS", 1000 * NS_PER_MS)
+
+
+def looked_at(path: Path, *changes: str) -> dict[str, Check]:
+    settings = doctor._load(path, list(changes))
+    return {check.name: check for check in doctor._checks(settings, MachineClock())}
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("rate_hz", "size", "verdict", "said"),
+    [
+        (30.0, (320, 240), "ok", "video.avi gives 320x240, "),
+        (30.0, (640, 480), "problem", "video.avi gives 320x240 at 30 Hz, but camera asks for 640x480 at 30 Hz"),
+        (25.0, (320, 240), "problem", "video.avi gives 320x240 at 30 Hz, but camera asks for 320x240 at 25 Hz"),
+    ],
+)
+def test_a_camera_that_is_plugged_in(
+    tmp_path: Path, rate_hz: float, size: tuple[int, int], verdict: str, said: str
+) -> None:
+    """The camera of a server's config is opened, and its pictures are counted; another size or rate is a problem."""
+    video = write_video(tmp_path / "video.avi", rate_hz=30.0)
+    camera = ["source=device", f"device={video}", f"rate_hz={rate_hz}", f"width_px={size[0]}", f"height_px={size[1]}"]
+    changes = [f"camera.{each}" for each in camera]
+    found = looked_at(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")["camera"]
+    assert found.verdict == verdict
+    assert said in found.found
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_server_without_a_router_and_without_its_ports() -> None:
+    """For a server's config its ports are opened and its router asked: what is taken or silent is a problem."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        changes = ["video.bind=127.0.0.1", f"video.port={taken.getsockname()[1]}", "clock.probe_port=0"]
+        found = looked_at(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert [(name, check.verdict) for name, check in found.items()][2:] == [
+        ("security", "warning"),
+        ("video port", "problem"),
+        ("probe port", "ok"),
+        ("router", "problem"),
+    ]
+    assert "Address already in use" in found["video port"].found
+    assert "no router answers at ['tcp/127.0.0.1:1']" in found["router"].found
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """A router, to which both sides' sessions go."""
+    quiet_logs()
+    opened = Router(shipped("zenoh-configs/router-server.json5"), {"listen/endpoints": ["tcp/127.0.0.1:0"]})
+    with closing(opened):
+        yield opened.locators()[0]
+
+
+@pytest.fixture
+def probe_port() -> Iterator[int]:
+    """A server that answers probes."""
+    clock, node = MachineClock(), ClockSyncNode(0)
+
+    def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+        for send in node.chains["probe_request"][0][1](Message("probe_request", payload, arrived, peer), clock.now()):
+            link.send(send)
+
+    link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")
+    with closing(link):
+        link.start()
+        yield link.port
+
+
+def asked_of_a_client(router: str, probe_port: int, vehicle: str, payload: bytes) -> dict[str, dict[str, Any]]:
+    """Run the doctor with a client's config while a server tells `payload` as its state, 50 times a second."""
+    server = ZenohLink(
+        MachineClock(), lambda *_: None, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
+        vehicle=vehicle, who="server",
+    )  # fmt: skip
+    changes = [f"vehicle_id={vehicle}", f"zenoh.router={router}", f"clock.probe_port={probe_port}"]
+    sets = [part for change in changes for part in ("--set", change)]
+    process = lavt_doctor(str(shipped("configs/client.yaml")), "--json", *sets)
+    with closing(server):
+        server.start()
+        while process.poll() is None:
+            server.send(Send("state", payload))
+            try:
+                process.wait(0.02)
+            except subprocess.TimeoutExpired:
+                continue
+        code, out, _ = ended(process)
+    said = json.loads(out)
+    assert code == (0 if said["good"] else 1)
+    return {check["name"]: check for check in said["checks"]}
+
+
+def test_a_pair(router: str, probe_port: int) -> None:
+    """For a client's config the router, the vehicle's state, the clocks and the link are looked at, and the video is
+    said to be known in a drive alone.
+    """
+    found = asked_of_a_client(router, probe_port, "vehicle-1", encode(STATE))
+    assert list(found)[len(MACHINE) :] == ["security", "router", "vehicle", "link of routers", "clock probe", "video"]
+    assert "disarmed, held by operator-1" in found["vehicle"]["found"]
+    assert found["vehicle"]["measured"]["states"] > 0
+    assert found["link of routers"]["verdict"] == "ok"
+    assert abs(found["clock probe"]["measured"]["offset_ms"]) <= found["clock probe"]["measured"]["bound_ms"]
+    assert found["video"]["verdict"] == "not checked"
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Signing keys of a vehicle and two operators."""
+    certificates = pytest.importorskip("lavt.transport.certificates")
+    folder = tmp_path_factory.mktemp("keys")
+    for name in ("vehicle-3", "operator-1", "operator-2"):
+        pair = certificates.new_signing_pair()
+        (folder / f"{name}.key").write_bytes(pair.private)
+        (folder / f"{name}.key").chmod(0o600)
+        (folder / f"{name}.pub").write_bytes(pair.shown)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("operator", "vehicle", "said"),
+    [
+        ("operator-1", "vehicle-3", ("ok", "held by operator-1")),
+        ("operator-2", "vehicle-3", ("problem", "which does not answer this operator's key")),
+        ("operator-1", "operator-2", ("problem", "not signed by the vehicle that security.vehicle names")),
+    ],
+)
+@pytest.mark.usefixtures("quick")
+def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, said: tuple[str, str]) -> None:
+    """Signed states are opened with the configured keys, without a session; where these do not fit, it is said why."""
+    from lavt.build.security import vehicle_seal
+    from lavt.transport.door import ServerDoor
+
+    security = {"key": str(keys / "vehicle-3.key"), "operators": {"operator-1": str(keys / "operator-1.pub")}}
+    seal = vehicle_seal(parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test"))
+    door = ServerDoor(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), seal)
+    server = ZenohLink(
+        MachineClock(), door.let_in, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
+        vehicle="vehicle-3", who="server",
+    )  # fmt: skip
+    over = threading.Event()
+
+    def tell() -> None:
+        while not over.wait(0.02):
+            door.send(Send("state", encode(STATE)))
+
+    teller = threading.Thread(target=tell)
+    with closing(server):
+        server.start()
+        teller.start()
+        try:
+            changes = [f"security.key={keys / operator}.key", f"security.vehicle={keys / vehicle}.pub"]
+            where = [f"zenoh.router={router}", "vehicle_id=vehicle-3", "clock.probe_port=1"]
+            found = looked_at(shipped("configs/client.yaml"), *changes, *where)
+        finally:
+            over.set()
+            teller.join()
+    assert (found["vehicle"].verdict, said[1] in found["vehicle"].found) == (said[0], True), found["vehicle"]
+    assert {found[name].verdict for name in ("security", "security.key", "security.vehicle")} == {"ok"}
+
+
+@pytest.mark.usefixtures("quick")
+def test_keys_that_are_none(tmp_path: Path) -> None:
+    """A file that holds no key is a problem, and the router is not asked with it."""
+    pytest.importorskip("lavt.transport.certificates")
+    for name in ("key", "pub"):
+        (tmp_path / name).write_text("no key")
+        (tmp_path / name).chmod(0o600)
+    changes = [f"security.key={tmp_path}/key", f"security.vehicle={tmp_path}/pub", "clock.probe_port=1"]
+    found = looked_at(shipped("configs/client.yaml"), *changes)
+    assert (found["keys"].verdict, found["router"].verdict) == ("problem", "not checked")
+    assert str(tmp_path) in found["keys"].found
+
+
+def test_a_peer_of_another_version(router: str, probe_port: int) -> None:
+    """States of another version of the messages are a problem, which says so and what to do."""
+    fields = msgpack.unpackb(encode(STATE))
+    found = asked_of_a_client(router, probe_port, "vehicle-2", msgpack.packb([99, *fields[1:]]))
+    assert found["vehicle"]["verdict"] == "problem"
+    assert "a message of another version" in found["vehicle"]["found"]
+    assert "install the same version" in found["vehicle"]["do"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_client_whose_vehicle_is_away(router: str) -> None:
+    """Where nobody tells a state or answers probes, both are problems, and the missing link of the routers is told."""
+    changes = ["vehicle_id=away", f"zenoh.router={router}", "clock.probe_port=1"]
+    found = looked_at(shipped("configs/client.yaml"), *changes)
+    assert {name: found[name].verdict for name in ("vehicle", "link of routers", "clock probe")} == {
+        "vehicle": "problem",
+        "link of routers": "warning",
+        "clock probe": "problem",
+    }
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_host_that_nobody_knows(router: str) -> None:
+    """A video.server without an address is a problem of its own, not a crash."""
+    found = looked_at(shipped("configs/client.yaml"), f"zenoh.router={router}", f"video.server={'a' * 64}")
+    assert found["clock probe"].verdict == "problem"
+    assert "is not known" in found["clock probe"].found
+
+
+def test_which_side_a_config_is_of(tmp_path: Path) -> None:
+    """A config is a client's where it has a key that only a client has, also by --set, else a server's."""
+    empty = tmp_path / "empty.yaml"
+    empty.write_text("")
+    assert isinstance(doctor._load(empty, []), ServerConfig)
+    assert not isinstance(doctor._load(empty, ["video.server=192.0.2.7"]), ServerConfig)
+    assert not isinstance(doctor._load(empty, ["who=operator-2"]), ServerConfig)
+
+
+class Security(Section):
+    """A config's section as both sides have it."""
+
+    key: str = ""
+    operators: dict[str, str] = Field(default_factory=dict)
+
+
+def test_key_files(tmp_path: Path) -> None:
+    """Every file that `security` names is looked at; a private key must be there, and its owner's alone."""
+    private, public = tmp_path / "vehicle-1.sign.key", tmp_path / "operator-1.sign.pub"
+    private.write_text("key")
+    private.chmod(0o644)
+    section = Security(key=str(private), operators={"operator-1": str(public)})
+    files = examine.key_files(section)
+    assert files == [("security.key", private, True), ("security.operators.operator-1", public, False)]
+    assert examine.file_state(private) == ("", 0o644)
+    assert examine.file_state(public) == ("No such file or directory", 0)
+    assert stat.S_IMODE(private.stat().st_mode) == 0o644
+    assert examine.key_files(Security()) == []
+
+
+def test_certificates(tmp_path: Path) -> None:
+    """The certificates beside the keys tell for how many days they are valid; other files are passed over."""
+    x509 = pytest.importorskip("cryptography.x509")
+    from datetime import UTC, datetime, timedelta  # noqa: TID251 (no clock is read)
+
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import Encoding
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "vehicle-1")])
+    begins = datetime(2026, 1, 1, tzinfo=UTC)
+    certificate = (
+        x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(key.public_key())
+        .serial_number(1).not_valid_before(begins).not_valid_after(begins + timedelta(days=30))
+        .sign(key, hashes.SHA256())
+    )  # fmt: skip
+    (tmp_path / "vehicle-1.pem").write_bytes(certificate.public_bytes(Encoding.PEM))
+    (tmp_path / "other.pem").write_text("no certificate")
+    now_ns = round(begins.timestamp()) * 10**9
+    assert examine.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
+    assert examine.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
+
+
+@pytest.mark.realtime
+def test_a_kit_on_its_bus(tmp_path: Path) -> None:
+    """With a by-wire kit the doctor listens to its bus, sends nothing, and says what hinders driving."""
+    pytest.importorskip("can")
+    run = by_wire.run_config("dataspeed_gen2", tmp_path / "none.json")
+    path, clock = by_wire.write_config(run, tmp_path / "server.yaml"), MachineClock()
+    config = load_config(ServerConfig, path)
+    heard, silent = listen(config.vehicle, clock, NS_PER_S)
+    assert heard == 0
+    assert "no SteerReport1 yet" in silent
+    with by_wire.software_car(path) as car:
+        heard, said = listen(config.vehicle, clock, 2 * NS_PER_S)
+        assert heard > 100
+        assert "none.json" in said
+        assert "SteerReport1" not in said
+    assert [each for each in car.news if each["kind"] == "enabled"] == []
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_bus_that_is_not_there() -> None:
+    """A bus that cannot be opened is a problem of its own, with a sentence, and the other checks are made."""
+    pytest.importorskip("can")
+    changes = ("vehicle.kind=dbw", "vehicle.dbw.interface=socketcan", "vehicle.dbw.channel=nothere")
+    found = looked_at(shipped("configs/server.yaml"), *changes, "zenoh.router=tcp/127.0.0.1:1")
+    assert (found["by wire"].verdict, "nothere cannot be opened" in found["by wire"].found) == ("problem", True)
+    assert "video port" in found

@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import re
+import shutil
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lavt.cli import console
+from lavt.cli.main import app
+
+pytest.importorskip("cryptography")
+
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+Run = Callable[..., tuple[int, str, str]]
+ENDINGS = (".key", ".pem", ".sign.key", ".sign.pub")
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Give a function that runs `lavt keys` in a fresh working directory: exit code, output, errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run_here(*arguments: str) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            console.run_command(lambda: app(["keys", *arguments]))
+        said = capsys.readouterr()
+        code = ended.value.code
+        return code if isinstance(code, int) else 0, said.out, said.err
+
+    return run_here
+
+
+@pytest.fixture
+def made(run: Run) -> Path:
+    """Give a directory with the keys of one of each role."""
+    names = [word for role in ("vehicle", "operator", "monitor", "cloud") for word in (f"--{role}", f"{role}-1")]
+    code, _, err = run("keys", *names, "--host", "192.0.2.7", "--host", "car.example.org", "--days", "30")
+    assert (code, err) == (0, "")
+    return Path("keys")
+
+
+def certificate(directory: Path, name: str) -> x509.Certificate:
+    return x509.load_pem_x509_certificate((directory / f"{name}.pem").read_bytes())
+
+
+def hosts(directory: Path, name: str) -> set[str]:
+    found = certificate(directory, name).extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    return {str(each.value) for each in found.value}
+
+
+def usages(directory: Path, name: str) -> set[x509.ObjectIdentifier]:
+    return set(certificate(directory, name).extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
+
+
+def test_layout(made: Path) -> None:
+    """Each name has a certificate with its key and a pair for signatures; only the owner can read what is private."""
+    names = [f"{role}-1" for role in ("vehicle", "operator", "monitor", "cloud")]
+    expected = {name + ending for name in names for ending in ENDINGS} | {"authority.key", "authority.pem"}
+    assert {path.name for path in made.iterdir()} == expected
+    assert stat.S_IMODE(made.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) for path in made.glob("*.key")} == {0o600}
+
+
+def test_certificates(made: Path) -> None:
+    """A certificate is of the name, signed by the authority, and its key is the one beside it."""
+    authority = certificate(made, "authority")
+    for name in ("vehicle-1", "operator-1", "monitor-1", "cloud-1"):
+        found = certificate(made, name)
+        found.verify_directly_issued_by(authority)
+        (common_name,) = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        assert common_name.value == name
+        key = serialization.load_pem_private_key((made / f"{name}.key").read_bytes(), None)
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        assert key.curve.name == "secp256r1"
+        assert key.public_key() == found.public_key()
+        assert found.not_valid_after_utc == authority.not_valid_after_utc
+        assert (found.not_valid_after_utc - found.not_valid_before_utc).days == 31
+
+
+def test_who_may_be_dialled(made: Path) -> None:
+    """Vehicle and cloud may be servers, at the hosts named and the loopback; operator and monitor only dial."""
+    for name in ("vehicle-1", "cloud-1"):
+        assert hosts(made, name) == {name, "127.0.0.1", "localhost", "192.0.2.7", "car.example.org"}
+        assert usages(made, name) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    for name in ("operator-1", "monitor-1"):
+        assert hosts(made, name) == {name}
+        assert usages(made, name) == {ExtendedKeyUsageOID.CLIENT_AUTH}
+
+
+def test_signing_pairs(made: Path) -> None:
+    """What a name's private signing key signs its public one confirms, and no two names have the same."""
+    publics = set()
+    for name in ("vehicle-1", "operator-1"):
+        key = serialization.load_pem_private_key((made / f"{name}.sign.key").read_bytes(), None)
+        public = serialization.load_pem_public_key((made / f"{name}.sign.pub").read_bytes())
+        assert isinstance(key, ed25519.Ed25519PrivateKey)
+        assert isinstance(public, ed25519.Ed25519PublicKey)
+        public.verify(key.sign(b"command"), b"command")
+        publics.add(public.public_bytes_raw())
+    assert len(publics) == 2
+
+
+def test_what_is_copied(run: Run) -> None:
+    """The output says until when all holds, that it is for tests, and what each machine gets: no key of another."""
+    code, out, _ = run("keys", "--vehicle", "car", "--operator", "ann", "--operator", "bob", "--cloud", "sky")
+    assert code == 0
+    lines = out.splitlines()
+    assert "test authority until 2" in lines[0]
+    assert "authority.key never leaves" in lines[0]
+    copied = {
+        line.split()[1].strip(","): set(then.split(": ")[1].split())
+        for line, then in zip(lines[1:-1:2], lines[2:-1:2], strict=True)
+    }
+    own = {name: {"authority.pem", f"{name}.pem", f"{name}.key"} for name in ("car", "ann", "bob", "sky")}
+    assert copied == {
+        "car": own["car"] | {"car.sign.key", "ann.sign.pub", "bob.sign.pub"},
+        "ann": own["ann"] | {"ann.sign.key", "car.sign.pub"},
+        "bob": own["bob"] | {"bob.sign.key", "car.sign.pub"},
+        "sky": own["sky"],
+    }
+
+
+def test_adding_names(run: Run, made: Path) -> None:
+    """Run again with another name, it adds it under the same authority, changes no other file, and tells all."""
+    before = {path: path.read_bytes() for path in made.iterdir()}
+    code, out, _ = run("keys", "--operator", "operator-2", "--days", "3000")
+    assert code == 0
+    assert "operator-1.sign.pub operator-2.sign.pub" in out
+    certificate(made, "operator-2").verify_directly_issued_by(certificate(made, "authority"))
+    assert certificate(made, "operator-2").not_valid_after_utc == certificate(made, "authority").not_valid_after_utc
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list(made.iterdir())) == len(before) + len(ENDINGS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "keys for nobody"),
+        (["--vehicle", "a/b"], "nobody can be called 'a/b'"),
+        (["--operator", "**"], r"nobody can be called '\*\*'"),
+        (["--operator", "authority"], "nobody can be called 'authority'"),
+        (["--vehicle", "one", "--operator", "one"], "'one' is there twice"),
+        (["--vehicle", "one", "--host", "192.0.2.7:7448"], "leave out port and protocol"),
+        (["--vehicle", "one", "--host", "tcp/192.0.2.7"], "leave out port and protocol"),
+        (["--vehicle", "one", "--host", "straße.example"], "neither an address nor a host name"),
+        (["--operator", "one", "--host", "192.0.2.7"], "name one with --vehicle or --cloud"),
+        (["--vehicle", "one", "--days", "0"], "choose 1 to 3650"),
+        (["--vehicle", "one", "--days", "100000"], "choose 1 to 3650"),
+    ],
+)
+def test_bad_input(run: Run, arguments: list[str], sentence: str) -> None:
+    """What nothing can be made of is said in one sentence, with exit code 2, and nothing is made."""
+    code, out, err = run("keys", *arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("lavt: ")
+    assert not Path("keys").exists()
+    assert re.search(sentence, err)
+
+
+def test_nothing_is_overwritten(run: Run, made: Path) -> None:
+    """A name that is there already is refused, and nothing of the same command is made."""
+    before = {path: path.read_bytes() for path in made.iterdir()}
+    code, _, err = run("keys", "--operator", "operator-2", "--vehicle", "vehicle-1")
+    assert code == 2
+    assert "keys/vehicle-1.key exists and is not overwritten" in err
+    assert {path: path.read_bytes() for path in made.iterdir()} == before
+
+
+def test_damaged_authority(run: Run, made: Path) -> None:
+    """Half an authority, another's key and what is no certificate are said, and nothing is signed."""
+    key = (made / "authority.key").read_bytes()
+    (made / "authority.key").unlink()
+    assert run("keys", "--operator", "two")[0::2] == (
+        2,
+        "lavt: keys/authority.key is missing: copy it back, or make a new authority in another directory\n",
+    )
+    shutil.copy(made / "vehicle-1.key", made / "authority.key")
+    assert "not that of its certificate" in run("keys", "--operator", "two")[2]
+    (made / "authority.key").write_bytes(b"nonsense")
+    assert "no private key in PEM" in run("keys", "--operator", "two")[2]
+    (made / "authority.key").write_bytes(key)
+    (made / "authority.pem").write_bytes(b"nonsense")
+    assert "no certificate in PEM" in run("keys", "--operator", "two")[2]
+    assert not list(made.glob("two*"))
+
+
+def test_others_may_not_look(run: Run) -> None:
+    """A directory that others may look into, or a file in its place, is refused."""
+    Path("open").mkdir(mode=0o755)
+    Path("file").touch()
+    assert "chmod 700 open" in run("open", "--vehicle", "one")[2]
+    assert "file is a file: name a directory" in run("file", "--vehicle", "one")[2]
+
+
+def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without cryptography a sentence says what to install."""
+    monkeypatch.delitem(sys.modules, "lavt.transport.certificates", raising=False)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    import lavt.transport
+
+    monkeypatch.delattr(lavt.transport, "certificates", raising=False)
+    code, _, err = run("keys", "--vehicle", "one")
+    assert code == 2
+    assert "pip install 'lavt[secure]'" in err

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from lavt.config_file import shipped
+from lavt.transport.clock_probe import encode_request
+from lavt.transport.rendezvous import wrap, write_registration
+
+HERE = "127.0.0.1"
+ENDS_S = 30.0
+
+
+@contextmanager
+def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
+    """Run the command at ports of its own."""
+    changes = [word for change in (f"bind={HERE}", "video_port=0", "probe_port=0") for word in ("--set", change)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lavt", "rendezvous", str(shipped("configs/rendezvous.yaml")), *changes, *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def vehicle() -> Iterator[socket.socket]:
+    """The vehicle's socket, which a client's stands in for, too."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind((HERE, 0))
+        opened.settimeout(ENDS_S)
+        yield opened
+
+
+def test_says_where_it_is_and_where_the_vehicle_is(vehicle: socket.socket) -> None:
+    """Its ports come first, then from where the vehicle registers, flow by flow; Ctrl-C ends it with 0."""
+    with rendezvous() as process:
+        assert process.stdout is not None
+        said = r"forwarding video at port (\d+) and probes at \d+; Ctrl-C ends it\n"
+        first = re.fullmatch(said, process.stdout.readline())
+        assert first is not None
+        vehicle.sendto(write_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
+        assert process.stdout.readline() == f"video: vehicle-1 is at {HERE}:{vehicle.getsockname()[1]}\n"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=ENDS_S)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+def test_what_it_says_to_programs(vehicle: socket.socket) -> None:
+    """As JSON: ports, where the vehicle is, and in the end what became of each flow's datagrams."""
+    with rendezvous("--json") as process, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind((HERE, 0))
+        client.settimeout(ENDS_S)
+        assert process.stdout is not None
+        ports = json.loads(process.stdout.readline())["ready"]
+        there = (HERE, ports["probe_port"])
+        vehicle.sendto(write_registration("vehicle-1", "probe", 1, None), there)
+        at = {"flow": "probe", "vehicle_at": list(vehicle.getsockname())}
+        assert json.loads(process.stdout.readline()) == at
+        client.sendto(encode_request(1, 2), there)
+        assert vehicle.recv(100) == wrap(client.getsockname(), encode_request(1, 2))
+        vehicle.sendto(wrap(client.getsockname(), b"reply"), there)
+        assert client.recv(100) == b"reply"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=ENDS_S)
+    counts = {"video": {}, "probe": {"registrations": 1, "to_vehicle": 1, "to_clients": 1}}
+    assert (process.returncode, json.loads(out), err) == (0, {"counts": counts}, "")

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+import ctypes
+import platform
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from lavt.config_file import shipped
+from lavt.experiment.processes import Processes
+
+TGKILL = 234
+"""Linux's system call that sends a signal to one thread (x86-64)."""
+ENDS_S = 5.0
+
+
+@pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="needs the number of tgkill")
+def test_signal_to_another_thread(tmp_path: Path) -> None:
+    """A router ends also where the kernel gives the signal to one of Zenoh's threads, which does not wake Python's."""
+    with Processes(tmp_path) as processes:
+        file = str(shipped("zenoh-configs/router-server.json5"))
+        router = processes.start("router", "router", file, "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]')
+        router.ready()
+        pid = router.popen.pid
+        thread = max(int(task.name) for task in Path(f"/proc/{pid}/task").iterdir())
+        assert thread != pid
+        assert ctypes.CDLL(None).syscall(TGKILL, pid, thread, int(signal.SIGINT)) == 0
+        assert router.popen.wait(ENDS_S) == 0

@@ -1,0 +1,204 @@
+"""A server that drives a software car over CAN, as real processes, and what somebody beside the car sees of it."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lavt.clock import MachineClock, pause
+from lavt.config import RunConfig
+from lavt.config_file import parse_config
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.plan import plan_run
+from lavt.experiment.processes import LAVT, Processes
+from lavt.experiment.real_run import Loop, start_loop
+from lavt.experiment.sides import server_config
+
+GROUP = "239.74.163.2"
+"""Of UDP multicast, which is a CAN bus between processes where the kernel has none."""
+CLOCK = MachineClock()
+LONGEST_NS = 60 * NS_PER_S
+ATTEMPTS = 4
+GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        trial.bind(("127.0.0.1", 0))
+        return int(trial.getsockname()[1])
+
+
+def proved(profile: str, work: Path) -> RunConfig:
+    """Give a run whose vehicle is a software car on a bus of its own; that its watchdog brakes is proved."""
+    run = run_config(profile, work / f"{profile}.json")
+    config = write_config(run, work / f"{profile}.yaml")
+    with software_car(config) as car:
+        command = [sys.executable, "-m", "lavt", "can", "prove", str(config), "--yes"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, (done.stderr, car.news)
+    return run
+
+
+def write_config(run: RunConfig, path: Path) -> Path:
+    """Write the server's part of a run."""
+    path.write_text(yaml.safe_dump(server_config(run, plan_run(run).seed).model_dump(mode="json")))
+    return path
+
+
+def run_config(profile: str, proof: Path) -> RunConfig:
+    """Give a run whose vehicle is a software car on a bus of its own."""
+    dbw = {
+        "profile": profile,
+        "interface": "udp_multicast",
+        "channel": GROUP,
+        "options": {"port": free_port()},
+        "truth": f"127.0.0.1:{free_port()}",
+        "steering_sign": 1,
+        "watchdog_proof": str(proof),
+    }
+    said = {
+        "vehicle": {"kind": "dbw", "route": "a_key", "scenery": "none", "dbw": dbw},
+        "camera": {"width_px": 320, "height_px": 240, "rate_hz": 30},
+        "network": {"injection": "none"},
+        "time": "real",
+    }
+    return parse_config(RunConfig, said, "the run")
+
+
+@dataclass
+class Car:
+    """`lavt software-car` as a process, and what it told."""
+
+    process: subprocess.Popen[str]
+    news: list[dict[str, Any]] = field(default_factory=list)
+    _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
+    _reader: threading.Thread = field(default_factory=threading.Thread)
+
+    def __post_init__(self) -> None:
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        assert "ready" in (self._lines.get(timeout=60) or {})
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._lines.put(json.loads(line))
+        self._lines.put(None)
+
+    def act(self, words: str) -> int:
+        """Say words to it; tell when."""
+        assert self.process.stdin is not None
+        at_ns = CLOCK.now().mono_ns
+        self.process.stdin.write(words + "\n")
+        self.process.stdin.flush()
+        return at_ns
+
+    def heard(self, kind: str, text: str, *, since_ns: int = 0) -> int | None:
+        """Tell when something was first told after a time; None: it was not."""
+        while not self._lines.empty():
+            line = self._lines.get()
+            if line is not None and "kind" in line:
+                self.news.append(line)
+        told = (each for each in self.news if each["kind"] == kind and text in each["text"])
+        return next((each["mono_ns"] for each in told if each["mono_ns"] >= since_ns), None)
+
+    def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = LONGEST_NS) -> int:
+        """Wait until it tells something; tell when that was."""
+        end_ns = CLOCK.now().mono_ns + within_ns
+        while CLOCK.now().mono_ns < end_ns:
+            at_ns = self.heard(kind, text, since_ns=since_ns)
+            if at_ns is not None:
+                return at_ns
+            pause(5 * NS_PER_MS)
+        raise AssertionError(f"the car told no {kind!r} with {text!r}: {self.news}")
+
+    def end(self) -> None:
+        """End it, as Ctrl-C does."""
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(20)
+        self._reader.join()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+@contextmanager
+def software_car(config: Path) -> Iterator[Car]:
+    """Start a software car of a server's config."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lavt", "software-car", str(config), "--json"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    car = Car(process)
+    try:
+        yield car
+    finally:
+        car.end()
+
+
+@dataclass
+class Driven:
+    """A drive over CAN that is under way."""
+
+    car: Car
+    loop: Loop
+    out: Path
+    actuator_pid: int
+
+    def status(self) -> dict[str, Any]:
+        """Give what the server told of itself last."""
+        told: dict[str, Any] = self.loop.server.latest.get("status", {})
+        return told
+
+    def drives(self) -> bool:
+        """Wait until it drives at more than 5 m/s; False where it was stopped before."""
+        end_ns = CLOCK.now().mono_ns + LONGEST_NS
+        while CLOCK.now().mono_ns < end_ns and self.status().get("safety") != "safe_stop":
+            if self.status().get("speed_mps", 0.0) > 5.0:
+                return True
+            if self.car.heard("watchdog", "watchdog brakes") is not None:
+                break
+            pause(20 * NS_PER_MS)
+        return False
+
+    def wait(self, what: Callable[[dict[str, Any]], bool], why: str) -> None:
+        """Wait until the server's status says something."""
+        end_ns = CLOCK.now().mono_ns + LONGEST_NS
+        while not what(self.status()):
+            assert CLOCK.now().mono_ns < end_ns, f"{why}: {self.loop.server.latest}, {self.car.news}"
+            pause(20 * NS_PER_MS)
+
+
+@contextmanager
+def driving(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
+    """Drive a software car at more than 5 m/s, over routers and sockets of the loopback.
+
+    Where other work on the machine holds it up before, so that the kit lets go, all is started again, with a new car.
+    """
+    for attempt in range(ATTEMPTS):
+        attempt_dir = work / f"attempt-{attempt}"
+        attempt_dir.mkdir()
+        with started(run, attempt_dir, program=program) as driven:
+            if driven.drives() or attempt == ATTEMPTS - 1:
+                yield driven
+                return
+
+
+@contextmanager
+def started(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
+    """Start a software car, its server and a client."""
+    with software_car(write_config(run, work / "car.yaml")) as car, Processes(work) as processes:
+        loop = start_loop(processes, plan_run(run), work, work, once=False, server_program=program)
+        yield Driven(car, loop, work, loop.server_ready["actuator_pid"])

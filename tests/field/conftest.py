@@ -1,0 +1,33 @@
+"""What the tests in networks of their own share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from tests.field.namespaces import kernel_refuses, programs_missing
+from tests.require import need
+
+
+@pytest.fixture(scope="session")
+def namespaces() -> None:
+    """Have network namespaces, or skip."""
+    if kernel_refuses():
+        need("namespaces", "needs root and a kernel that lets it make network namespaces with NAT")
+    if programs_missing():
+        need("namespaces", "needs ip and nft: apt-get install iproute2 nftables")
+
+
+@pytest.fixture(scope="session")
+def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Print what was measured, whatever becomes of the test."""
+    plugins = request.config.pluginmanager
+    reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
+    assert reporter is not None
+    assert capture is not None
+
+    def lines(text: str) -> None:
+        with capture.global_and_fixture_disabled():
+            reporter.write_line(f"\n{text}")
+
+    return lines

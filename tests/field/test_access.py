@@ -1,0 +1,367 @@
+"""Who may do what at the routers of the encrypted configs: by certificate, and by the rights of a socket file."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from tests.field import attacked
+from tests.field.secured import (
+    QUIC,
+    Client,
+    Intruder,
+    Site,
+    Vehicle,
+    dialled,
+    make_keys,
+    open_session,
+    port,
+    start_router,
+    tls_changes,
+)
+from tests.require import need
+
+from lavt.control.limits import CLIENT_LIMITS
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.processes import Processes
+from lavt.experiment.record import Record
+from lavt.experiment.table import MISSING, IntArray, Table
+from lavt.streams import stream
+from lavt.transport.zenoh_link import quiet_logs
+
+pytest.importorskip("cryptography")
+pytestmark = pytest.mark.realtime
+
+DRIVES = {"commands", "questions", "session", "netem", "state", "alive"}
+EVERYTHING = DRIVES | {
+    "wildcard commands",
+    "deletes",
+    "long commands",
+    "the routers' own state",
+    "forged state",
+    "forged answers",
+    "others' commands",
+}
+WATCHES = {"state", "alive"}
+MAY = [("operator-1", DRIVES), ("operator-2", set()), ("monitor-1", WATCHES)]
+"""Name in the certificate, and all that it achieves; operator-2 is of the same authority, but in no list."""
+NOBODY = 65534
+CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
+    "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
+)
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `lavt keys` makes for a site."""
+    directory = tmp_path_factory.mktemp("authority") / "keys"
+    names = ("--vehicle=vehicle-1", "--operator=operator-1", "--operator=operator-2", "--monitor=monitor-1")
+    make_keys(directory, *names, "--cloud=cloud-1")
+    return directory
+
+
+@pytest.fixture(scope="module")
+def others_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same names of another authority, which calls itself the same."""
+    directory = tmp_path_factory.mktemp("other") / "keys"
+    make_keys(directory, "--vehicle=vehicle-1", "--operator=operator-1")
+    return directory
+
+
+def site_of(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site:
+    """Start the routers, the vehicle and the operator, and see that they work together.
+
+    The changes are of the router that others dial.
+    """
+    quiet_logs()
+    work = Path(stack.enter_context(TemporaryDirectory()))
+    work.chmod(0o755)  # what others may not do is then a matter of the sockets alone
+    processes = stack.enter_context(Processes(work))
+    sockets = {name: work / f"{name}.sock" for name in ("vehicle", "operator")}
+    local = {name: f"unixsock-stream/{path}" for name, path in sockets.items()}
+    if cloud:
+        middle = start_router(
+            processes,
+            "cloud",
+            "router-cloud-tls.json5",
+            f'listen.endpoints=["{QUIC}"]',
+            *tls_changes(keys, "cloud-1", "listen"),
+            *changes,
+        )
+        endpoint = dialled(middle)
+        vehicle = start_router(
+            processes,
+            "vehicle",
+            "router-server-to-cloud-tls.json5",
+            f'listen.endpoints=["{local["vehicle"]}"]',
+            f'connect.endpoints=["{endpoint}"]',
+            *tls_changes(keys, "vehicle-1", "connect"),
+        )
+        vehicle.ready()
+    else:
+        vehicle = start_router(
+            processes,
+            "vehicle",
+            "router-server-tls.json5",
+            f'listen.endpoints=["{local["vehicle"]}", "{QUIC}"]',
+            *tls_changes(keys, "vehicle-1", "listen"),
+            *changes,
+        )
+        endpoint = dialled(vehicle)
+    start_router(
+        processes,
+        "operator",
+        "router-client-tls.json5",
+        f'listen.endpoints=["{local["operator"]}"]',
+        f'connect.endpoints=["{endpoint}"]',
+        *tls_changes(keys, "operator-1", "connect"),
+    ).ready()
+    car = Vehicle(local["vehicle"])
+    stack.callback(car.session.close)
+    operator = Client(open_session(local["operator"]), b"operator")
+    stack.callback(operator.session.close)
+    site = Site(keys, endpoint, sockets["operator"], car, operator, processes)
+    site.drive()
+    return site
+
+
+@pytest.fixture(scope="module")
+def direct_site(keys: Path) -> Iterator[Site]:
+    """The operator's router dials the vehicle's."""
+    with ExitStack() as stack:
+        yield site_of(stack, keys, cloud=False)
+
+
+@pytest.fixture(scope="module")
+def cloud_site(keys: Path) -> Iterator[Site]:
+    """Both dial a cloud's router."""
+    with ExitStack() as stack:
+        yield site_of(stack, keys, cloud=True)
+
+
+@pytest.fixture(params=["direct_site", "cloud_site"])
+def site(request: pytest.FixtureRequest) -> Site:
+    """Each kind of site in turn, with nothing left of what was tried before."""
+    found: Site = request.getfixturevalue(request.param)
+    for kept in (found.vehicle.commands, found.vehicle.asked, found.operator.answers, *found.operator.heard.values()):
+        kept.clear()
+    found.vehicle.deleted = 0
+    return found
+
+
+@pytest.mark.parametrize("mode", ["client", "router"])
+@pytest.mark.parametrize(("name", "achieves"), MAY)
+def test_by_name(site: Site, name: str, achieves: set[str], mode: str) -> None:
+    """The named operator drives and asks; another name of the same authority nothing; a monitor sees the state only.
+
+    None of them reaches anybody by wildcards, deletes, long messages, forged states or forged answers.
+    """
+    with closing(site.intruder(name, mode)) as intruder:
+        site.drive(intruder.attempt)
+        assert intruder.achieved(site) == achieves
+
+
+def test_without_the_lists(keys: Path) -> None:
+    """With access and lengths not limited the same attempts all reach their aim: so the other tests would see them."""
+    with ExitStack() as stack:
+        site = site_of(stack, keys, "access_control.enabled=false", "low_pass_filter=[]", cloud=False)
+        intruder = stack.enter_context(closing(site.intruder("monitor-1", "router")))
+        site.drive(intruder.attempt)
+        assert intruder.achieved(site) == EVERYTHING
+
+
+def test_operators_own_router(site: Site) -> None:
+    """Through the operator's own router all commands, questions, answers and states of the operator come through."""
+    site.drive()
+    assert set(site.vehicle.commands) == {b"operator"}
+    assert set(site.vehicle.asked) == {b"operator"}
+
+
+def test_other_authority(site: Site, keys: Path, others_keys: Path) -> None:
+    """A certificate of another authority gets no link, though its names are the same, and the drive goes on."""
+
+    def try_again() -> None:
+        with pytest.raises(zenoh.ZError):
+            open_session(site.endpoint, authority=keys / "authority.pem", own=others_keys / "operator-1.pem")
+
+    try_again()
+    site.drive()
+
+
+def test_no_certificate(site: Site, keys: Path) -> None:
+    """Who shows no certificate gets no link, and the drive goes on."""
+    with pytest.raises(zenoh.ZError):
+        open_session(site.endpoint, authority=keys / "authority.pem")
+    site.drive()
+
+
+@pytest.mark.parametrize(("whose", "name"), [("others_keys", "vehicle-1"), ("keys", "operator-1")])
+def test_false_vehicle(keys: Path, whose: str, name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """An operator does not link to a router of another authority, nor to one with an operator's stolen key."""
+    theirs = request.getfixturevalue(whose)
+    with Processes(tmp_path) as processes:
+        false = start_router(
+            processes,
+            "false",
+            "router-cloud-tls.json5",
+            f'listen.endpoints=["{QUIC}"]',
+            *tls_changes(theirs, name, "listen"),
+        )
+        with pytest.raises(zenoh.ZError):
+            open_session(dialled(false), authority=keys / "authority.pem", own=keys / "operator-1.pem")
+
+
+def test_garbage_at_the_port(site: Site) -> None:
+    """Random datagrams, and such as begin like QUIC, at the open port keep no command, state or answer from coming."""
+    chance = stream(1, "garbage")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+
+        def garbage() -> None:
+            for begin in (b"", b"\xc0\x00\x00\x00\x01\x08", b"\x40"):
+                for length in (0, 20, 1200, 1400):
+                    stranger.sendto(begin + chance.bytes(length), ("127.0.0.1", port(site.endpoint)))
+
+        site.drive(garbage)
+    assert set(site.vehicle.commands) == {b"operator"}
+    with closing(site.intruder("operator-1", "client")):  # and it still takes new links
+        pass
+
+
+def test_local_process_without_rights(direct_site: Site) -> None:
+    """On the operator's machine, who may not write to the socket file does not get in: all but its owner."""
+    if os.geteuid() != 0:
+        need("root", "needs root, to be somebody else")
+    path = direct_site.operator_socket
+    assert stat.S_IMODE(path.stat().st_mode) & 0o002 == 0
+
+    def as_nobody() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-c", CONNECT, str(path)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    assert "PermissionError" in as_nobody().stderr
+    former = path.stat().st_mode
+    path.chmod(0o777)
+    assert as_nobody().returncode == 0
+    path.chmod(former)
+
+
+def test_local_process_with_rights(direct_site: Site) -> None:
+    """A process that may write to the operator's socket is the operator to the access list: so commands are signed."""
+    with closing(Intruder(open_session(f"unixsock-stream/{direct_site.operator_socket}"))) as intruder:
+        direct_site.drive(intruder.attempt)
+        assert "commands" in intruder.achieved(direct_site)
+
+
+# A whole drive, with somebody at the operator's router who has the rights that the socket's file should keep from him.
+
+
+@pytest.fixture(scope="module")
+def attacked_drive(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> attacked.Drive:
+    """A drive with the secure configs, quiet at first, and then under one attack after the other."""
+    pytest.importorskip("pylibsrtp")
+    return attacked.drive(tmp_path_factory.mktemp("attacked"), keys)
+
+
+def counted(record: Record, name: str) -> int:
+    values = record.table("counts").ints(name)
+    return int(np.sum(values[values != MISSING]))
+
+
+def during(drive: attacked.Drive, name: str, mono_ns: IntArray) -> Any:
+    began_ns, ended_ns = drive.phases[name]
+    return (mono_ns > began_ns) & (mono_ns < ended_ns)
+
+
+def obeyed(drive: attacked.Drive) -> Table:
+    admissions = drive.server.table("admission")
+    return admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+
+
+COMMAND_PERIOD_MS = CLIENT_LIMITS.command_period_ns / NS_PER_MS
+SAID = ("sequence", "steering_rad", "throttle", "brake", "mode", "stamp_ns", "sent_wall_ns")
+
+
+def said(table: Table, *names: str) -> list[tuple[Any, ...]]:
+    return list(zip(*(table.objects(name) for name in ("epoch", *names)), strict=True))
+
+
+def test_only_what_the_operator_said_is_obeyed(attacked_drive: attacked.Drive) -> None:
+    """Every command obeyed is one that the client sent, as it sent it, and none is obeyed twice, in any attack."""
+    commands = obeyed(attacked_drive)
+    by_the_client = set(said(attacked_drive.client.table("control"), *SAID))
+    done = said(commands, *SAID)
+
+    assert set(done) <= by_the_client
+    assert len(set(said(commands, "sequence"))) == len(commands)
+    for name in attacked_drive.phases:
+        assert np.sum(during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
+
+
+def test_what_was_forged_is_counted(attacked_drive: attacked.Drive) -> None:
+    """Repeated, altered and forged commands came in their thousands, and were refused and counted."""
+    server = attacked_drive.server
+    assert attacked_drive.sent["repeated"] > 1000
+    assert attacked_drive.sent["flood"] > 0.5 * attacked.FLOOD_PER_S * attacked.PHASE_NS / NS_PER_S
+    assert counted(server, "commands_forged") > 500
+    assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent["flood"]
+    assert counted(server, "session_requests_of_another_time") > 10
+    assert counted(server, "refused: not newer than the last command") > 100
+
+
+def test_only_what_the_vehicle_said_is_shown(attacked_drive: attacked.Drive) -> None:
+    """Every state that reached the client's driver is one that the server told; what else came was counted."""
+    names = ("sent_wall_ns", "state_mono_ns", "speed_mps", "safety", "applied_sequence")
+    told, shown = (
+        list(zip(*(record.table("state").objects(name) for name in names), strict=True))
+        for record in (attacked_drive.server, attacked_drive.client)
+    )
+
+    assert set(shown) <= set(told)
+    assert len(set(shown)) == len(shown)
+    assert len(shown) > 0.9 * len(told) - 100
+    assert counted(attacked_drive.client, "states_replayed") > 100
+    assert counted(attacked_drive.client, "states_forged") > 100
+
+
+def test_the_drive_goes_on_under_every_attack(attacked_drive: attacked.Drive) -> None:
+    """From the first second of the attacks to the last the vehicle is driven, and never stopped."""
+    events = attacked_drive.server.table("event")
+    began_ns, ended_ns = attacked_drive.phases["quiet"][0], attacked_drive.phases["flood"][1]
+    meanwhile = events.where((events.ints("mono_ns") > began_ns) & (events.ints("mono_ns") < ended_ns))
+
+    assert attacked_drive.last_status["safety"] == "driving"
+    assert not [detail for detail in meanwhile.texts("detail") if "stop" in detail]
+
+
+def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive) -> None:
+    """Ten thousand commands a second, known by their codes alone, cost a period in the median at most."""
+    sent_ns = dict(
+        zip(
+            said(attacked_drive.client.table("control"), "sequence"),
+            attacked_drive.client.table("control").mono_ns,
+            strict=True,
+        )
+    )
+    commands = obeyed(attacked_drive)
+    received_ns = commands.ints("received_mono_ns")
+    delays_ms = np.array(
+        [(at_ns - sent_ns[key]) / NS_PER_MS for key, at_ns in zip(said(commands, "sequence"), received_ns, strict=True)]
+    )
+    quiet, flood = (np.median(delays_ms[during(attacked_drive, name, received_ns)]) for name in ("quiet", "flood"))
+
+    assert flood - quiet < COMMAND_PERIOD_MS, f"{quiet:.2f} ms, and under the flood {flood:.2f} ms"

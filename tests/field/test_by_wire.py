@@ -1,0 +1,174 @@
+"""Faults of processes in a drive over CAN, seen from the car: what happens, how soon, and that no command stands."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+from tests.field import by_wire
+from tests.field.by_wire import CLOCK, GENERATIONS, Driven, driving
+
+from lavt.clock import pause
+from lavt.config import RunConfig
+from lavt.domain import NS_PER_MS, NS_PER_S
+
+pytest.importorskip("can")
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
+
+Tell = Callable[[str], None]
+Proved = Callable[[str], RunConfig]
+
+HOGGING = (str(Path(__file__).with_name("hogging.py")),)
+ROOM_MS = 60
+"""For a busy machine, beside what the design promises."""
+KIT_MS = 100
+"""The kit lets go so long after the last command."""
+SILENCE_MS = 500
+"""The vehicle's side stops so long after the last command."""
+
+
+@pytest.fixture(scope="module")
+def proved(tmp_path_factory: pytest.TempPathFactory) -> Proved:
+    """Give the run with a profile; that the kit's watchdog brakes is proved once."""
+    return cache(lambda profile: by_wire.proved(profile, tmp_path_factory.mktemp("proof")))
+
+
+@pytest.fixture(autouse=True)
+def signs_of_hogging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Say where the signs for `hogging.py` are."""
+    monkeypatch.setenv("LAVT_HOG", str(tmp_path))
+
+
+def ms_since(at_ns: int, since_ns: int) -> float:
+    return (at_ns - since_ns) / NS_PER_MS
+
+
+def held(driven: Driven, since_ns: int) -> float:
+    """Wait until the kit has let go and brakes by its watchdog; tell how long after something."""
+    at_ns = driven.car.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
+    return ms_since(at_ns, since_ns)
+
+
+def parked(driven: Driven, since_ns: int) -> float:
+    """Wait until the car stands in park, which the actuator asks for once it stands, and nothing is enabled."""
+    at_ns = driven.car.wait("gear", "gear PARK", since_ns=since_ns)
+    driven.car.wait("enabled", "lets go", since_ns=since_ns)
+    assert driven.car.heard("watchdog", "brakes", since_ns=since_ns) is None, "it was stopped without the watchdog"
+    return ms_since(at_ns, since_ns)
+
+
+@pytest.mark.parametrize("profile", GENERATIONS)
+def test_a_route_is_driven_over_can(profile: str, tmp_path: Path, tell: Tell, proved: Proved) -> None:
+    """The server drives the software car over CAN to the end of the route, then parks it and lets go."""
+    with driving(proved(profile), tmp_path) as driven:
+        driven.wait(lambda _: driven.loop.server.latest.get("ending") is not None, "the drive does not end")
+        assert driven.loop.server.latest["ending"] == "completed"
+        ended_ns = CLOCK.now().mono_ns
+        tell(f"{profile}: parked {parked(driven, ended_ns - NS_PER_S):.0f} ms after the end of the drive was seen")
+
+
+@pytest.mark.parametrize("how", ["frozen", "killed", "busy"])
+def test_a_server_that_stands_still_stops_the_car(how: str, tmp_path: Path, tell: Tell, proved: Proved) -> None:
+    """Frozen, killed, or held by a thread of its own: the actuator's process stops the car, parks it and lets go."""
+    with driving(proved("dataspeed_gen1"), tmp_path, program=HOGGING) as driven:
+        server = driven.loop.server.popen
+        since_ns = CLOCK.now().mono_ns
+        if how == "busy":
+            (tmp_path / "hog_server").touch()
+        else:
+            server.send_signal(signal.SIGSTOP if how == "frozen" else signal.SIGKILL)
+        took_ms = parked(driven, since_ns)
+        tell(f"server {how}: in park {took_ms:.0f} ms after")
+        assert SILENCE_MS < took_ms < 6000
+        if how == "frozen":
+            server.send_signal(signal.SIGCONT)
+            pause(NS_PER_S)
+            assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None, "nothing of before is obeyed"
+            assert driven.status()["safety"] == "safe_stop"
+
+
+@pytest.mark.parametrize(
+    ("how", "profile"),
+    [("frozen", GENERATIONS[0]), ("frozen", GENERATIONS[1]), ("killed", GENERATIONS[0]), ("busy", GENERATIONS[1])],
+)
+def test_an_actuator_that_stands_still_leaves_a_braking_car(
+    how: str, profile: str, tmp_path: Path, tell: Tell, proved: Proved
+) -> None:
+    """No frame leaves an actuator's process that does not run: the kit lets go after 100 ms, and brakes."""
+    with driving(proved(profile), tmp_path, program=HOGGING) as driven:
+        since_ns = CLOCK.now().mono_ns
+        if how == "busy":
+            (tmp_path / "hog_actuator").touch()
+        else:
+            os.kill(driven.actuator_pid, signal.SIGSTOP if how == "frozen" else signal.SIGKILL)
+        took_ms = held(driven, since_ns)
+        tell(f"actuator {how}, {profile}: the kit brakes {took_ms:.0f} ms after")
+        assert KIT_MS - 25 < took_ms < KIT_MS + ROOM_MS
+        if how == "frozen":
+            os.kill(driven.actuator_pid, signal.SIGCONT)
+        if how == "killed":
+            assert driven.loop.server.popen.wait(30) == 1
+            assert "the process of the actuator has ended" in driven.loop.server.said()
+        else:
+            driven.wait(lambda status: status.get("safety") == "safe_stop", "the server does not say that it stopped")
+        assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None, "nothing of before is obeyed"
+
+
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_machine_that_stands_still_leaves_a_braking_car(
+    how: signal.Signals, tmp_path: Path, tell: Tell, proved: Proved
+) -> None:
+    """With both processes frozen or killed the kit lets go after 100 ms, and brakes; thawed, nothing is obeyed."""
+    with driving(proved("dataspeed_gen2"), tmp_path) as driven:
+        since_ns = CLOCK.now().mono_ns
+        os.killpg(driven.loop.server.popen.pid, how)
+        took_ms = held(driven, since_ns)
+        tell(f"both, {how.name}: the kit brakes {took_ms:.0f} ms after")
+        assert KIT_MS - 25 < took_ms < KIT_MS + ROOM_MS
+        if how == signal.SIGSTOP:
+            pause(2 * NS_PER_S)
+            os.killpg(driven.loop.server.popen.pid, signal.SIGCONT)
+            pause(NS_PER_S)
+            assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
+            assert driven.status()["safety"] != "driving"
+
+
+@pytest.mark.parametrize(
+    ("words", "safety"),
+    [("driver_steers 3", "disarmed"), ("driver_brakes 0.3", "disarmed"), ("fault steering.FLTPWR", "safe_stop")],
+)
+def test_what_happens_in_the_car_reaches_the_server(
+    words: str, safety: str, tmp_path: Path, tell: Tell, proved: Proved
+) -> None:
+    """A driver who takes over has the car at once, and a fault stops it; the server says so in words."""
+    with driving(proved("dataspeed_gen1"), tmp_path) as driven:
+        at_ns = driven.car.act(words)
+        let_go_ns = driven.car.wait("enabled", "lets go", since_ns=at_ns)
+        driven.wait(lambda status: status.get("safety") == safety, "the server does not say what happened")
+        pause(NS_PER_S // 2)
+        tell(f"{words}: first axis let go {ms_since(let_go_ns, at_ns):.0f} ms after; {driven.status()['because']}")
+        assert driven.car.heard("enabled", "obeys: steering", since_ns=at_ns) is None
+
+
+def test_a_server_that_is_told_to_end_parks_the_car(tmp_path: Path, tell: Tell, proved: Proved) -> None:
+    """Ctrl-C on the server stops the car, parks it and lets go, and ends with 0."""
+    with driving(proved("dataspeed_gen2"), tmp_path) as driven:
+        since_ns = CLOCK.now().mono_ns
+        driven.loop.server.popen.send_signal(signal.SIGINT)
+        tell(f"told to end: in park {parked(driven, since_ns):.0f} ms after")
+        assert driven.loop.server.popen.wait(20) == 0
+
+
+def test_without_a_proof_that_the_watchdog_brakes_nothing_is_armed(tmp_path: Path, tell: Tell) -> None:
+    """Arming is refused, in words, unless it was proved that this kit on this bus brakes when nothing is sent."""
+    run = by_wire.run_config("dataspeed_gen2", tmp_path / "none.json")
+    with by_wire.started(run, tmp_path) as driven:
+        driven.wait(lambda status: "watchdog" in status.get("refused", ""), "the server does not say why")
+        tell(driven.status()["refused"])
+        pause(2 * NS_PER_S)
+        assert driven.status()["safety"] == "disarmed"
+        assert driven.car.heard("enabled", "obeys: ") is None

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from benchmarks import control_round_trip
+from benchmarks.round_trip import carriers
+from benchmarks.round_trip.side import command
+
+from lavt.domain import Command
+from lavt.transport.messages import decode
+
+PROGRAM = Path(control_round_trip.__file__)
+
+
+def paced(p50_us: float) -> control_round_trip.Measured:
+    times = {"p50_us": p50_us, "p95_us": 2 * p50_us, "p99_us": 4 * p50_us, "lost": 0.0}
+    return {"at_50_hz": times, "back_to_back": times}
+
+
+def test_a_real_command_is_sent() -> None:
+    """What goes round is a command that the vehicle can read, of about 200 bytes."""
+    assert decode(Command, command(7)).sequence == 7
+    assert 150 < len(command(7)) < 250
+
+
+def test_medians_over_rounds_and_ratios_to_raw_udp() -> None:
+    """The last line has medians over the rounds, and how many times those of raw UDP they are."""
+    found = control_round_trip.summary({"udp": [paced(10), paced(20), paced(30)], "zenoh": [paced(50)]})
+    assert found["udp"]["at_50_hz"]["p50_us"] == 20
+    assert found["udp"]["at_50_hz"]["p50_ratio"] == 1
+    assert found["zenoh"]["back_to_back"]["p99_us"] == 200
+    assert found["zenoh"]["back_to_back"]["p99_ratio"] == 2.5
+
+
+def test_without_raw_udp_there_are_no_ratios() -> None:
+    """A carrier that is measured alone has times only."""
+    assert set(control_round_trip.summary({"zenoh": [paced(50)]})["zenoh"]["at_50_hz"]) == set(paced(1)["at_50_hz"])
+
+
+def test_lost_echoes_are_counted() -> None:
+    """An echo that did not come is no time, and is told."""
+    found = control_round_trip.percentiles("udp", [1000, None, 3000])
+    assert (found["p50_us"], found["lost"]) == (2.0, 1)
+
+
+def test_what_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where pyzmq is missing the benchmark says how to install it and, with nothing else asked, ends with 2."""
+    monkeypatch.setattr(carriers, "find_spec", lambda _name: None)
+    monkeypatch.setattr(sys, "argv", ["control_round_trip.py", "--only", "pyzmq"])
+    assert control_round_trip.main() == 2
+    assert "pip install pyzmq" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--rounds", "0"], ["--seconds", "0"], ["--messages", "0"]])
+def test_nothing_is_not_measured(words: list[str]) -> None:
+    """A benchmark of no rounds, no time or no messages is refused with exit status 2."""
+    with pytest.raises(SystemExit) as ended:
+        control_round_trip.arguments(words)
+    assert ended.value.code == 2
+
+
+@pytest.mark.realtime
+def test_the_benchmark_of_the_control_runs() -> None:
+    """`benchmarks/control_round_trip.py` measures a command through two real routers beside raw UDP."""
+    done = subprocess.run(
+        [sys.executable, PROGRAM, "--only", "udp", "--only", "zenoh", "--rounds", "1", "--seconds", "1"],
+        capture_output=True, text=True, check=False, timeout=200,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert list(last) == ["udp", "zenoh"]
+    for pace in ("at_50_hz", "back_to_back"):
+        assert 0 < last["udp"][pace]["p50_us"] < last["zenoh"][pace]["p50_us"]
+        assert last["zenoh"][pace]["p50_ratio"] > 1
+    assert "| Zenoh through two routers, as LAVT has it | " in done.stdout
+
+
+def test_a_carrier_that_is_installed_brings_an_echo_back() -> None:
+    """Pyzmq and CycloneDDS, where they are installed, carry a command there and back as it was."""
+    names = [name for name, carrier in carriers.CARRIERS.items() if carrier.module and not carrier.missing]
+    if not names:
+        pytest.skip("needs pyzmq or cyclonedds: pip install pyzmq cyclonedds")
+    for name in names:
+        found = control_round_trip.run(name, ("", ""), 0.1, 5)
+        assert found["back_to_back"]["lost"] == 0

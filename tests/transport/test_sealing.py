@@ -1,0 +1,295 @@
+# ruff: noqa: D102 (a helper of tests: short methods say themselves what they do)
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest
+from lavt.transport.messages import decode, encode
+
+pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from lavt.transport.sealing import NoSeal, OperatorSeal, VehicleSeal
+from lavt.transport.signing import PrivateKey
+
+COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
+TOKEN = bytes(range(16))
+GRANTED = SessionReply(True, "", 77, TOKEN, 5600, "kernel", 0)
+
+
+def new_key() -> PrivateKey:
+    return PrivateKey(Ed25519PrivateKey.generate())
+
+
+VEHICLE, ALICE, BOB, MALLORY = (new_key() for _ in range(4))
+OPERATORS = {"alice": ALICE.public, "bob": BOB.public}
+
+
+class Pair:
+    """A vehicle and an operator, and nothing between them but bytes."""
+
+    def __init__(self, who: str = "alice", key: PrivateKey = ALICE, vehicle: VehicleSeal | None = None) -> None:
+        self.who = who
+        self.vehicle = vehicle or VehicleSeal("car", VEHICLE, OPERATORS)
+        self.operator = OperatorSeal("car", who, key, VEHICLE.public)
+
+    def request(self, operation: str = "hold", number: int = 0) -> bytes:
+        request = SessionRequest(operation, self.who, 5, number)  # type: ignore[arg-type]
+        return self.operator.seal_request("session", encode(request))
+
+    def ask(self, data: bytes, reply: SessionReply = GRANTED) -> tuple[bytes, bytes | None]:
+        """Let the vehicle take a request: its reply's bytes, and what the operator reads in it."""
+        request = self.vehicle.open_request("session", data)
+        assert request is not None
+        sealed = self.vehicle.seal_reply(request, b"" if request.is_stale else encode(reply))
+        opened = self.operator.open_reply("session", sealed)
+        return sealed, opened.again if request.is_stale else opened.body
+
+    def hold(self) -> None:
+        _, again = self.ask(self.request())
+        assert again is not None
+        _, body = self.ask(again)
+        assert body == encode(GRANTED)
+
+    def command(self, command: Command = COMMAND) -> bytes:
+        return self.operator.seal_command(encode(command))
+
+
+@pytest.fixture
+def pair() -> Pair:
+    return Pair()
+
+
+def test_the_first_request_is_asked_again_and_then_granted(pair: Pair) -> None:
+    """A server that has just started takes no request but with a place of its own, which its reply tells."""
+    request = pair.vehicle.open_request("session", pair.request())
+    assert request is not None
+    assert request.is_stale
+    pair.hold()
+
+
+def test_a_command_of_the_holder_is_opened(pair: Pair) -> None:
+    """What the holder has signed comes out as it went in, and its code says cheaply that it is the holder's."""
+    pair.hold()
+    assert pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
+
+
+def test_nobody_but_the_holder_commands(pair: Pair) -> None:
+    """Another operator's command is refused, though his key is known; so is that of a key nobody knows."""
+    pair.hold()
+    for other in (Pair("bob", BOB), Pair("alice", MALLORY)):
+        assert not pair.vehicle.is_from_holder(other.command())
+        assert pair.vehicle.open_command(other.command()) is None
+    assert pair.vehicle.counts["commands_forged"] == 2
+
+
+def test_any_operator_stops_the_vehicle(pair: Pair) -> None:
+    """An emergency stop in a command is heard from every operator whose key is known, and from nobody else."""
+    pair.hold()
+    stop = replace(COMMAND, emergency_stop=9)
+    assert pair.vehicle.open_command(Pair("bob", BOB).command(stop)) == encode(stop)
+    assert pair.vehicle.open_command(Pair("bob", MALLORY).command(stop)) is None
+
+
+def test_after_a_release_nobody_commands(pair: Pair) -> None:
+    """When the holder has released the vehicle his commands are no longer his to give."""
+    pair.hold()
+    pair.ask(pair.request("release"), SessionReply(True, "", 0, b"", 5600, "kernel", 0))
+    assert not pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.open_command(pair.command()) is None
+
+
+def test_an_altered_command_is_refused(pair: Pair) -> None:
+    """A change of any byte of a command, its code or its signature makes it a forgery; the code shows it cheaply."""
+    pair.hold()
+    sealed = pair.command()
+    for at in range(len(sealed)):
+        altered = sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :]
+        within = at < len(sealed) - 64
+        assert not (within and pair.vehicle.is_from_holder(altered))
+        in_the_code = len(sealed) - 80 <= at < len(sealed) - 64
+        assert (pair.vehicle.open_command(altered) is None) != in_the_code
+
+
+def test_the_code_of_one_kind_serves_for_no_other(pair: Pair) -> None:
+    """What the holder has sent as one kind of message is cheaply told from another, as is the next from one before."""
+    pair.hold()
+    request = pair.request()
+    assert pair.vehicle.is_next_of_holder("session", request)
+    assert not pair.vehicle.is_next_of_holder("netem", request)
+    assert not pair.vehicle.is_from_holder(request)
+    pair.ask(request)
+    assert not pair.vehicle.is_next_of_holder("session", request)
+    state = pair.vehicle.seal_state(b"state")
+    assert pair.operator.is_next_state(state)
+    assert pair.operator.open_state(state).body == b"state"
+    assert not pair.operator.is_next_state(state)
+
+
+def test_a_command_for_another_vehicle_is_refused(pair: Pair) -> None:
+    """A signature serves for one vehicle only."""
+    pair.hold()
+    elsewhere = OperatorSeal("truck", "alice", ALICE, VEHICLE.public)
+    assert pair.vehicle.open_command(elsewhere.seal_command(encode(COMMAND))) is None
+
+
+def test_a_replayed_request_is_not_looked_at(pair: Pair) -> None:
+    """The same bytes once more are stale: nothing is decided on them, and nobody else can read what is answered."""
+    pair.hold()
+    data = pair.request("release")
+    pair.ask(data)
+    again = pair.vehicle.open_request("session", data)
+    assert again is not None
+    assert again.is_stale
+    assert pair.vehicle.counts["session_requests_of_another_time"] == 2
+
+
+def test_a_request_to_another_process_of_the_server_is_not_looked_at(pair: Pair) -> None:
+    """What was asked of a server before it was started anew is stale after it."""
+    pair.hold()
+    data = pair.request("hold")
+    anew = VehicleSeal("car", VEHICLE, OPERATORS).open_request("session", data)
+    assert anew is not None
+    assert anew.is_stale
+
+
+def test_an_emergency_stop_is_not_asked_twice(pair: Pair) -> None:
+    """An emergency stop counts at once, whatever its place: its own number refuses a replay."""
+    request = pair.vehicle.open_request("session", pair.request("emergency_stop", 7))
+    assert request is not None
+    assert not request.is_stale
+
+
+def test_a_request_in_another_name_is_refused(pair: Pair) -> None:
+    """Nobody asks in the name of another operator, nor without a name that is known."""
+    for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
+        assert pair.vehicle.open_request("session", Pair(name, key).request()) is None
+    forged = pair.operator.seal_request("session", encode(SessionRequest("hold", "bob", 5, 0)))
+    assert pair.vehicle.open_request("session", forged) is None
+    assert pair.vehicle.counts["session_requests_forged"] == 4
+
+
+def test_the_token_is_read_by_who_asked_only(pair: Pair) -> None:
+    """A reply holds the token encrypted, for whoever has asked and nobody else."""
+    _, again = pair.ask(pair.request())
+    assert again is not None
+    sealed, _ = pair.ask(again)
+    assert TOKEN not in sealed
+    assert Pair().operator.open_reply("session", sealed).body is None
+
+
+def test_a_reply_counts_once(pair: Pair) -> None:
+    """A reply of the vehicle is taken once; one to no request of ours, altered or of another vehicle never."""
+    pair.hold()
+    sealed, body = pair.ask(pair.request())
+    assert body is not None
+    assert pair.operator.open_reply("session", sealed).body is None
+    data = pair.request()
+    request = pair.vehicle.open_request("session", data)
+    assert request is not None
+    sealed = pair.vehicle.seal_reply(request, encode(GRANTED))
+    for at in range(len(sealed)):
+        assert (
+            pair.operator.open_reply("session", sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :]).body is None
+        )
+    other = VehicleSeal("car", MALLORY, OPERATORS)
+    asked = other.open_request("session", data)
+    assert asked is not None
+    assert pair.operator.open_reply("session", other.seal_reply(asked, b"")).again is None
+    assert pair.operator.open_reply("netem", sealed).body is None
+    assert pair.operator.open_reply("session", sealed).body == encode(GRANTED)
+
+
+def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
+    """A reply that comes after that to a later query says what is no longer so: it is dropped."""
+    pair.hold()
+    replies = []
+    for _ in range(2):
+        request = pair.vehicle.open_request("session", pair.request())
+        assert request is not None
+        replies.append(pair.vehicle.seal_reply(request, b"" if request.is_stale else encode(GRANTED)))
+    assert pair.operator.open_reply("session", replies[1]).again is not None
+    assert pair.operator.open_reply("session", replies[0]).body is None
+
+
+def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
+    """A state is shown once, in order, and only where the vehicle has signed it."""
+    pair.hold()
+    first, second = pair.vehicle.seal_state(b"first"), pair.vehicle.seal_state(b"second")
+    assert pair.operator.open_state(second).body == b"second"
+    assert pair.operator.open_state(second).body is None
+    assert pair.operator.open_state(first).body is None
+    assert pair.operator.counts["states_replayed"] == 2
+    forged = VehicleSeal("car", MALLORY, OPERATORS)
+    forged._instance = pair.vehicle._instance
+    forged._states = 100
+    assert pair.operator.open_state(forged.seal_state(b"forged")).body is None
+    assert pair.operator.counts["states_forged"] == 1
+
+
+def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pair) -> None:
+    """A state of a server's process that has not answered a request may be a recorded one: it is asked first."""
+    pair.hold()
+    anew = VehicleSeal("car", VEHICLE, OPERATORS)
+    opened = pair.operator.open_state(anew.seal_state(b"new"))
+    assert opened.body is None
+    assert opened.ask
+    pair.vehicle = anew
+    pair.ask(pair.operator.seal_request("session", b""))
+    assert pair.operator.open_state(anew.seal_state(b"newer")).body == b"newer"
+
+
+def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
+    """Requests for a condition do not make those of the session stale."""
+    pair.hold()
+    session = pair.request()
+    netem = encode(NetemRequest("alice", 5, "L4", 0, 0.0, 0.0, 0.0, "uniform", 0.0, 1.0, 0, 0.0, 0.0))
+    asked = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", netem))
+    assert asked is not None
+    again = pair.operator.open_reply("netem", pair.vehicle.seal_reply(asked, b"")).again
+    assert again is not None
+    asked = pair.vehicle.open_request("netem", again)
+    assert asked is not None
+    reply = pair.operator.open_reply("netem", pair.vehicle.seal_reply(asked, encode(NetemReply(True, ""))))
+    assert decode(NetemReply, reply.body or b"").granted
+    request = pair.vehicle.open_request("session", session)
+    assert request is not None
+    assert not request.is_stale
+
+
+def test_what_waits_is_bounded(pair: Pair) -> None:
+    """Neither requests without replies nor clients that come and go take more and more memory."""
+    for _ in range(50):
+        pair.request()
+        pair.vehicle.open_request("session", Pair().request())
+    assert len(pair.operator._asked) <= 8
+    assert len(pair.vehicle._agreements) <= 8
+
+
+@given(st.binary(max_size=1400))
+def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
+    """Whatever comes in at any of the openings is refused without an error."""
+    pair = Pair()
+    assert not pair.vehicle.is_from_holder(data)
+    assert pair.vehicle.open_command(data) is None
+    assert pair.vehicle.open_request("session", data) is None
+    assert pair.vehicle.open_request("netem", data) is None
+    assert pair.operator.open_reply("session", data).body is None
+    assert pair.operator.open_state(data).body is None
+
+
+def test_without_keys_everything_is_as_it_is() -> None:
+    """Where nothing is signed, bytes go in and out unchanged."""
+    seal = NoSeal()
+    request = seal.open_request("session", b"request")
+    assert request is not None
+    assert {seal.body(b"x"), seal.open_command(b"x"), seal.seal_state(b"x"), seal.seal_reply(request, b"x")} == {b"x"}
+    assert request.body == b"request"
+    assert seal.is_from_holder(b"x")

@@ -1,0 +1,149 @@
+"""The adapter, a software car and the time: frames go both ways at once; what reaches the wheels is written down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import pytest
+
+from lavt.build.dbw import load_profile
+from lavt.domain import NS_PER_MS, Actuation, VehicleEvent
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.dbw.profile import Profile
+from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.simulator import Simulator
+from lavt.vehicle.software_car.car import SoftwareCar
+from lavt.vehicle.software_car.kit import Kit
+
+START_NS = 77_000_000_123
+STEP_NS = NS_PER_MS
+"""The rig's time goes in steps of so much; nothing is measured finer."""
+
+
+@cache
+def profile(name: str) -> Profile:
+    return load_profile(name, steering_sign=1)
+
+
+@cache
+def road() -> Road:
+    return load_road("a_key")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a car was and what reached its wheels at a time."""
+
+    at_ns: int
+    wheels: Actuation
+    is_asked: bool
+    """Something commanded reaches the wheels: an axis is enabled."""
+    state: str
+
+
+class Rig:
+    """An adapter that drives a software car; `tick_ms` apart it is told `actuation`.
+
+    `spoil` may change what the adapter sends on its way to the car, or lose it (None); `lose_report` loses what the car
+    sends; `is_cut` loses both.
+    """
+
+    def __init__(self, generation: int, *, tick_ms: int = 20, start_frames: bool = True, **keys: Any) -> None:
+        name = keys.pop("profile", f"dataspeed_gen{generation}")
+        self.profile: Profile = name if isinstance(name, Profile) else profile(name)
+        self.generation, self.tick_ns = generation, tick_ms * NS_PER_MS
+        adapter_keys = {key: keys.pop(key) for key in ("hindrance",) if key in keys}
+        self.adapter = Adapter(self.profile, start_ns=START_NS, **adapter_keys)
+        self.simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
+        self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **keys)
+        self.car = SoftwareCar(self.kit, self.simulator)
+        self.now_ns = START_NS
+        self.actuation = Actuation(0.0, 0.0, 1.0)
+        self.is_ticking, self.is_cut = True, False
+        self.spoil: Callable[[Frame], Frame | None] = lambda frame: frame
+        self.lose_report: Callable[[Frame], bool] = lambda _: False
+        self.sent: list[tuple[int, Frame]] = []
+        self.moments: list[Moment] = []
+        self.events: list[VehicleEvent] = []
+        self._next_tick_ns = START_NS
+        if start_frames:
+            self.run_ms(400)
+
+    def run_ms(self, duration_ms: int) -> None:
+        """Let time pass."""
+        for _ in range(duration_ms):
+            self.now_ns += STEP_NS
+            self._step()
+
+    def run_until(self, condition: Callable[[Rig], bool], limit_ms: int = 5000) -> int:
+        """Let time pass until something is so; gives how many milliseconds it took."""
+        for passed_ms in range(limit_ms):
+            if condition(self):
+                return passed_ms
+            self.run_ms(1)
+        raise AssertionError(f"not in {limit_ms} ms: {self.adapter.state()}")
+
+    def _step(self) -> None:
+        for frame in self.car.advance(self.now_ns):
+            if not self.is_cut and not self.lose_report(frame):
+                self.adapter.receive(frame, self.now_ns)
+        if self.is_ticking and self.now_ns >= self._next_tick_ns:
+            self._next_tick_ns = self.now_ns + self.tick_ns
+            self.adapter.ask(self.actuation, self.now_ns)
+        for frame in self.adapter.frames_due(self.now_ns):
+            self.sent.append((self.now_ns, frame))
+            if not self.is_cut and (spoiled := self.spoil(frame)) is not None:
+                self.car.receive(spoiled, self.now_ns)
+        self.events += self.adapter.take_events()
+        self.moments.append(
+            Moment(self.now_ns, self.kit.actuation(self.now_ns), bool(self.enabled()), self.adapter._state)
+        )
+
+    def enabled(self) -> set[str]:
+        """Axes of the kit that obey."""
+        return {axis for axis, actuator in self.kit.state.actuators.items() if actuator.is_enabled}
+
+    @property
+    def state(self) -> str:
+        """Of the adapter."""
+        return self.adapter._state
+
+    @property
+    def speed_mps(self) -> float:
+        """Of the car."""
+        return self.simulator.state().speed_mps
+
+    def engage(self) -> None:
+        """Get to where the car obeys, as the gate does: brake on."""
+        self.actuation = Actuation(self.simulator.state().steering_rad, 0.0, 1.0)
+        self.adapter.engage(True, self.now_ns)
+        self.run_until(lambda rig: rig.state == "engaged")
+
+    def let_go_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
+        """Let time pass until nothing commanded reaches the wheels any more; how long after `since_ns` that was."""
+        self.run_until(lambda rig: not rig.enabled(), limit_ms)
+        return (self.now_ns - since_ns) // NS_PER_MS
+
+
+def driving(generation: int, **keys: Any) -> Rig:
+    """A car that goes at 5 m/s or a little more, steered a little to the left."""
+    rig = Rig(generation, **keys)
+    rig.engage()
+    rig.actuation = Actuation(0.01, 0.5, 0.0)
+    rig.run_until(lambda rig: rig.speed_mps > 5.0, 10_000)
+    rig.sent.clear()
+    rig.events.clear()
+    return rig
+
+
+def with_limits(generation: int, **limits: float) -> Profile:
+    """A profile with other limits."""
+    found = profile(f"dataspeed_gen{generation}")
+    return replace(found, limits=replace(found.limits, **limits))
+
+
+both = pytest.mark.parametrize("generation", [1, 2])

@@ -1,0 +1,43 @@
+"""The safety gate, the adapter and a software car together: who has the car after a stop."""
+
+from __future__ import annotations
+
+from tests.control.rig import new_limiter
+from tests.vehicle.dbw.rig import Rig, both
+
+from lavt.control.limits import LIMITS
+from lavt.control.safety import SafetyGate
+from lavt.domain import SessionRequest
+from lavt.vehicle.software_car.state import Gear
+
+
+def new_gate() -> SafetyGate:
+    epochs = iter(range(1000))
+    return SafetyGate(LIMITS, new_limiter(), new_epoch=lambda: next(epochs), new_token=lambda: b"token")
+
+
+def decide(rig: Rig, gate: SafetyGate) -> None:
+    """Have the gate say what the car shall do, as the actuator node does."""
+    state = rig.adapter.state()
+    rig.actuation = gate.actuation(state, rig.now_ns)
+    rig.adapter.engage(gate.needs(state), rig.now_ns)
+
+
+@both
+def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generation: int) -> None:
+    """After an emergency stop, at rest and parked, a driver drives off by hand: the kit is not engaged again."""
+    rig, gate = Rig(generation), new_gate()
+    rig.engage()
+    assert gate.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
+    for _ in range(2000):
+        decide(rig, gate)
+        rig.run_ms(1)
+    assert (gate.state, rig.state) == ("emergency_stop", "idle")
+    rig.sent.clear()
+    rig.kit.driver_shifts(Gear.DRIVE, rig.now_ns)
+    rig.kit.driver_throttles(0.2, rig.now_ns)
+    for _ in range(2000):
+        decide(rig, gate)
+        rig.run_ms(1)
+    assert not rig.sent
+    assert rig.speed_mps > 0.1

@@ -1,0 +1,608 @@
+"""What goes wrong while driving: how long something commanded still reaches the wheels, and what is said about it.
+
+The kit acts in the millisecond in which a frame reaches it; the adapter knows with the next report. Times are those of
+the rig, exact to its step of 1 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from tests.vehicle.dbw.rig import Rig, both, driving, profile
+
+from lavt.domain import NS_PER_MS, Actuation
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
+from lavt.vehicle.software_car.state import AXES, Gear
+
+STEERING = {1: 0x064, 2: 0x200}
+
+
+def last_sent_ns(rig: Rig) -> int:
+    return max(at_ns for at_ns, _ in rig.sent)
+
+
+def is_lost(rig: Rig) -> bool:
+    return rig.state == "lost"
+
+
+def stop_and_disengage(rig: Rig) -> None:
+    """Let the car come to a stand as somebody has to, by the brake pedal, and be wanted no more."""
+    rig.kit.driver_brakes(0.5, rig.now_ns)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000)
+    rig.run_ms(50)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(150)
+    rig.kit.driver_brakes(0.0, rig.now_ns)
+    rig.run_ms(150)
+
+
+# Commands that do not arrive, or are wrong.
+
+
+@both
+def test_commands_lost(generation: int) -> None:
+    """Commands that do not arrive: 100 ms after the last that did nothing commanded stands, and the watchdog brakes."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
+    cut_ns = rig.now_ns
+    rig.spoil = lambda _: None
+    assert rig.let_go_ms(cut_ns) == 100
+    assert rig.kit.state.brake == WATCHDOG_BRAKE
+    assert rig.run_until(is_lost) <= 20
+    rig.run_ms(150)
+    state = rig.adapter.state()
+    assert not state.is_engaged
+    assert "the kit has let go of" in state.hindrance or "watchdog" in state.hindrance
+    assert any("watchdog" in event.detail for event in rig.events)
+    assert {event.kind for event in rig.events} == {"fault"}
+
+
+@both
+def test_counter_stuck(generation: int) -> None:
+    """A counter that stands still: the kit lets go of all axes with that frame, and brakes."""
+    rig = driving(generation)
+    stuck: list[int] = []
+
+    def spoil(frame: Frame) -> Frame:
+        if frame.identifier != STEERING[generation]:
+            return frame
+        place = 7 if generation == 1 else 6
+        stuck.append(frame.data[place])
+        data = frame.data[:place] + bytes([stuck[0]]) + frame.data[place + 1 :]
+        return sealed(frame.identifier, data) if generation == 2 else Frame(frame.identifier, data)
+
+    rig.spoil = spoil
+    rig.run_until(lambda _: len(stuck) == 2)
+    assert rig.let_go_ms(rig.now_ns) == 0
+    assert rig.kit.state.brake == WATCHDOG_BRAKE
+    assert rig.run_until(is_lost) <= 20
+    assert not rig.adapter.state().is_engaged
+
+
+def sealed(identifier: int, data: bytes) -> Frame:
+    """Give a frame its CRC by division, bit by bit."""
+    number = int.from_bytes(identifier.to_bytes(2, "big") + data[:-1], "big") << 8
+    bits = 8 * (2 + len(data) - 1)
+    number ^= 0xFF << bits
+    for bit in range(bits + 7, 7, -1):
+        if number >> bit & 1:
+            number ^= 0x11D << bit - 8
+    return Frame(identifier, data[:-1] + bytes([number ^ 0xFF]))
+
+
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_checksum_wrong(part: int) -> None:
+    """A wrong checksum on any axis (generation 2): the kit lets go of all axes with that frame, and brakes."""
+    rig = driving(2)
+    spoiled: list[int] = []
+
+    def spoil(frame: Frame) -> Frame:
+        if frame.identifier != 0x200 + part or spoiled:
+            return frame
+        spoiled.append(rig.now_ns)
+        return Frame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 0x40]))
+
+    rig.spoil = spoil
+    rig.run_until(lambda _: bool(spoiled))
+    assert rig.let_go_ms(spoiled[0]) == 0
+    assert rig.run_until(is_lost) <= 20
+    rig.run_ms(100)
+    assert "SystemReport says crc" in "; ".join(rig.adapter._reports.said("reason"))
+    assert rig.kit.state.brake == WATCHDOG_BRAKE
+
+
+@both
+def test_ticks_stop(generation: int) -> None:
+    """Ticks that stop: nothing leaves after 60 ms, and nothing commanded stands 100 ms after the last frame."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: rig.adapter._asked_ns == rig.now_ns)
+    stopped_ns, rig.is_ticking = rig.now_ns, False
+    took_ms = rig.let_go_ms(stopped_ns)
+    left_ms = (last_sent_ns(rig) - stopped_ns) // NS_PER_MS
+    assert 40 < left_ms <= 60
+    assert took_ms == left_ms + 100
+    assert rig.adapter.counts["ticks_missed"] == 1
+    assert "no command has left for 100 ms" in [event.detail for event in rig.events]
+    rig.is_ticking = True
+    rig.run_ms(500)
+    assert rig.state == "lost"
+    assert rig.enabled() == set()
+
+
+@both
+def test_frozen(generation: int) -> None:
+    """A server that froze: what it finds in its buffers of before moves nothing; no axis is enabled again."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
+    frozen_ns, waiting = rig.now_ns, []
+    rig.now_ns += 2000 * NS_PER_MS
+    waiting = rig.car.advance(rig.now_ns)[:30]
+    assert not rig.enabled()
+    rig.sent.clear()
+    for frame in waiting:  # the oldest, as they were read
+        rig.adapter.receive(frame, rig.now_ns)
+        rig.adapter.ask(rig.actuation, rig.now_ns)
+        for sent in rig.adapter.frames_due(rig.now_ns):
+            rig.sent.append((rig.now_ns, sent))
+            rig.car.receive(sent, rig.now_ns)
+    rig.run_ms(500)
+    assert rig.state == "lost"
+    assert rig.now_ns > frozen_ns
+    assert rig.sent
+    assert {is_enabling(rig.generation, frame) for _, frame in rig.sent} == {False}
+
+
+def is_enabling(generation: int, frame: Frame) -> bool:
+    """Whether a frame has its EN, or asks the system to enable."""
+    if generation == 1:
+        return bool(frame.data[2 if frame.identifier == 0x064 else 3] & 1)
+    return frame.identifier == 0x216 or bool(frame.data[2] & 0x10)
+
+
+SOMEBODY_ELSES = {
+    1: [Frame(0x064, bytes(8)), Frame(0x060, bytes(4)), Frame(0x066, bytes(1))],
+    2: [Frame(0x201, bytes(8)), Frame(0x203, bytes(4)), Frame(0x216, bytes(2))],
+}
+"""Of an axis, of another length or a gear, and of the system or a gear: which bytes does not matter."""
+
+
+@both
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_somebody_else_commands_and_nobody_is_engaged(generation: int, which: int) -> None:
+    """While somebody else commands the kit, and for 1 s after, it is not engaged: a server may still be stopping it."""
+    rig = Rig(generation)
+    rig.adapter.receive(SOMEBODY_ELSES[generation][which], rig.now_ns)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(999)
+    assert (rig.state, rig.sent) == ("idle", [])
+    assert "somebody else on the bus commands the kit" in rig.adapter.state().hindrance
+    assert rig.adapter.counts["foreign_commands"] == 1
+    rig.run_ms(2)
+    assert rig.state == "clearing"
+    assert rig.adapter.state().hindrance == ""
+
+
+@both
+def test_somebody_else_commands_while_driving(generation: int) -> None:
+    """A second sender ends the drive with its first frame: no throttle any more, and the brake as asked."""
+    rig = driving(generation)
+    rig.adapter.receive(SOMEBODY_ELSES[generation][0], rig.now_ns)
+    assert rig.state == "lost"
+    assert "somebody else on the bus commands the kit" in rig.adapter.state().hindrance
+    rig.actuation = Actuation(0.01, 0.5, 0.4)
+    rig.run_ms(200)
+    assert (rig.moments[-1].wheels.throttle, round(rig.moments[-1].wheels.brake, 2)) == (0.0, 0.4)
+
+
+# The driver.
+
+OVERRIDES: dict[str, Callable[[Rig], None]] = {
+    "steering": lambda rig: rig.kit.driver_steers(3.0, rig.now_ns),
+    "brake": lambda rig: rig.kit.driver_brakes(0.3, rig.now_ns),
+    "throttle": lambda rig: rig.kit.driver_throttles(0.3, rig.now_ns),
+    "gear": lambda rig: rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns),
+}
+HANDS_OFF: dict[str, Callable[[Rig], None]] = {
+    "steering": lambda rig: rig.kit.driver_steers(0.0, rig.now_ns),
+    "brake": lambda rig: rig.kit.driver_brakes(0.0, rig.now_ns),
+    "throttle": lambda rig: rig.kit.driver_throttles(0.0, rig.now_ns),
+    "gear": lambda _: None,
+}
+WORDS = {
+    "steering": "the driver steers",
+    "brake": "the driver brakes",
+    "throttle": "the driver gives throttle",
+    "gear": "the driver has shifted",
+}
+PERIOD_MS = {"steering": 10, "brake": 20, "throttle": 20, "gear": 100}
+"""Of the reports that tell it."""
+
+
+@both
+@pytest.mark.parametrize("part", OVERRIDES)
+def test_override(generation: int, part: str) -> None:
+    """The driver takes over: all axes are free at once (generation 2), or with the report that says so (1)."""
+    rig = driving(generation)
+    taken_ns = rig.now_ns
+    OVERRIDES[part](rig)
+    if part in AXES:
+        assert part not in rig.enabled()
+    took_ms = rig.let_go_ms(taken_ns)
+    assert took_ms == 0 if generation == 2 else took_ms <= PERIOD_MS[part]
+    rig.run_until(lambda rig: rig.state == "overridden", PERIOD_MS[part] + 1)
+    rig.run_ms(PERIOD_MS[part])
+    state = rig.adapter.state()
+    assert (state.is_overridden, state.is_engaged) == (True, False)
+    assert "the driver has taken over" in state.hindrance
+    assert any(WORDS[part] in event.detail for event in rig.events)
+    assert rig.kit.state.watchdog == 0
+
+
+@both
+@pytest.mark.parametrize("part", OVERRIDES)
+def test_override_is_latched(generation: int, part: str) -> None:
+    """An override holds with hands off and at a stand; it ends when driving is not wanted there, and CLEAR follows."""
+    rig = driving(generation)
+    OVERRIDES[part](rig)
+    rig.run_until(lambda rig: rig.state == "overridden")
+    HANDS_OFF[part](rig)
+    rig.run_ms(300)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(20)
+    rig.adapter.engage(True, rig.now_ns)  # while it moves: of no use
+    rig.run_ms(300)
+    assert (rig.state, rig.enabled()) == ("overridden", set())
+    rig.kit.driver_brakes(0.5, rig.now_ns)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000)
+    rig.kit.driver_brakes(0.0, rig.now_ns)
+    rig.run_ms(500)
+    assert (rig.state, rig.adapter.state().is_overridden) == ("overridden", True)
+    assert rig.kit.state.is_overridden
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(20)
+    assert (rig.state, rig.adapter.state().hindrance) == ("idle", "")
+    assert rig.kit.state.is_overridden
+    rig.engage()
+    assert not rig.kit.state.is_overridden
+    assert rig.enabled() == set(AXES)
+
+
+@both
+def test_hands_on(generation: int) -> None:
+    """With hands on the wheel an override cannot be cleared: after 3 s it is said so, and nothing was enabled."""
+    rig = driving(generation)
+    rig.kit.driver_steers(3.0, rig.now_ns)
+    stop_and_disengage(rig)
+    rig.moments.clear()
+    rig.adapter.engage(True, rig.now_ns)
+    took_ms = rig.run_until(lambda rig: rig.state == "overridden")
+    assert 3000 <= took_ms <= 3010
+    assert any(event.detail.startswith("the kit did not clear in 3 s: the driver steers") for event in rig.events)
+    assert not any(moment.is_asked for moment in rig.moments)
+    assert rig.adapter.state().is_overridden
+
+
+# Faults of the kit.
+
+FAULTS_1 = (
+    *(f"steering.{bit}" for bit in ("FLTPWR", "FLTBUS1", "FLTBUS2", "FLTCAL")),
+    *(f"{pedal}.{bit}" for pedal in ("brake", "throttle") for bit in ("FLT1", "FLT2", "FLTPWR")),
+)
+FAULTS = [(1, name) for name in FAULTS_1] + [(2, f"{part}.fault") for part in (*AXES, "gear")]
+
+
+@pytest.mark.parametrize(("generation", "name"), FAULTS)
+def test_fault(generation: int, name: str) -> None:
+    """A fault: the kit lets go of all axes at once, and its watchdog brakes; the part is named with the next report."""
+    rig = driving(generation)
+    rig.kit.set_fault(name, rig.now_ns)
+    assert rig.let_go_ms(rig.now_ns) == 0
+    assert rig.kit.state.brake == WATCHDOG_BRAKE
+    assert rig.run_until(is_lost) <= 20
+    rig.run_ms(100)
+    part = "gearbox" if name.startswith("gear") else name.partition(".")[0]
+    assert f"the {part}" in rig.adapter.state().hindrance
+    assert any(f"the {part}" in event.detail for event in rig.events)
+
+
+def test_gear_fault_of_generation_1() -> None:
+    """A fault of generation 1's gearbox, on which the kit does not act: no throttle and the asked brake, in 100 ms."""
+    rig = driving(1)
+    rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
+    broken_ns = rig.now_ns
+    rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
+    assert (rig.now_ns - broken_ns) // NS_PER_MS <= 101
+    assert rig.enabled() == set(AXES)
+    rig.actuation = Actuation(0.0, 1.0, 0.6)
+    rig.run_ms(200)
+    assert (rig.kit.state.throttle, round(rig.kit.state.brake, 3)) == (0.0, 0.6)
+    assert rig.adapter.state().hindrance == "the gearbox has a bus fault"
+
+
+def test_fault_without_a_watchdog() -> None:
+    """A kit of generation 1 without a watchdog keeps the other axes: they brake as asked, without throttle."""
+    rig = driving(1, has_watchdog=False)
+    rig.kit.set_fault("steering.FLTPWR", rig.now_ns)
+    broken_ns = rig.now_ns
+    rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
+    assert (rig.now_ns - broken_ns) // NS_PER_MS <= 11
+    assert rig.enabled() == {"brake", "throttle"}
+    rig.kit.set_fault("steering.FLTPWR", rig.now_ns, is_set=False)
+    rig.actuation = Actuation(0.0, 0.5, 0.6)
+    rig.run_ms(300)
+    assert rig.enabled() == {"brake", "throttle"}
+    assert (rig.kit.state.throttle, round(rig.kit.state.brake, 3)) == (0.0, 0.6)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "idle")
+    assert rig.kit.state.gear == Gear.PARK
+
+
+@both
+def test_fault_latches(generation: int) -> None:
+    """A fault that goes away leaves the car lost until driving was not wanted; then it can be engaged anew."""
+    name = "steering.FLTPWR" if generation == 1 else "steering.fault"
+    rig = driving(generation)
+    rig.kit.set_fault(name, rig.now_ns)
+    rig.run_ms(200)
+    rig.kit.set_fault(name, rig.now_ns, is_set=False)
+    rig.run_ms(1000)
+    assert rig.state == "lost"
+    assert rig.adapter.state().hindrance != ""
+    stop_and_disengage(rig)
+    assert (rig.state, rig.adapter.state().hindrance) == ("idle", "")
+    rig.engage()
+    assert rig.enabled() == set(AXES)
+
+
+@both
+def test_fault_before(generation: int) -> None:
+    """A fault that is there hinders before anything was begun, and nothing is sent while it is."""
+    name = "brake.FLT1" if generation == 1 else "brake.fault"
+    rig = Rig(generation)
+    rig.kit.set_fault(name, rig.now_ns)
+    rig.run_ms(50)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(500)
+    assert rig.sent == []
+    assert "the brake has a fault" in rig.adapter.state().hindrance
+
+
+@both
+def test_watchdog(generation: int) -> None:
+    """After the watchdog has tripped somebody has to take over; then the car is engaged anew, by CLEAR."""
+    rig = driving(generation)
+    rig.is_ticking = False
+    rig.run_ms(300)
+    rig.is_ticking = True
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 10_000)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(500)
+    assert rig.kit.state.watchdog_brakes
+    if generation == 1:
+        assert rig.adapter.state().hindrance == "the kit's watchdog brakes: take over by a pedal"
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(4000)
+    assert rig.enabled() == set()
+    assert "watchdog" in rig.adapter.state().hindrance
+    rig.adapter.engage(False, rig.now_ns)
+    rig.kit.driver_brakes(0.5, rig.now_ns)
+    rig.run_ms(100)
+    rig.kit.driver_brakes(0.0, rig.now_ns)
+    rig.run_ms(200)
+    rig.engage()
+    assert rig.enabled() == set(AXES)
+    assert rig.kit.state.watchdog == 0
+
+
+# The bus.
+
+
+@both
+def test_bus_off(generation: int) -> None:
+    """A kit that is off the bus lets go 100 ms after the last command, and is missed by its reports' time-out."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
+    rig.kit.bus_off(rig.now_ns)
+    cut_ns = rig.now_ns
+    assert rig.let_go_ms(cut_ns) == 100
+    rig.run_until(is_lost)
+    shortest_ms = min(report.timeout_ns for report in rig.profile.reports.values()) // NS_PER_MS
+    assert shortest_ms - 10 <= (rig.now_ns - cut_ns) // NS_PER_MS <= shortest_ms
+    rig.run_ms(400)
+    assert rig.adapter.state().hindrance.count("no ") == len(rig.profile.reports)
+    rig.kit.bus_off(rig.now_ns, is_off=False)
+    rig.run_ms(500)
+    assert rig.enabled() == set()
+    assert not rig.adapter.state().is_engaged
+
+
+@both
+def test_bus_gone(generation: int) -> None:
+    """A bus that is gone takes no frame any more at once; the kit lets go 100 ms after the last command."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
+    cut_ns, rig.is_cut = rig.now_ns, True
+    rig.adapter.bus_gone("can0 is down", rig.now_ns)
+    state = rig.adapter.state()
+    assert (state.is_engaged, state.hindrance) == (False, "can0 is down")
+    assert rig.let_go_ms(cut_ns) == 100
+    assert last_sent_ns(rig) == cut_ns
+    rig.is_cut = False
+    rig.run_ms(500)
+    assert rig.state == "lost"
+    assert rig.enabled() == set()
+    stop_and_disengage(rig)
+    rig.engage()
+
+
+REPORTS: dict[int, tuple[str, ...]] = {
+    1: ("SteeringReport", "BrakeReport", "ThrottleReport", "GearReport"),
+    2: (
+        "SteerReport1",
+        "BrakeReport1",
+        "ThrtlReport1",
+        "GearReport1",
+        "VehicleVelocity",
+        "SystemReport",
+        "RemoteReport",
+    ),
+}
+
+
+@pytest.mark.parametrize(("generation", "message"), [(n, name) for n, names in REPORTS.items() for name in names])
+def test_report_missing(generation: int, message: str) -> None:
+    """Each report that does not come: after its time-out no throttle, and the brake that is asked for."""
+    rig = driving(generation)
+    identifier = rig.profile.codec.messages[message].identifier
+    heard_ns = rig.adapter._reports._heard_ns[message]
+    rig.lose_report = lambda frame: frame.identifier == identifier
+    rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
+    timeout_ms = rig.profile.reports[message].timeout_ns // NS_PER_MS
+    assert timeout_ms <= (rig.now_ns - heard_ns) // NS_PER_MS <= timeout_ms + 1
+    assert rig.adapter.state().hindrance == f"no {message} for {timeout_ms} ms"
+    rig.actuation = Actuation(0.0, 0.0, 0.6)
+    rig.run_ms(200)
+    assert rig.kit.state.brake == pytest.approx(0.6, abs=1e-3)
+
+
+@both
+@pytest.mark.parametrize("name", ["angle", "speed"])
+def test_value_unknown(generation: int, name: str) -> None:
+    """A speed or angle reported as not known is one that is missing; the last speed stays, with its own time."""
+    rig = driving(generation)
+    heard_ns = rig.adapter.state().mono_ns
+    speed_mps = rig.adapter.state().speed_mps
+    rig.kit.set_unknown(name)
+    rig.run_until(is_lost)
+    took_ms = (rig.now_ns - heard_ns) // NS_PER_MS
+    assert took_ms <= 220
+    state = rig.adapter.state()
+    assert rig.adapter.counts["value_unknown"] > 0
+    if name == "speed":
+        assert (state.mono_ns, state.speed_mps) == (heard_ns, speed_mps)
+
+
+def test_wrong_checksum_of_a_report() -> None:
+    """A report of generation 2 with a wrong checksum is dropped and counted."""
+    rig = driving(2)
+    before = rig.adapter.state()
+    frame = sealed(0x107, bytes(8))
+    rig.adapter.receive(Frame(0x107, frame.data[:-1] + bytes([frame.data[-1] ^ 1])), rig.now_ns)
+    assert rig.adapter.state() == before
+    assert rig.adapter.counts["wrong_checksum"] == 1
+    rig.adapter.receive(frame, rig.now_ns)
+    assert rig.adapter.state().speed_mps == 0.0
+
+
+# What generation 2 has besides.
+
+
+@pytest.mark.parametrize(("position", "words"), [(0, "e stop"), (1, "pause")])
+def test_remote_switch(position: int, words: str) -> None:
+    """The remote's switch at stop or pause: the kit lets go at once; the adapter says so with the next report."""
+    rig = driving(2)
+    rig.kit.switch_remote(position, rig.now_ns)
+    assert rig.let_go_ms(rig.now_ns) == 0
+    rig.run_until(is_lost, 101)
+    rig.run_ms(100)
+    assert f"RemoteReport has STATE {words}" in rig.adapter.state().hindrance
+
+
+def test_remote_switch_elsewhere() -> None:
+    """The remote's switch at what is not remote, where the kit goes on: in 100 ms no throttle, and the asked brake."""
+    rig = driving(2)
+    rig.kit.switch_remote(3, rig.now_ns)
+    turned_ns = rig.now_ns
+    rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
+    assert (rig.now_ns - turned_ns) // NS_PER_MS <= 101
+    assert rig.adapter.state().hindrance == "RemoteReport has STATE control allowed"
+    rig.kit.switch_remote(2, rig.now_ns)
+    rig.run_ms(200)
+    assert rig.state == "lost"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("seat belt", "a seat belt is open"), ("door", "a door is open"), ("speed", "the kit is locked by speed")],
+)
+def test_kit_not_ready(name: str, words: str) -> None:
+    """What makes generation 2 not ready: the kit lets go at once, and its reason is said."""
+    rig = driving(2)
+    rig.kit.hinder(name, rig.now_ns)
+    assert rig.let_go_ms(rig.now_ns) == 0
+    rig.run_until(is_lost)
+    rig.run_ms(100)
+    assert words in rig.adapter.state().hindrance
+
+
+# The gearbox.
+
+
+@both
+def test_drive_refused(generation: int) -> None:
+    """A gear that the kit refuses: after 3 s it is said with the kit's reason; then the car is let go of in PARK."""
+    known = profile(f"dataspeed_gen{generation}")
+    gear = replace(known.gear, numbers={**known.gear.numbers, "drive": 5})
+    rig = Rig(generation, profile=replace(known, gear=gear))
+    rig.adapter.engage(True, rig.now_ns)
+    took_ms = rig.run_until(is_lost)
+    assert 3120 <= took_ms <= 3160
+    said = rig.adapter.state().hindrance
+    assert said.startswith("the kit did not enable in 3 s: the gear is park instead of drive")
+    if generation == 1:
+        assert said.endswith("GearReport says unsupported")
+    assert rig.kit.state.throttle == 0.0
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "idle")
+    assert rig.enabled() == set()
+    assert rig.kit.state.watchdog == 0
+
+
+def test_park_refused() -> None:
+    """Where PARK is refused the car is held by its brake, and it is said so."""
+    rig = driving(1)
+    rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
+    rig.actuation = Actuation(0.0, 0.0, 0.5)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0)
+    rig.actuation = Actuation(0.0, 0.0, 0.0)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(5000)
+    assert rig.speed_mps == 0.0
+    assert rig.kit.state.brake == pytest.approx(rig.profile.limits.holding_brake, abs=1e-3)
+    assert rig.enabled() == set(AXES)
+    said = rig.adapter.state().hindrance
+    assert "the car stands and is not parked" in said
+    assert "GearReport says fault" in said
+
+
+@both
+def test_out_of_gear(generation: int) -> None:
+    """A gear that is reported as another, though nobody has shifted, ends driving with that report."""
+    rig = driving(generation)
+    rig.kit.state.gear = Gear.NEUTRAL
+    assert rig.run_until(is_lost) <= 101
+    assert rig.adapter.state().hindrance == "the gear is neutral instead of drive"
+
+
+@both
+def test_nothing_goes_unsaid(generation: int) -> None:
+    """Whatever ends driving is an event, in words, with its time."""
+    causes: list[Callable[[Rig], Any]] = [
+        lambda rig: rig.adapter.bus_gone("can0 is down", rig.now_ns),
+        lambda rig: rig.kit.bus_off(rig.now_ns),
+        lambda rig: rig.kit.driver_steers(3.0, rig.now_ns),
+        lambda rig: setattr(rig, "is_ticking", False),
+    ]
+    for cause in causes:
+        rig = driving(generation)
+        cause(rig)
+        rig.run_ms(500)
+        assert rig.events, cause
+        assert all(event.kind == "fault" and event.detail for event in rig.events)
+        details = [event.detail for event in rig.events]
+        assert len(details) == len(set(details))

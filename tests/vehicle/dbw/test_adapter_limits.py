@@ -1,0 +1,153 @@
+"""The profile's limits: the last thing before the bytes, whatever is asked and however often."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.vehicle.dbw.rig import Rig, both, driving, profile, with_limits
+
+from lavt.domain import NS_PER_S, Actuation
+from lavt.vehicle.dbw.profile import TICK_LIMIT_NS, Limits
+from lavt.vehicle.dbw.sending import Asked, limited
+from lavt.vehicle.sim.cars import LINCOLN_MKZ
+
+LIMITS = Limits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
+STEERING = {1: 0x064, 2: 0x200}
+
+
+def angles_deg(rig: Rig) -> list[tuple[int, float]]:
+    """What the steering was told, read by hand from bytes 0 and 1, with when."""
+    identifier = STEERING[rig.generation]
+    return [
+        (at_ns, int.from_bytes(frame.data[:2], "little", signed=True) / 10)
+        for at_ns, frame in rig.sent
+        if frame.identifier == identifier
+    ]
+
+
+@both
+def test_angle(generation: int) -> None:
+    """The steering wheel is asked for no more than the limit on either side; that it was more is counted."""
+    rig = driving(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
+    rig.actuation = Actuation(0.5, 0.0, 0.2)
+    rig.run_ms(500)
+    rig.actuation = Actuation(-0.5, 0.0, 0.2)
+    rig.run_ms(500)
+    asked = [angle_deg for _, angle_deg in angles_deg(rig)]
+    assert (max(asked), min(asked)) == (30.0, -30.0)
+    assert rig.adapter.counts["limited_wheel_deg"] > 20
+
+
+@both
+def test_rate(generation: int) -> None:
+    """The steering wheel is asked to turn no faster than the limit, and the kit is told that limit, cut to a step."""
+    rig = driving(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
+    rig.actuation = Actuation(0.2, 0.0, 0.0)
+    rig.run_ms(400)
+    asked = angles_deg(rig)
+    for (before_ns, before_deg), (after_ns, after_deg) in pairwise(asked):
+        assert abs(after_deg - before_deg) <= 100.0 * (after_ns - before_ns) / NS_PER_S + 0.1
+    assert asked[-1][1] > 30
+
+
+def test_rate_of_the_kit() -> None:
+    """The kit is told the greatest rate in its own steps: 452 deg/s are 113 of 4 deg/s, in both generations."""
+    for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
+        rig = Rig(int(name[-1]))
+        rig.engage()
+        told = {
+            frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
+        }
+        assert 113 in told
+        assert told <= {0, 113}
+
+
+@both
+def test_pedals(generation: int) -> None:
+    """Pedals are pressed no further and no faster than the limits, and let go of at once."""
+    known = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
+    rig = driving(generation, profile=known)
+    rig.actuation = Actuation(0.0, 1.0, 0.0)
+    rig.run_ms(1000)
+    assert rig.kit.state.throttle == pytest.approx(0.4, abs=1e-3)
+    rig.actuation = Actuation(0.0, 0.0, 1.0)
+    rig.moments.clear()
+    rig.run_ms(400)
+    assert rig.moments[25].wheels.throttle == 0.0
+    assert rig.moments[-1].wheels.brake == pytest.approx(0.5, abs=1e-3)
+    rising = [moment.wheels.brake for moment in rig.moments]
+    assert rising[150] <= 2.0 * 0.151 + 2.0 * 0.02
+    rig.actuation = Actuation(0.0, 0.0, 0.0)
+    rig.run_ms(25)
+    assert rig.kit.state.brake == 0.0
+
+
+@both
+def test_begins_where_the_wheel_is(generation: int) -> None:
+    """The first angle after enabling is at most a set's turn from where the wheel is."""
+    rig = driving(generation)
+    rig.actuation = Actuation(0.2, 0.0, 1.0)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0)
+    rig.run_ms(1000)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "idle")
+    rig.sent.clear()
+    rig.actuation = Actuation(-0.2, 0.0, 1.0)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "enabling")
+    assert rig.adapter._sender.sent_ns == rig.now_ns
+    rig.sent = [(at_ns, frame) for at_ns, frame in rig.sent if at_ns == rig.now_ns]
+    first_deg = angles_deg(rig)[0][1]
+    wheel_deg = math.degrees(0.2 * 14.8)
+    assert abs(first_deg - wheel_deg) <= 452 * 0.06 + 0.1
+
+
+any_number = st.floats(allow_nan=False, allow_infinity=False)
+asked = st.builds(Asked, any_number, any_number, any_number)
+allowed = st.builds(Asked, st.floats(-400, 400), st.floats(0, 0.6), st.floats(0, 0.8))
+
+
+@given(asked, allowed, st.integers(0, 10 * NS_PER_S))
+def test_never_more(wanted: Asked, before: Asked, passed_ns: int) -> None:
+    """Whatever is asked, what is allowed is in range and no faster than the rates over at most 60 ms."""
+    found = limited(LIMITS, wanted, before, passed_ns)
+    passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
+    assert abs(found.wheel_deg) <= 400.0
+    assert abs(found.wheel_deg - before.wheel_deg) <= 300.0 * passed_s + 1e-9
+    assert 0.0 <= found.throttle <= min(0.6, before.throttle + 2.0 * passed_s)
+    assert 0.0 <= found.brake <= min(0.8, before.brake + 5.0 * passed_s)
+
+
+@given(allowed)
+def test_as_asked(wanted: Asked) -> None:
+    """What is within the limits is not changed, but that there is no throttle while the brake is asked for."""
+    found = limited(LIMITS, wanted, wanted, 0)
+    assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
+
+
+@both
+def test_one_pedal(generation: int) -> None:
+    """Throttle and brake asked for at once are the brake alone: whoever asks for both wants to stop."""
+    rig = driving(generation)
+    rig.actuation = Actuation(0.0, 0.5, 0.2)
+    rig.run_ms(50)
+    wheels = rig.moments[-1].wheels
+    assert (wheels.throttle, round(wheels.brake, 2)) == (0.0, 0.2)
+    assert rig.adapter.counts["limited_throttle"] > 0
+
+
+@pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
+def test_limits_are_the_simulators(name: str) -> None:
+    """By the shipped profiles the software car is driven as the simulator is: its lengths, angles and pedals."""
+    known = profile(name)
+    assert known.car.wheelbase_m == LINCOLN_MKZ.wheelbase_m
+    assert known.car.max_braking_mps2 == LINCOLN_MKZ.max_braking_mps2
+    assert known.car.max_acceleration_mps2 == LINCOLN_MKZ.max_acceleration_mps2
+    assert known.road_rad(known.limits.steering_wheel_deg) == pytest.approx(LINCOLN_MKZ.max_steering_rad, abs=1e-3)
+    rate_radps = known.road_rad(known.limits.steering_wheel_rate_degps)
+    assert rate_radps == pytest.approx(LINCOLN_MKZ.max_steering_rate_radps, abs=2e-3)

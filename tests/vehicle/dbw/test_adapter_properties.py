@@ -1,0 +1,154 @@
+"""What holds whatever comes from the bus, and for all that a profile can send."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.vehicle.dbw.rig import START_NS, Rig, driving, profile
+
+from lavt.domain import NS_PER_MS, Actuation
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.dbw.profile import AXES
+from lavt.vehicle.dbw.sending import Sender
+from lavt.vehicle.software_car import generation_1, generation_2
+from lavt.vehicle.software_car.mechanics import Mechanics
+from lavt.vehicle.software_car.state import Order
+
+names = pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user"])
+
+
+def heard(name: str, frame: Frame) -> Order:
+    """What the software car, which shares no code with the adapter, takes a frame for."""
+    read = generation_1.read if name == "dataspeed_gen1" else generation_2.read
+    order = read(frame, Mechanics(), not name.endswith(":user"))
+    assert isinstance(order, Order)
+    return order
+
+
+@names
+@given(data=st.data())
+def test_all_that_can_be_sent(name: str, data: st.DataObject) -> None:
+    """Whatever the limits allow is heard by the kit as it was meant, to half a step, valid and enabling."""
+    known, sender = profile(name), Sender(profile(name), START_NS)
+    axis = data.draw(st.sampled_from(AXES))
+    sender._numbers[known.axes[axis].message] = data.draw(st.integers(0, 1000))
+    if axis == "steering":
+        most = known.limits.steering_wheel_deg
+        angle_deg = data.draw(st.floats(-most, most))
+        order = heard(name, sender.axis_frame(axis, angle_deg, is_enabled=True))
+        assert order.target * 57.29577951308232 == pytest.approx(angle_deg, abs=0.05 + 1e-9)
+        assert order.rate_radps * 57.29577951308232 == pytest.approx(452.0)
+    else:
+        fraction = data.draw(st.floats(0, 1))
+        order = heard(name, sender.axis_frame(axis, fraction, is_enabled=True))
+        assert order.target == pytest.approx(fraction, abs=0.000126)
+    assert (order.axis, order.is_valid, order.is_enabling, order.is_clearing, order.ignores_driver) == (
+        axis,
+        True,
+        True,
+        False,
+        False,
+    )
+
+
+@names
+@given(data=st.data())
+def test_reports_come_back(name: str, data: st.DataObject) -> None:
+    """Any angle and speed that a report can hold is read as it was written, to half a step."""
+    known = profile(name)
+    adapter = Adapter(known, start_ns=START_NS)
+    angle = data.draw(st.integers(-5500, 5500))
+    raw = angle.to_bytes(2, "little", signed=True)
+    if name == "dataspeed_gen1":
+        adapter.receive(Frame(0x065, raw + bytes(6)), START_NS)
+    else:
+        fourteen = (angle & 0x3FFF).to_bytes(2, "little")
+        adapter.receive(generation_2_sealed(0x100, fourteen + bytes(6)), START_NS)
+    assert adapter.state().steering_rad == pytest.approx(known.road_rad(angle / 10), abs=1e-12)
+
+
+def generation_2_sealed(identifier: int, data: bytes) -> Frame:
+    from lavt.vehicle.software_car.frames import sealed
+
+    return Frame(identifier, sealed(identifier, data))
+
+
+any_frame = st.builds(
+    Frame,
+    st.one_of(
+        st.integers(0, 0x7FF),
+        st.sampled_from([0x061, 0x063, 0x065, 0x067, 0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2D8]),
+    ),
+    st.binary(max_size=8),
+    st.booleans(),
+)
+steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.integers(0, 3)), max_size=60)
+
+
+@names
+@given(steps)
+@settings(max_examples=150, deadline=None)
+def test_random_bus(name: str, happening: list[tuple[Frame, int, int]]) -> None:
+    """Whatever comes from the bus nothing is raised, and without all the reports the car is never engaged."""
+    adapter = Adapter(profile(name), start_ns=START_NS)
+    now_ns = START_NS
+    for frame, passed_ns, kind in happening:
+        now_ns += passed_ns
+        adapter.receive(frame, now_ns)
+        adapter.ask(Actuation(0.1, 0.5, 0.0), now_ns)
+        if kind:
+            adapter.engage(kind > 1, now_ns)
+        adapter.frames_due(now_ns)
+        assert adapter.next_wake_ns() > now_ns
+        state = adapter.state()
+        assert not state.is_engaged
+        adapter.take_events()
+        adapter.take_reached()
+
+
+@cache
+def reports_of(generation: int) -> tuple[Frame, ...]:
+    """A driving kit's reports of 100 ms."""
+    rig, found = driving(generation), []
+    receive = rig.adapter.receive
+
+    def keep(frame: Frame, now_ns: int) -> None:
+        found.append(frame)
+        receive(frame, now_ns)
+
+    rig.adapter.receive = keep  # type: ignore[method-assign]
+    rig.run_ms(100)
+    return tuple(found)
+
+
+@pytest.mark.parametrize("generation", [1, 2])
+@given(st.lists(st.tuples(any_frame, st.integers(0, 30)), min_size=1, max_size=20))
+@settings(max_examples=25, deadline=None)
+def test_garbage_beside_reports(generation: int, garbage: list[tuple[Frame, int]]) -> None:
+    """Garbage between the reports of a car that only stands there never makes it engaged while nobody wants it."""
+    rig = Rig(generation)
+    for frame, wait_ms in garbage:
+        rig.adapter.receive(frame, rig.now_ns)
+        rig.run_ms(wait_ms)
+        assert not rig.adapter.state().is_engaged
+    assert rig.sent == []
+
+
+@pytest.mark.parametrize("generation", [1, 2])
+@given(st.data())
+@settings(max_examples=100, deadline=None)
+def test_one_bit(generation: int, data: st.DataObject) -> None:
+    """A report with a wrong bit raises nothing; generation 2's checksum finds each."""
+    frame = data.draw(st.sampled_from(reports_of(generation)))
+    bit = data.draw(st.integers(0, 8 * len(frame.data) - 1))
+    flipped = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(len(frame.data), "little")
+    adapter = Adapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
+    adapter.receive(Frame(frame.identifier, flipped), START_NS)
+    known = {known.identifier: name for name, known in profile(f"dataspeed_gen{generation}").codec.messages.items()}
+    report = profile(f"dataspeed_gen{generation}").reports.get(known[frame.identifier])
+    if generation == 2 and report is not None:
+        assert adapter._reports.counts["wrong_checksum"] == 1

@@ -1,0 +1,94 @@
+"""What the adapter sends is, byte for byte, what was worked out by hand from the facts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tests.vehicle.dbw.rig import START_NS, profile
+
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw.profile import AXES, Axis, Profile
+from lavt.vehicle.dbw.sending import Asked, Plan, Sender
+
+NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user")
+NONE: frozenset[Axis] = frozenset()
+
+
+def vectors(name: str) -> list[dict[str, Any]]:
+    text = (Path(__file__).parent / "vectors" / f"{name.partition(':')[0]}.yaml").read_text()
+    found: list[dict[str, Any]] = yaml.safe_load(text)["vectors"]
+    return found
+
+
+def sent(name: str, vector: dict[str, Any]) -> Frame | None:
+    """The frame of the adapter that asks for what the vector says; None where the adapter never says it."""
+    known, signals, message = profile(name), dict(vector["signals"]), vector["message"]
+    sender = Sender(known, START_NS)
+    if signals.pop("CLEAR", 0):
+        return cleared(known, message, signals)
+    for axis in AXES:
+        if known.axes[axis].message == message:
+            return of_axis(known, axis, signals)
+    if known.gear.message == message and set(signals) == {known.gear.value}:
+        gears = {number: gear for gear, number in known.gear.numbers.items()}
+        gear = gears.get(signals[known.gear.value])
+        return sender.gear_frame(gear) if gear else None
+    if known.system and message == known.system.message and signals:
+        sender._numbers[message] = signals["RC"] - 1
+        return sender._system_frame(known.system, "enable" if signals["CMD"] == 1 else "disable")
+    return None
+
+
+def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> Frame | None:
+    """An axis's command of the type that the profile has; what the adapter never changes is a constant of a profile."""
+    command = known.axes[axis]
+    kind, number = next(iter(command.constants.items()))
+    if command.value not in signals or signals.get(kind, 0) != number:
+        return None
+    varied = {command.value, command.enable, command.count}
+    constants = {kind: number} | {name: each for name, each in signals.items() if name not in varied}
+    sender = Sender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
+    sender._numbers[command.message] = signals.get(command.count, 0) + command.modulus - 1
+    is_enabled = bool(signals.get(command.enable, 0))
+    return sender.axis_frame(axis, signals[command.value] / command.per_unit, is_enabled=is_enabled)
+
+
+def cleared(known: Profile, message: str, signals: dict[str, Any]) -> Frame | None:
+    """A frame of what takes back overrides."""
+    if message not in {command.message for command in known.axes.values()} | {known.gear.message}:
+        return None
+    sender = Sender(known, START_NS)
+    sender._numbers[message] = signals.get("RC", 0) - 1
+    frames = sender.frames(Plan(NONE, is_clearing=True), Asked(0.0, 0.0, 0.0), 0.0, START_NS)
+    identifier = known.codec.messages[message].identifier
+    return next(frame for frame in frames if frame.identifier == identifier)
+
+
+CASES = [
+    pytest.param(frame, vector, id=f"{name}: {vector['name']}")
+    for name in NAMES
+    for vector in vectors(name)
+    if (frame := sent(name, vector)) is not None
+]
+
+
+@pytest.mark.parametrize(("frame", "vector"), CASES)
+def test_sent(frame: Frame, vector: dict[str, Any]) -> None:
+    """A command that the adapter makes has the bytes worked by hand, counter and checksum included."""
+    assert frame == Frame(vector["id"], bytes.fromhex(vector["data"]))
+
+
+def test_enough() -> None:
+    """Every message that the adapter sends is among them, but two that have no vector with anything in it."""
+    checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if sent(name, vector)}
+    missing = set()
+    for name in NAMES:
+        known = profile(name)
+        messages = {command.message for command in known.axes.values()} | {known.gear.message}
+        messages |= {known.system.message} if known.system else set()
+        missing |= {(name, message) for message in messages} - checked
+    assert missing == {("dataspeed_gen2:user", "UserGearCmd"), ("dataspeed_gen2:user", "UserThrtlCmd")}

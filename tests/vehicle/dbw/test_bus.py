@@ -1,0 +1,458 @@
+"""A port on a bus of python-can: what leaves, what is heard, and what happens when the bus goes."""
+
+from __future__ import annotations
+
+import errno
+import gc
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.errors import UserError
+from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.dbw import bus as bus_module
+from lavt.vehicle.dbw.bus import CanPort, is_virtual, log_line, read_log
+
+GROUP = "239.74.163.2"
+DEADLINE_S = 20
+STEERING = Frame(0x064, bytes(8))
+BRAKE = Frame(0x060, bytes(range(8)))
+FAR = Frame(0x2F01, b"\x01", is_extended=True)
+
+
+class HandClock:
+    """A clock that goes on by `step_ns` each time it is read."""
+
+    def __init__(self, mono_ns: int, step_ns: int = 0) -> None:
+        self.mono_ns, self.step_ns = mono_ns, step_ns
+
+    def now(self) -> Now:
+        """Read both."""
+        self.mono_ns += self.step_ns
+        return Now(self.mono_ns, MachineClock().now().wall_ns)
+
+
+def until(done: Callable[[], bool]) -> None:
+    for _ in range(DEADLINE_S * 1000):
+        if done():
+            return
+        pause(NS_PER_MS)
+    raise AssertionError("it did not happen")
+
+
+def hear(port: CanPort, count: int) -> list[Frame]:
+    """The next frames that a port hears."""
+    heard: list[HeardFrame] = []
+
+    def enough() -> bool:
+        heard.extend(port.take(0))
+        return len(heard) >= count
+
+    until(enough)
+    return [each.frame for each in heard]
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable[..., CanPort]]:
+    """Opens ports that are closed in the end."""
+    ports: list[CanPort] = []
+
+    def open_port(interface: str = "virtual", channel: str = "test", clock: Any = None, **options: Any) -> CanPort:
+        ports.append(CanPort(interface, channel, options, clock=clock or MachineClock()))
+        return ports[-1]
+
+    yield open_port
+    for port in ports:
+        port.close()
+
+
+@pytest.fixture
+def raw() -> Iterator[can.BusABC]:
+    """Somebody else on the bus `test`."""
+    with can.Bus(interface="virtual", channel="test", ignore_config=True) as bus:
+        yield bus
+
+
+def now_ns() -> int:
+    return MachineClock().now().mono_ns
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def test_virtual(opened: Callable[..., CanPort]) -> None:
+    """Frames come in order to every other port of the bus, as they were, and not to the one that sent them."""
+    one, other = opened(), opened()
+    one.send([STEERING, BRAKE, FAR], now_ns())
+    assert hear(other, 3) == [STEERING, BRAKE, FAR]
+    other.send([BRAKE], now_ns())
+    assert hear(one, 1) == [BRAKE]
+
+
+OTHER_PROCESS = """
+import sys
+from lavt.clock import MachineClock, pause
+from lavt.vehicle.dbw.bus import CanPort
+port = CanPort("udp_multicast", sys.argv[1], {"port": int(sys.argv[2])}, clock=MachineClock())
+print("ready", flush=True)
+heard = 0
+while heard < 3:
+    for each in port.take(0):
+        heard += 1
+        port.send([each.frame], MachineClock().now().mono_ns)
+    pause(1_000_000)
+port.close()
+"""
+
+
+def test_two_processes(opened: Callable[..., CanPort]) -> None:
+    """Over `udp_multicast` two processes hear each other and neither itself, though the group sends everything back."""
+    number = free_port()
+    port = opened("udp_multicast", GROUP, port=number)
+    with subprocess.Popen(
+        [sys.executable, "-c", OTHER_PROCESS, GROUP, str(number)], stdout=subprocess.PIPE, text=True
+    ) as echo:
+        assert echo.stdout is not None
+        assert echo.stdout.readline() == "ready\n"
+        before_ns = now_ns()
+        port.send([STEERING, BRAKE, FAR], before_ns)
+        assert hear(port, 3) == [STEERING, BRAKE, FAR]
+        assert echo.wait(DEADLINE_S) == 0
+    until(lambda: port.counts["own_frames"] == 3)
+    assert not port.take(0)
+
+
+def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of `udp_multicast`, which counts as virtual, leave the machine only where the user says how far."""
+    asked: list[dict[str, Any]] = []
+    open_bus = can.Bus
+
+    def note(**keys: Any) -> can.BusABC:
+        asked.append(keys)
+        return open_bus(**keys)
+
+    monkeypatch.setattr(can, "Bus", note)
+    opened("udp_multicast", GROUP, port=free_port())
+    opened("udp_multicast", GROUP, port=free_port(), hop_limit=1)
+    opened()
+    assert [keys.get("hop_limit") for keys in asked] == [0, 1, None]
+
+
+def test_arrival(opened: Callable[..., CanPort]) -> None:
+    """A frame's time of arrival is the kernel's, on the monotonic clock, however late it is taken."""
+    number = free_port()
+    port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
+    before_ns = now_ns()
+    other.send([STEERING], before_ns)
+    taken: list[HeardFrame] = []
+
+    def is_there() -> bool:
+        taken.extend(port.take(0))
+        return bool(taken)
+
+    until(is_there)
+    assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
+
+
+def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:
+    """Datagrams of the group that are no frames are counted, and the next frame is heard."""
+    number = free_port()
+    port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
+    garbage = [b"", b"\xff", b"\x80", b"\xc0", bytes(2000), b"\x81\xaearbitration_id\xcb?\xf8\0\0\0\0\0\0"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anybody:
+        for datagram in garbage:
+            anybody.sendto(datagram, (GROUP, number))
+    until(lambda: port.counts["unreadable"] == len(garbage) - 1)  # one with no identifier but 0 is a frame of it
+    hear(port, 1)
+    other.send([BRAKE], now_ns())
+    assert hear(port, 1) == [BRAKE]
+
+
+@pytest.mark.parametrize(("age_ns", "is_sent"), [(60 * NS_PER_MS, True), (60 * NS_PER_MS + 1, False)])
+def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, is_sent: bool) -> None:
+    """A frame made more than 60 ms before it is written is not written, and counted."""
+    port = opened(clock=HandClock(5 * NS_PER_S))
+    port.send([STEERING], 5 * NS_PER_S - age_ns)
+    assert (raw.recv(0) is not None) is is_sent
+    assert port.counts["frames_too_old"] == (not is_sent)
+
+
+def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
+    """The age is looked at before each frame: of those whose writer froze between two, the rest is not written."""
+    clock = HandClock(0)
+    port = opened(clock=clock)
+    clock.step_ns = 25 * NS_PER_MS
+    port.send([STEERING, BRAKE, STEERING, BRAKE], 0)
+    assert [getattr(raw.recv(0), "arbitration_id", None) for _ in range(3)] == [0x064, 0x060, None]
+    assert port.counts["frames_too_old"] == 2
+
+
+def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
+    """Error frames, remote frames and those of CAN FD are counted and dropped."""
+    port = opened()
+    raw.send(can.Message(is_error_frame=True, arbitration_id=0x04))
+    raw.send(can.Message(is_remote_frame=True, arbitration_id=0x60))
+    raw.send(can.Message(is_fd=True, arbitration_id=0x60, data=bytes(12), is_extended_id=False))
+    raw.send(can.Message(arbitration_id=0x60, data=b"\x07", is_extended_id=False))
+    assert hear(port, 1) == [Frame(0x60, b"\x07")]
+    assert {name: count for name, count in port.counts.items() if count} == {
+        "error_frames": 1,
+        "remote_frames": 1,
+        "fd_frames": 1,
+    }
+
+
+def test_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody takes what comes, the newest frames are kept and the others counted."""
+    monkeypatch.setattr(bus_module, "QUEUE_FRAMES", 4)
+    port = opened()
+    for number in range(10):
+        raw.send(can.Message(arbitration_id=number, is_extended_id=False))
+    until(lambda: port.counts["overflowed"] == 6)
+    assert [each.frame.identifier for each in port.take(0)] == [6, 7, 8, 9]
+
+
+@dataclass
+class Device:
+    """A driver's device that can be pulled out."""
+
+    heard: deque[can.Message | Exception] = field(default_factory=deque)
+    """What reading gives next, raised where it is an error."""
+    open_error: Exception | None = None
+    send_error: Exception | None = None
+    opened: int = 0
+    shut_down: int = 0
+
+
+DEVICES: dict[str, Device] = {}
+
+
+class BreakableBus(can.BusABC):
+    """The driver."""
+
+    def __init__(self, channel: str, **_: Any) -> None:
+        self.device = DEVICES[channel]
+        if self.device.open_error:
+            raise self.device.open_error
+        self.device.opened += 1
+        super().__init__(channel)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:  # noqa: ARG002 (python-can's)
+        if not self.device.heard:
+            pause(NS_PER_MS)
+            return None, False
+        following = self.device.heard.popleft()
+        if isinstance(following, Exception):
+            raise following
+        return following, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002, D102 (python-can's)
+        if self.device.send_error:
+            raise self.device.send_error
+
+    def shutdown(self) -> None:  # noqa: D102 (python-can's)
+        self.device.shut_down += 1
+        super().shutdown()
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Device:
+    monkeypatch.setitem(can.interfaces.BACKENDS, "breakable", (__name__, "BreakableBus"))
+    DEVICES["stick"] = Device()
+    return DEVICES["stick"]
+
+
+def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> None:
+    """A bus that goes away is told of by reading and writing, tried again each second, and heard when it is back."""
+    port = opened("breakable", "stick", clock=HandClock(0))
+    device.open_error = OSError(errno.ENODEV, "No such device")
+    device.heard.append(can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN))
+    until(lambda: device.shut_down == 1)
+    for attempt in (lambda: port.take(NS_PER_S - 1), lambda: port.send([STEERING], 0)):
+        with pytest.raises(BusGone, match=r"breakable stick cannot be read .*Network is down"):
+            attempt()
+    with pytest.raises(BusGone, match=r"breakable stick cannot be opened .*No such device"):
+        port.take(NS_PER_S)
+    device.open_error = None
+    with pytest.raises(BusGone):
+        port.take(2 * NS_PER_S - 1)
+    assert port.take(2 * NS_PER_S) == []
+    device.heard.append(can.Message(arbitration_id=7, is_extended_id=False))
+    assert hear(port, 1) == [Frame(7, b"")]
+    port.send([STEERING], 0)
+    assert device.opened == 2
+
+
+def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) -> None:
+    """What was heard before the bus went away is taken first."""
+    port = opened("breakable", "stick", clock=HandClock(0))
+    device.heard.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
+    until(lambda: device.shut_down == 1)
+    assert [each.frame.identifier for each in port.take(0)] == [7]
+    with pytest.raises(BusGone):
+        port.take(0)
+
+
+@pytest.mark.parametrize(
+    ("error", "is_passing"),
+    [
+        (can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS), True),
+        (can.CanOperationError("Transmit buffer full"), True),
+        (can.CanTimeoutError(), True),
+        (can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN), False),
+        (OSError(errno.ENODEV, "No such device"), False),
+    ],
+)
+def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exception, is_passing: bool) -> None:
+    """What cannot be written is told of at once; a bus that has no room now is the same bus, another is tried again."""
+    port = opened("breakable", "stick", clock=HandClock(0))
+    device.send_error = error
+    with pytest.raises(BusGone, match=r"breakable stick cannot be written to"):
+        port.send([STEERING], 0)
+    device.send_error = None
+    if is_passing:
+        port.send([STEERING], 0)
+    else:
+        with pytest.raises(BusGone):
+            port.send([STEERING], 0)
+        until(lambda: device.shut_down == 1)
+        assert port.take(NS_PER_S) == []
+        port.send([STEERING], 0)
+
+
+def test_bus_off(opened: Callable[..., CanPort], device: Device) -> None:
+    """An error frame that says that the controller is off is a bus that has gone."""
+    port = opened("breakable", "stick", clock=HandClock(0))
+    device.heard.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
+    until(lambda: device.shut_down == 1)
+    with pytest.raises(BusGone, match="bus-off"):
+        port.take(0)
+
+
+def test_closed(device: Device) -> None:
+    """A port that is closed has let go of the bus, and can be closed again."""
+    port = CanPort("breakable", "stick", {}, clock=HandClock(0))
+    port.close()
+    port.close()
+    assert (device.opened, device.shut_down) == (1, 1)
+    with pytest.raises(BusGone):
+        port.send([STEERING], 0)
+
+
+REFUSED = [
+    ("nosuch", "can0", {}, "there is no CAN interface nosuch: name one of .*socketcan"),
+    ("virtual", "", {}, "a bus of virtual needs a channel"),
+    ("virtual", "x", {"receive_own_messages": True}, "leave out receive_own_messages"),
+    ("udp_multicast", "1.2.3.4", {}, r"udp_multicast 1\.2\.3\.4 cannot be opened \(.*Invalid argument\)"),
+    ("udp_multicast", GROUP, {"port": 99999}, "cannot be opened .*port must be 0-65535"),
+    ("socketcan", "nosuch0", {}, "socketcan nosuch0 cannot be opened"),
+]
+
+
+@pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # python-can's
+@pytest.mark.parametrize(("interface", "channel", "options", "because"), REFUSED)
+def test_refused(interface: str, channel: str, options: dict[str, Any], because: str) -> None:
+    """A bus that cannot be opened is refused in one sentence."""
+    with pytest.raises(UserError, match=because) as refused:
+        CanPort(interface, channel, options, clock=MachineClock())
+    assert "\n" not in str(refused.value)
+    del refused
+    gc.collect()  # while python-can's forgotten sockets are no matter
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"), [(errno.ENODEV, "ip link"), (errno.EPERM, "a user who may"), (errno.EAFNOSUPPORT, "can_raw")]
+)
+def test_remedies(device: Device, number: int, remedy: str) -> None:
+    """A channel that is not there, a right that is missing and a kernel without CAN are told with what to do."""
+    device.open_error = OSError(number, "refused")
+    with pytest.raises(UserError, match=rf"breakable stick cannot be opened \(.*refused\): .*{remedy}"):
+        CanPort("breakable", "stick", {}, clock=MachineClock())
+
+
+def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where python-can is missing, the sentence says what installs it."""
+
+    def missing(name: str) -> None:
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(bus_module, "import_module", missing)
+    with pytest.raises(UserError, match=r"pip install 'lavt\[can\]'"):
+        CanPort("virtual", "x", {}, clock=MachineClock())
+
+
+@pytest.mark.parametrize(
+    ("bus", "told", "expected"),
+    [
+        (("virtual", "x"), "", True),
+        (("udp_multicast", GROUP), "", True),
+        (("inside", ""), "", True),
+        (("pcan", "PCAN_USBBUS1"), "", False),
+        (("socketcan", "vcan0"), '[{"ifname": "vcan0", "linkinfo": {"info_kind": "vcan"}}]', True),
+        (("socketcan", "can0"), '[{"ifname": "can0", "linkinfo": {"info_kind": "can"}}]', False),
+        (("socketcan", "slcan0"), '[{"ifname": "slcan0"}]', False),
+        (("socketcan", "vcan0"), "[]", False),
+        (("socketcan", "vcan0"), "nonsense", False),
+    ],
+)
+def test_is_virtual(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: tuple[str, str], told: str, expected: bool
+) -> None:
+    """A bus is virtual where python-can or the kernel says so, and nowhere else."""
+    program = tmp_path / "ip"
+    program.write_text(f"#!/bin/sh\nprintf '%s' '{told}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert is_virtual(*bus) is expected
+
+
+def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An interface that the kernel does not have, and a machine without `ip`, have no virtual bus."""
+    assert not is_virtual("socketcan", "lo")
+    assert not is_virtual("socketcan", "nosuch0")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert not is_virtual("socketcan", "vcan0")
+
+
+def test_log(tmp_path: Path) -> None:
+    """A log that was written is read as it was, to the microsecond."""
+    written = [HeardFrame(STEERING, 1_700_000_000_000_001_000), HeardFrame(FAR, 1_700_000_000_500_000_000)]
+    log = tmp_path / "drive.log"
+    log.write_text("".join(log_line(each.arrived_ns, "vcan0", each.frame) for each in written))
+    read = list(read_log(log))
+    assert [each.frame for each in read] == [each.frame for each in written]
+    assert [round(each.arrived_ns / 1000) for each in read] == [each.arrived_ns // 1000 for each in written]
+    assert log.read_text().splitlines()[1] == "(1700000000.500000) vcan0 00002F01#01"
+
+
+def test_bad_log(tmp_path: Path) -> None:
+    """A log that is missing, or stops being one, is refused with how far it was read."""
+    with pytest.raises(UserError, match=r"missing\.log cannot be read after 0 frames"):
+        list(read_log(tmp_path / "missing.log"))
+    bad = tmp_path / "bad.log"
+    bad.write_text(log_line(0, "can0", STEERING) + "and then nothing\n")
+    with pytest.raises(UserError, match=r"bad\.log cannot be read after 1 frames"):
+        list(read_log(bad))
+
+
+def test_counts_of_a_log(tmp_path: Path) -> None:
+    """A log's error and remote frames are left out."""
+    log = tmp_path / "drive.log"
+    log.write_text("(1.0) can0 20000080#0000000000000000\n(2.0) can0 060#R\n(3.0) can0 060#01\n")
+    assert [each.frame for each in read_log(log)] == [Frame(0x60, b"\x01")]

@@ -1,0 +1,199 @@
+"""Values become the bytes that were worked by hand, and whatever a bus carries is read or counted."""
+
+from __future__ import annotations
+
+import math
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.errors import UserError
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw import codec as codec_module
+from lavt.vehicle.dbw.codec import Codec
+
+PROFILES = ("dataspeed_gen1", "dataspeed_gen2")
+
+
+def shipped(profile: str) -> Codec:
+    with as_file(files("lavt.vehicle.dbw") / "profiles" / f"{profile}.dbc") as path:
+        return Codec(path)
+
+
+CODECS = {profile: shipped(profile) for profile in PROFILES}
+GENERATION_1, GENERATION_2 = CODECS.values()
+
+VECTORS = [
+    pytest.param(CODECS[profile], vector, id=f"{profile}: {vector['name']}")
+    for profile in PROFILES
+    for vector in yaml.safe_load((Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text())["vectors"]
+]
+
+AWKWARD = """VERSION ""
+BS_:
+BU_: A
+BO_ 2566844671 Far: 8 A
+ SG_ TEMPERATURE : 0|8@1+ (0.5,-40) [-30|80] "C" A
+ SG_ REAL : 8|32@1- (1,0) [0|0] "" A
+BO_ 16 Nested: 8 A
+ SG_ OUTER M : 0|4@1+ (1,0) [0|15] "" A
+ SG_ INNER m1M : 4|4@1+ (1,0) [0|15] "" A
+ SG_ DEEP m2 : 8|8@1+ (1,0) [0|255] "" A
+SIG_VALTYPE_ 2566844671 REAL : 1;
+SG_MUL_VAL_ 16 INNER OUTER 1-1;
+SG_MUL_VAL_ 16 DEEP INNER 2-2;
+"""
+
+
+def awkward(tmp_path: Path) -> Codec:
+    (tmp_path / "awkward.dbc").write_text(AWKWARD)
+    return Codec(tmp_path / "awkward.dbc")
+
+
+@pytest.mark.parametrize(("codec", "vector"), VECTORS)
+def test_vectors(codec: Codec, vector: dict[str, Any]) -> None:
+    """A frame worked by hand is what its values are encoded to, but for a CRC, and tells them when it is decoded."""
+    data = bytes.fromhex(vector["data"])
+    made = codec.encode(vector["message"], vector["signals"], length=len(data))
+    has_crc = "CRC" in codec.messages[vector["message"]].signals
+    assert made[: len(data) - has_crc] == data[: len(data) - has_crc]
+    decoded = codec.decode(Frame(vector["id"], data), short=True)
+    assert decoded is not None
+    assert decoded[0] == vector["message"]
+    for name, signal in codec.messages[decoded[0]].signals.items():
+        value = vector["signals"].get(name)
+        if value in signal.no_value:
+            assert decoded[1][name] is None, name
+        elif value is not None and name != "CRC":
+            assert decoded[1][name] == pytest.approx(value, abs=abs(signal.scale) / 2 + 1e-9), name
+
+
+@given(data=st.binary(max_size=8), identifier=st.one_of(st.integers(0, 0x1FFFFFFF), st.sampled_from([0x65, 0x200])))
+@pytest.mark.parametrize("codec", CODECS.values(), ids=PROFILES)
+@pytest.mark.parametrize("short", [False, True])
+def test_random_bus(codec: Codec, data: bytes, identifier: int, short: bool) -> None:
+    """Whatever a frame is, it is read or counted, once, and nothing raises."""
+    before = sum(codec.counts.values())
+    decoded = codec.decode(Frame(identifier, data, identifier > 0x7FF), short=short)
+    assert (decoded is None) == (sum(codec.counts.values()) == before + 1)
+    assert all(value is None or math.isfinite(value) for value in (decoded or ("", {}))[1].values())
+
+
+def test_counts() -> None:
+    """What cannot be read is counted by why: identifier, length, multiplexer."""
+    codec = shipped("dataspeed_gen1")
+    assert codec.decode(Frame(0x555, bytes(8))) is None
+    assert codec.decode(Frame(0x065, bytes(8), is_extended=True)) is None
+    assert codec.decode(Frame(0x065, bytes(7))) is None
+    assert codec.decode(Frame(0x067, bytes(3)), short=True) is None
+    assert codec.decode(Frame(0x060, bytes([0, 0, 0x50, 0, 0, 0, 0, 0]))) is None  # type 5
+    assert codec.counts == {"unknown_identifier": 2, "wrong_length": 2, "unknown_multiplexer": 1}
+
+
+def test_short_frame() -> None:
+    """A frame of four bytes tells the signals that are whole in it, to whoever asks for short ones."""
+    clear = Frame(0x064, bytes([0, 0, 2, 0]))
+    assert GENERATION_1.decode(clear) is None
+    assert GENERATION_1.decode(clear, short=True) == (
+        "SteeringCmd",
+        {
+            **dict.fromkeys(("SCMD_ANGLE", "EN", "IGNORE", "QUIET", "RES1", "ALERT", "CMD_TYPE", "SVEL"), 0),
+            "CLEAR": 1,
+        },
+    )
+    assert GENERATION_1.encode("SteeringCmd", {"CLEAR": 1}, length=4) == clear.data
+
+
+def test_named_values() -> None:
+    """A value that has a name is decoded as a number, and one whose name says that there is none as None."""
+    report = GENERATION_1.decode(Frame(0x065, bytes.fromhex("00 80 00 00 00 80 80 00")))
+    assert report is not None
+    assert [report[1][name] for name in ("ANGLE", "VEH_VEL", "TORQUE", "CMD")] == [None, None, None, 0]
+    gear = GENERATION_1.decode(Frame(0x067, bytes([4, 0])))
+    assert gear is not None
+    assert gear[1]["STATE"] == 4
+    assert GENERATION_1.messages["GearReport"].signals["STATE"].names[4] == "DRIVE"
+
+
+REFUSED = [
+    ("NoSuchCmd", {}, "the DBC has no message NoSuchCmd"),
+    ("SteeringCmd", {"SPEED": 1}, "SteeringCmd has no signal SPEED"),
+    ("SteeringCmd", {"SCMD_TORQUE": 1}, "SCMD_TORQUE of SteeringCmd is not in a frame with this multiplexer"),
+    ("SteeringCmd", {"SCMD_ANGLE": 550.1}, "SCMD_ANGLE of SteeringCmd is 550.1, but goes from -550 to 550 deg"),
+    ("SteeringCmd", {"SCMD_ANGLE": -550.1}, "SCMD_ANGLE of SteeringCmd is -550.1, but goes from -550 to 550 deg"),
+    ("SteeringCmd", {"SCMD_ANGLE": math.nan}, "SCMD_ANGLE of SteeringCmd is nan, but goes from -550 to 550 deg"),
+    ("SteeringCmd", {"EN": 2}, "EN of SteeringCmd is 2, but goes from 0 to 1"),
+    ("BrakeCmd", {"CMD_TYPE": 16}, "CMD_TYPE of BrakeCmd is 16, but goes from 0 to 15"),
+]
+
+
+@pytest.mark.parametrize(("message", "values", "because"), REFUSED)
+def test_refused(message: str, values: dict[str, float], because: str) -> None:
+    """What does not fit its message is refused, and the text says what and why."""
+    with pytest.raises(ValueError, match=because):
+        GENERATION_1.encode(message, values)
+
+
+def test_facts() -> None:
+    """What a DBC says of a message can be asked: where it is, its times, its signals, which of them are unverified."""
+    report = GENERATION_2.messages["SteerReport1"]
+    assert (report.identifier, report.is_extended, report.length) == (0x100, False, 8)
+    assert (report.timeout_ns, report.period_ns) == (100_000_000, 10_000_000)
+    assert report.senders == ("KIT",)
+    angle = report.signals["ANGLE"]
+    assert (angle.start, angle.bits, angle.is_signed, angle.scale, angle.unit) == (0, 14, True, 0.1, "deg")
+    assert (angle.minimum, angle.maximum) == (-819.2, 819.1)
+    assert angle.is_unverified
+    command = GENERATION_2.messages["RemoteSteerCmd"]
+    assert not command.signals["CRC"].is_unverified
+    assert command.signals["CMD_ANGLE"].multiplexer == "TYPE"
+    assert command.signals["CMD_ANGLE"].branches == {2}
+    assert GENERATION_2.messages["Accel"].timeout_ns is None
+
+
+def test_range_of_bits() -> None:
+    """A signal without limits in the DBC goes as far as its bits do, also where its step is negative."""
+    lateral = GENERATION_1.messages["Accel"].signals["LATERAL"]
+    assert (lateral.minimum, lateral.maximum) == (-327.67, 327.68)
+    assert GENERATION_1.encode("Accel", {"LATERAL": 327.68})[:2] == bytes([0x00, 0x80])
+
+
+def test_offsets_nesting_and_reals(tmp_path: Path) -> None:
+    """Of a vendor's DBC: bits not named are 0 whatever the offset, multiplexers nest, and what is no number is None."""
+    codec = awkward(tmp_path)
+    assert codec.encode("Far", {}) == bytes(8)
+    assert codec.encode("Far", {"TEMPERATURE": 0})[0] == 80
+    far = codec.messages["Far"]
+    assert far.is_extended
+    decoded = codec.decode(Frame(far.identifier, bytes([80, 0, 0, 0xC0, 0x7F, 0, 0, 0]), is_extended=True))
+    assert decoded == ("Far", {"TEMPERATURE": 0, "REAL": None})
+    assert codec.encode("Nested", {"OUTER": 1, "INNER": 2, "DEEP": 7})[:2] == bytes([0x21, 7])
+    with pytest.raises(ValueError, match="DEEP of Nested is not in a frame"):
+        codec.encode("Nested", {"OUTER": 1, "INNER": 1, "DEEP": 7})
+
+
+def test_no_dbc(tmp_path: Path) -> None:
+    """A file that is missing, empty or no DBC is refused in one sentence."""
+    with pytest.raises(UserError, match=r"cannot be read \(No such file or directory\): name a DBC file"):
+        Codec(tmp_path / "missing.dbc")
+    for text in ("", 'VERSION ""', "BO_ what", "\x00\xff"):
+        (tmp_path / "bad.dbc").write_text(text, "latin-1")
+        with pytest.raises(UserError) as refused:
+            Codec(tmp_path / "bad.dbc")
+        assert "\n" not in str(refused.value)
+
+
+def test_without_cantools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where cantools is missing, the sentence says what installs it."""
+
+    def missing(name: str) -> None:
+        raise ImportError(f"No module named {name!r}")
+
+    monkeypatch.setattr(codec_module, "import_module", missing)
+    with pytest.raises(UserError, match=r"pip install 'lavt\[can\]'"):
+        Codec(tmp_path / "any.dbc")

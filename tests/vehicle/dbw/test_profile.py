@@ -1,0 +1,165 @@
+"""Profiles: what the shipped ones say, and what is refused before anything is sent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lavt.build.dbw import load_profile, shipped_profiles
+from lavt.config.dbw import DbwConfig
+from lavt.config_file import parse_config
+from lavt.errors import UserError
+
+NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user", "dataspeed_gen2:remote")
+
+
+def changed(folder: Path, name: str, **changes: Any) -> Path:
+    """A profile's file with other values; a key is a path with __ between its parts, None leaves it out."""
+    shipped = shipped_profiles()[name]
+    data = yaml.safe_load(shipped.read_text())
+    data["dbc"] = str(shipped.with_suffix(".dbc"))
+    for key, value in changes.items():
+        *parts, last = key.split("__")
+        section = data
+        for part in parts:
+            section = section[part]
+        section[last] = value
+    path = folder / "mine.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def refused(name_or_path: str | Path, **keys: Any) -> str:
+    with pytest.raises(UserError) as error:
+        load_profile(str(name_or_path), **keys)
+    said = str(error.value)
+    assert "\n" not in said
+    return said
+
+
+def test_shipped() -> None:
+    """The two profiles come with LAVT and agree with their DBC files."""
+    assert list(shipped_profiles()) == ["dataspeed_gen1", "dataspeed_gen2"]
+    known = {name: load_profile(name) for name in NAMES}
+    assert {profile.kit for name, profile in known.items() if "gen2" in name} == {"dataspeed_2"}
+    assert known["dataspeed_gen1"].kit == "dataspeed_1"
+    assert [known[name].commands for name in NAMES] == [None, "remote", "user", "remote"]
+
+
+def test_unverified() -> None:
+    """Generation 1 uses no unverified signal; generation 2 uses hardly any other, of the set that was chosen."""
+    assert load_profile("dataspeed_gen1").unverified == ()
+    remote, user = (load_profile(f"dataspeed_gen2:{name}").unverified for name in ("remote", "user"))
+    assert len(remote) == len(user)
+    assert {"RemoteSteerCmd.CMD_ANGLE", "RemoteSteerCmd.TYPE", "SteerReport1.ANGLE", "RemoteReport.STATE"} <= set(
+        remote
+    )
+    assert "RemoteSteerCmd.CRC" not in remote
+    assert {name.replace("User", "Remote") for name in user} == set(remote)
+
+
+def test_sign_is_open() -> None:
+    """Generation 1's profile leaves the steering's sign open; what the user says counts, and may not contradict."""
+    assert load_profile("dataspeed_gen1").car.steering_sign is None
+    assert load_profile("dataspeed_gen1", steering_sign=-1).car.steering_sign == -1
+    assert load_profile("dataspeed_gen2").car.steering_sign == 1
+    assert load_profile("dataspeed_gen2", steering_sign=1).car.steering_sign == 1
+    assert refused("dataspeed_gen2", steering_sign=-1) == (
+        "dataspeed_gen2 has steering_sign 1, not -1: leave vehicle.dbw.steering_sign out"
+    )
+
+
+def test_units() -> None:
+    """The steering wheel's angle is the road wheels' times the ratio, in degrees, with the sign."""
+    known = load_profile("dataspeed_gen1", steering_sign=-1)
+    assert known.wheel_deg(0.1) == pytest.approx(-0.1 * 57.29577951308232 * 14.8)
+    assert known.road_rad(known.wheel_deg(0.123)) == pytest.approx(0.123)
+
+
+@pytest.mark.parametrize("name", ["dataspeed_gen3", "dataspeed_gen2:usr", ":user"])
+def test_no_such_profile(name: str) -> None:
+    """A profile that does not exist is refused with the known ones."""
+    assert refused(name) == (
+        f"there is no profile {name!r}: name a YAML file, or one of dataspeed_gen1, dataspeed_gen2"
+    )
+
+
+def test_one_set_only() -> None:
+    """A set of commands cannot be chosen where there is one."""
+    assert refused("dataspeed_gen1:user") == "dataspeed_gen1 has one set of commands only: leave out :user"
+
+
+def test_own_file(tmp_path: Path) -> None:
+    """A file of one's own is a profile, and so is a set of it."""
+    path = changed(tmp_path, "dataspeed_gen2", limits__steering_wheel_deg=100.0)
+    assert load_profile(str(path)).limits.steering_wheel_deg == 100.0
+    assert load_profile(f"{path}:user").commands == "user"
+
+
+def test_other_dbc(tmp_path: Path) -> None:
+    """The vendor's DBC takes the place of the profile's, and must have what the profile names."""
+    vendors = tmp_path / "vendor.dbc"
+    vendors.write_text(shipped_profiles()["dataspeed_gen2"].with_suffix(".dbc").read_text().replace('" 1;', '" 0;'))
+    text = vendors.read_text()
+    vendors.write_text("\n".join(line for line in text.splitlines() if not line.startswith('BA_ "Unverified"')))
+    assert load_profile("dataspeed_gen2", str(vendors)).unverified == ()
+    vendors.write_text(text.replace("RemoteSteerCmd", "SteerCmdRemote"))
+    assert "has no message 'RemoteSteerCmd': change the profile" in refused("dataspeed_gen2", dbc=str(vendors))
+
+
+def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
+    """A DBC that has a pedal's bare number is refused: full brake would be the number 1, and no brake at all."""
+    text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
+    bare = tmp_path / "bare.dbc"
+    bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
+    assert refused("dataspeed_gen1", dbc=str(bare)) == (
+        "dataspeed_gen1: a step of PCMD_PERCENT of BrakeCmd is 100% of a pedal: give it its scale or its unit in "
+        "the DBC"
+    )
+
+
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
+    ("dataspeed_gen1", {"sent__brake__value": "PCMD_PRECENT"}, "BrakeCmd of its DBC has no signal 'PCMD_PRECENT'"),
+    ("dataspeed_gen1", {"sent__brake__message": "BreakCmd"}, "its DBC has no message 'BreakCmd'"),
+    ("dataspeed_gen1", {"sent__brake__value": "PCMD_TORQUE"}, "PCMD_TORQUE of BrakeCmd is in 'Nm': name a signal in"),
+    ("dataspeed_gen1", {"sent__steering__value": "SCMD_TORQUE"}, "is in 'Nm': name a signal in 'deg' or 'rad'"),
+    ("dataspeed_gen1", {"limits__steering_wheel_deg": 600.0}, "600 does not fit SCMD_ANGLE of SteeringCmd"),
+    (
+        "dataspeed_gen1",
+        {"limits__steering_wheel_rate_degps": 3.0},
+        "limits.steering_wheel_rate_degps is less than one of SVEL: raise it",
+    ),
+    ("dataspeed_gen1", {"sent__gears": {"park": 1}}, "sent.gears has no drive: give its number"),
+    ("dataspeed_gen1", {"sent__gears": {"park": 1, "drive": 9}}, "9 does not fit GCMD of GearCmd"),
+    ("dataspeed_gen1", {"sent__brake__checksum": "CLEAR"}, "CLEAR of BrakeCmd is not its last byte"),
+    ("dataspeed_gen1", {"reports__brake__values": {}}, "reports.brake.values has no enabled: name its signal"),
+    ("dataspeed_gen1", {"reports__gear__values": {}}, "reports.gear.values has no gear: name its signal"),
+    ("dataspeed_gen2", {"reports__speed__values": {}}, "no report has a speed: name its signal"),
+    ("dataspeed_gen2", {"reports__system__trip": {"STATE=x": "no"}}, "'STATE=x' of SystemReport is no sign"),
+    ("dataspeed_gen2", {"commands": None}, "is for remote or user: say in commands which"),
+    ("dataspeed_gen2", {"sent__system__value": ""}, "SystemCmd of its DBC has no signal ''"),
+    ("dataspeed_gen2", {"sent__stearing": {}}, "unknown key 'sent.stearing': did you mean 'steering'?"),
+    ("dataspeed_gen2", {"limits__brake": 2.0}, "'limits.brake': Input should be less than or equal to 1"),
+    ("dataspeed_gen2", {"vehicle__steering_sign": 0}, "'vehicle.steering_sign': Input should be 1 or -1"),
+    ("dataspeed_gen2", {"kit": "dataspeed_3"}, "'kit': Input should be 'dataspeed_1' or 'dataspeed_2'"),
+    ("dataspeed_gen2", {"dbc": "nowhere.dbc"}, "nowhere.dbc cannot be read"),
+]
+
+
+@pytest.mark.parametrize(("name", "changes", "said"), REFUSED, ids=[said for _, _, said in REFUSED])
+def test_refused(tmp_path: Path, name: str, changes: dict[str, Any], said: str) -> None:
+    """What a profile gets wrong is one sentence that says what to do."""
+    assert said in refused(changed(tmp_path, name, **changes))
+
+
+def test_section() -> None:
+    """The section of a server's config has its defaults, and refuses what it does not know with the nearest known."""
+    section = parse_config(DbwConfig, {}, "server.yaml")
+    assert (section.profile, section.interface, section.channel) == ("dataspeed_gen2", "socketcan", "can0")
+    assert (section.dbc, section.options, section.truth, section.watchdog_proof) == ("", {}, "", "")
+    assert section.steering_sign is None
+    with pytest.raises(UserError, match="unknown key 'chanel': did you mean 'channel'"):
+        parse_config(DbwConfig, {"chanel": "can1"}, "server.yaml")

@@ -1,0 +1,246 @@
+"""The shipped DBC files say what the vectors worked by hand say, and mark what no fact says."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cantools
+import pytest
+import yaml
+from cantools.database import EncodeError
+from cantools.database.can import Database, Message, Signal
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.vehicle.dbw.crc8 import frame_crc8
+
+PROFILES = ("dataspeed_gen1", "dataspeed_gen2")
+
+
+def loaded(profile: str) -> Database:
+    text = (files("lavt.vehicle.dbw") / "profiles" / f"{profile}.dbc").read_text("ascii")
+    database = cantools.database.load_string(text, "dbc")
+    assert isinstance(database, Database)
+    return database
+
+
+def written(profile: str) -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((Path(__file__).parent / "vectors" / f"{profile}.yaml").read_text())
+    return found
+
+
+DATABASES = {profile: loaded(profile) for profile in PROFILES}
+WRITTEN = {profile: written(profile) for profile in PROFILES}
+
+CASES = [
+    pytest.param(DATABASES[profile].get_message_by_name(vector["message"]), vector, id=f"{profile}: {vector['name']}")
+    for profile in PROFILES
+    for vector in WRITTEN[profile]["vectors"]
+]
+MESSAGES = [
+    pytest.param(message, id=f"{profile}: {message.name}")
+    for profile, database in DATABASES.items()
+    for message in database.messages
+]
+
+
+def selected(message: Message, selector: int) -> list[Signal]:
+    """The signals that a frame has whose multiplexer is `selector`, by number or by name."""
+    return [signal for signal in message.signals if selector in (signal.multiplexer_ids or [selector])]
+
+
+def selector_of(message: Message) -> Signal | None:
+    return next((signal for signal in message.signals if signal.is_multiplexer), None)
+
+
+def is_unverified(signal: Signal) -> bool:
+    assert signal.dbc is not None
+    mark = signal.dbc.attributes.get("Unverified")
+    return mark is not None and mark.value == 1
+
+
+def full(message: Message, given_signals: dict[str, float]) -> dict[str, float]:
+    """All signals of the frame: those given, the others 0."""
+    multiplexer = selector_of(message)
+    selector = int(given_signals.get(multiplexer.name, 0)) if multiplexer else 0
+    return {signal.name: 0 for signal in selected(message, selector)} | given_signals
+
+
+def encoded(message: Message, signals: dict[str, float]) -> bytes:
+    """The frame's bytes, with its CRC where it has one."""
+    data = bytes(message.encode(full(message, signals)))
+    if any(signal.name == "CRC" for signal in message.signals):
+        return data[:-1] + bytes([frame_crc8(message.frame_id, data[:-1])])
+    return data
+
+
+@pytest.mark.parametrize(("message", "vector"), CASES)
+def test_encoded(message: Message, vector: dict[str, Any]) -> None:
+    """What a command or report says becomes the bytes worked by hand; a short frame begins the full one."""
+    data = bytes.fromhex(vector["data"])
+    assert message.frame_id == vector["id"]
+    assert not message.is_extended_frame
+    assert encoded(message, vector["signals"])[: len(data)] == data
+    assert len(data) in (message.length, 4)
+
+
+@pytest.mark.parametrize(("message", "vector"), CASES)
+def test_decoded(message: Message, vector: dict[str, Any]) -> None:
+    """The bytes worked by hand say what they were made from, to half a step."""
+    data = bytes.fromhex(vector["data"])
+    found = message.decode(data, decode_choices=False, allow_truncated=True)
+    assert isinstance(found, dict)
+    for name, value in (full(message, vector["signals"]) if len(data) == message.length else vector["signals"]).items():
+        if name != "CRC":
+            step = abs(message.get_signal_by_name(name).conversion.scale)
+            assert found[name] == pytest.approx(value, abs=step / 2 + 1e-9), name
+
+
+@pytest.mark.parametrize("vector", [vector for vector in WRITTEN["dataspeed_gen2"]["vectors"] if "registers" in vector])
+def test_crc_by_hand(vector: dict[str, Any]) -> None:
+    """The last byte of a frame of generation 2 is its CRC."""
+    *data, crc = bytes.fromhex(vector["data"])
+    assert frame_crc8(vector["id"], bytes(data)) == crc == bytes.fromhex(vector["registers"])[-1] ^ 0xFF
+
+
+@pytest.mark.parametrize(("message", "vector"), CASES)
+def test_marked(message: Message, vector: dict[str, Any]) -> None:
+    """A vector is unverified, and says by what assumption, where a signal that it sets has the mark, and only there."""
+    marked = any(is_unverified(message.get_signal_by_name(name)) for name, value in vector["signals"].items() if value)
+    assert vector.get("unverified", False) is marked
+    assert ("assumption" in vector) is marked
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+@given(data=st.data())
+def test_round_trip(message: Message, data: st.DataObject) -> None:
+    """What is encoded within a signal's range is decoded as it was, and leaves every bit that is no signal's 0."""
+    multiplexer = selector_of(message)
+    selectors = sorted({n for signal in message.signals for n in signal.multiplexer_ids or []})
+    selector = data.draw(st.sampled_from(selectors)) if multiplexer else 0
+    raw = {
+        signal.name: selector if signal is multiplexer else data.draw(raw_of(signal), signal.name)
+        for signal in selected(message, selector)
+    }
+    scaled = {
+        signal.name: signal.conversion.raw_to_scaled(raw[signal.name], decode_choices=False)
+        for signal in selected(message, selector)
+    }
+    frame = message.encode(scaled)
+    assert len(frame) == message.length
+    assert message.decode(frame, decode_choices=False, scaling=False) == raw
+    assert int.from_bytes(frame, "little") == sum(
+        (raw[signal.name] & ((1 << signal.length) - 1)) << signal.start for signal in selected(message, selector)
+    )
+
+
+def raw_of(signal: Signal) -> st.SearchStrategy[int]:
+    """Numbers on the wire that are in the signal's range, or all of its bits where it has none."""
+    if signal.minimum is None or signal.maximum is None:
+        half = 1 << (signal.length - 1)
+        return st.integers(-half, half - 1) if signal.is_signed else st.integers(0, 2 * half - 1)
+    step = signal.conversion.scale
+    return st.integers(math.ceil(signal.minimum / step - 1e-6), math.floor(signal.maximum / step + 1e-6))
+
+
+def unverified(profile: str) -> set[str]:
+    return {
+        f"{message.name}.{signal.name}"
+        for message in DATABASES[profile].messages
+        for signal in message.signals
+        if is_unverified(signal)
+    }
+
+
+def test_unverified_of_generation_1() -> None:
+    """In generation 1 only the parking brake has a place that no fact gives."""
+    assert unverified("dataspeed_gen1") == {"MiscCmd.PBRKCMD"}
+
+
+def test_unverified_of_generation_2() -> None:
+    """In generation 2 only the CRC of commands has a place that the facts give."""
+    everything = {
+        f"{message.name}.{signal.name}"
+        for message in DATABASES["dataspeed_gen2"].messages
+        for signal in message.signals
+    }
+    kinds = [("Remote", "User"), ("Remote", "User", "Ulc"), ("Remote", "User", "Ulc"), ("Remote", "User", "Ulc")]
+    commands = [
+        source + name
+        for sources, name in zip(kinds, ("SteerCmd", "BrakeCmd", "ThrtlCmd", "GearCmd"), strict=True)
+        for source in sources
+    ]
+    assert everything - unverified("dataspeed_gen2") == {f"{name}.CRC" for name in [*commands, "SystemCmd"]}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_unverified_says_why(profile: str) -> None:
+    """Every unverified signal has a comment that says what was assumed, and no other has."""
+    for message in DATABASES[profile].messages:
+        for signal in message.signals:
+            assert (signal.comment or "").startswith("Unverified") is is_unverified(signal), (message.name, signal.name)
+
+
+@pytest.mark.parametrize("limit", WRITTEN["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
+def test_limits(limit: dict[str, Any]) -> None:
+    """A command is encoded at the limits of the facts and refused one step beyond."""
+    message = DATABASES["dataspeed_gen1"].get_message_by_name(limit["message"])
+    signal = message.get_signal_by_name(limit["signal"])
+    multiplexer = selector_of(message)
+    assert multiplexer is not None
+    encode = partial(encoded, message)
+    selector = {multiplexer.name: (signal.multiplexer_ids or [0])[0]}
+    for end, beyond in ((limit["lowest"], -1), (limit["highest"], 1)):
+        encode({**selector, signal.name: end})
+        with pytest.raises(EncodeError):
+            encode({**selector, signal.name: end + beyond * signal.conversion.scale})
+
+
+TIMES = {  # period, time-out, ms
+    "dataspeed_gen1": dict.fromkeys(("BrakeCmd", "ThrottleCmd", "SteeringCmd"), (20, 100)),
+    "dataspeed_gen2": {
+        **{f"{source}{name}Cmd": (None, 100) for source in ("Remote", "User", "Ulc") for name in ("Brake", "Thrtl")},
+        "RemoteSteerCmd": (None, 100),
+        "UserSteerCmd": (None, 100),
+        "SystemCmd": (None, 100),
+        "UlcCmd": (20, 100),
+        "UlcCfg": (200, 1000),
+        "TurnSignalCmd": (50, 250),
+        "SteerReport1": (10, 100),
+        "BrakeReport1": (20, 100),
+        "ThrtlReport1": (20, 100),
+        "GearReport1": (100, 350),
+        "SystemReport": (100, None),
+        "VehicleVelocity": (20, 200),
+        "Accel": (10, None),
+        "Gyro": (10, None),
+        "WheelSpeed": (10, None),
+        "WheelPosition": (20, None),
+        "RemoteReport": (100, 250),
+    },
+}
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_times(profile: str) -> None:
+    """Periods and time-outs are those of the facts, and none is there that the facts have not."""
+    found = {}
+    for message in DATABASES[profile].messages:
+        assert message.dbc is not None
+        timeout = message.dbc.attributes.get("TimeoutMs")
+        times = (message.cycle_time, timeout.value if timeout else None)
+        if times != (None, None):
+            found[message.name] = times
+    assert found == TIMES[profile]
+
+
+def test_marks_of_invalid_values() -> None:
+    """A report's mark for "not valid" is decoded as a word, not as a number that could be driven by."""
+    report = DATABASES["dataspeed_gen1"].get_message_by_name("SteeringReport")
+    found = report.decode(bytes.fromhex("00 80 00 00 00 80 80 00"))
+    assert isinstance(found, dict)
+    assert [str(found[name]) for name in ("ANGLE", "VEH_VEL", "TORQUE")] == ["INVALID"] * 3

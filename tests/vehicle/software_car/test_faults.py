@@ -1,0 +1,97 @@
+import pytest
+from tests.vehicle.software_car.rig import ALL, Rig, both, driving
+
+from lavt.errors import UserError
+from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
+from lavt.vehicle.software_car.state import Gear, Reason, System
+
+FAULTS = [
+    (1, "steering.FLTPWR"),
+    (1, "steering.FLTCAL"),
+    (1, "brake.FLT1"),
+    (1, "throttle.FLTPWR"),
+    (2, "steering.fault"),
+    (2, "brake.fault"),
+    (2, "gear.fault"),
+]
+
+
+@pytest.mark.parametrize(("generation", "name"), FAULTS)
+def test_a_fault_lets_go_and_brakes(generation: int, name: str) -> None:
+    """A part that breaks while it is driven lets everything go, and the kit brakes."""
+    rig = driving(generation)
+    rig.kit.set_fault(name, rig.now_ns)
+    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), Reason.FAULT, WATCHDOG_BRAKE)
+
+
+@pytest.mark.parametrize(("generation", "name"), FAULTS)
+def test_what_is_broken_is_not_enabled(generation: int, name: str) -> None:
+    """A part that is broken is not enabled, and generation 2 not at all; once it is mended it is."""
+    rig = Rig(generation)
+    rig.kit.set_fault(name, rig.now_ns)
+    rig.command()
+    rig.ask()
+    assert rig.enabled() == (set() if generation == 2 else ALL - {name.split(".", maxsplit=1)[0]})
+    rig.kit.set_fault(name, rig.now_ns, is_set=False)
+    rig.command()
+    assert rig.enabled() == ALL
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("seat belt", Reason.SEAT_BELT),
+        ("door", Reason.DOOR),
+        ("speed", Reason.LOCKOUT_SPEED),
+        ("acceleration", Reason.LOCKOUT_ACCELERATION),
+        ("reverse", Reason.LOCKOUT_REVERSE),
+    ],
+)
+def test_what_hinders_generation_2(name: str, reason: Reason) -> None:
+    """Belt, door and lockouts keep generation 2 in manual, and it says why; while driving it lets go and brakes."""
+    rig = Rig(2)
+    rig.kit.hinder(name, rig.now_ns)
+    rig.command()
+    rig.ask()
+    assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), System.MANUAL, reason)
+    rig.kit.hinder(None, rig.now_ns)
+    assert rig.enabled() == ALL
+    rig.kit.hinder(name, rig.now_ns)
+    assert (rig.enabled(), rig.kit.state.watchdog_brakes) == (set(), True)
+
+
+@pytest.mark.parametrize("remote_state", [0, 1])
+def test_the_remotes_switch(remote_state: int) -> None:
+    """At emergency stop or pause generation 2 lets go and brakes, and is not ready."""
+    rig = driving(2)
+    rig.kit.switch_remote(remote_state, rig.now_ns)
+    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, Reason.REMOTE)
+
+
+@both
+def test_bus_off_is_silence(generation: int) -> None:
+    """Cut from the bus the kit says and hears nothing, so commands time out and it brakes; back on it, it talks."""
+    rig = driving(generation)
+    rig.wait_ms(20)
+    rig.kit.bus_off(rig.now_ns)
+    rig.last.clear()
+    rig.drive_ms(80, throttle=0.5)
+    assert rig.last == {}
+    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), Reason.TIMEOUT)
+    rig.kit.bus_off(rig.now_ns, is_off=False)
+    rig.wait_ms(100)
+    assert len(rig.last) == (5 if generation == 1 else 8)
+
+
+@both
+def test_unknown_names_are_refused(generation: int) -> None:
+    """A fault, hindrance, value or gear that there is not is refused in a sentence that names the known ones."""
+    kit = Rig(generation).kit
+    with pytest.raises(UserError, match=r"no fault 'brake\.smoke': the known ones are brake"):
+        kit.set_fault("brake.smoke", 10**12)
+    with pytest.raises(UserError, match="no hindrance 'rain'"):
+        kit.hinder("rain", 10**12)
+    with pytest.raises(UserError, match="no value that can be unknown 'mood'"):
+        kit.set_unknown("mood")
+    with pytest.raises(UserError, match="no gear of this car 'REVERSE'"):
+        kit.driver_shifts(Gear.REVERSE, 10**12)

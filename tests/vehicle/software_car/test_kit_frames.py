@@ -1,0 +1,117 @@
+import ast
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.vehicle.software_car.rig import START_NS, crc_by_division
+
+import lavt.vehicle.software_car as package
+from lavt.domain import NS_PER_MS
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.software_car.frames import Field, Layout, checksum, crc8, is_sealed, pack, unpack
+from lavt.vehicle.software_car.generation_1 import BRAKE_REPORT, STEERING_REPORT
+from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS, UNVERIFIED
+from lavt.vehicle.software_car.kit import Kit
+
+LETTERS = b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+COMMANDS = (0x060, 0x062, 0x064, 0x066, 0x200, 0x201, 0x202, 0x203, 0x210, 0x211, 0x212, 0x213, 0x216)
+identifiers = st.sampled_from(COMMANDS) | st.integers(0, 0x7FF)
+
+
+@pytest.mark.parametrize(("data", "crc"), [(b"", 0x00), (b"0", 0x71), (b"01", 0x28), (b"012", 0x24), (LETTERS, 0xA3)])
+def test_the_crc_is_the_notes(data: bytes, crc: int) -> None:
+    """The CRC gives what the notes on CAN have for their strings."""
+    assert crc8(data) == crc
+
+
+def test_the_checksum_begins_with_the_identifier() -> None:
+    """Identifier 0 without data has checksum 0xBE, and 0x59 when it is an extended one."""
+    assert (checksum(0, b""), checksum(0, b"", is_extended=True)) == (0xBE, 0x59)
+
+
+@given(st.integers(0, 0x7FF), st.binary(max_size=7))
+def test_the_checksum_is_a_remainder(identifier: int, data: bytes) -> None:
+    """The checksum is the remainder of a long division, and one turned bit of the data gives another."""
+    crc = crc_by_division(identifier, data)
+    assert checksum(identifier, data) == crc
+    assert is_sealed(Frame(identifier, data + bytes([crc])))
+    for bit in range(8 * len(data)):
+        turned = bytes(byte ^ (1 << bit % 8 if index == bit // 8 else 0) for index, byte in enumerate(data))
+        assert not is_sealed(Frame(identifier, turned + bytes([crc])))
+
+
+@given(st.data())
+def test_what_is_packed_is_unpacked(data: st.DataObject) -> None:
+    """Numbers in range come out of every report's layout as they went in."""
+    layout = data.draw(st.sampled_from([BRAKE_REPORT, STEERING_REPORT, *REPORT_LAYOUTS.values()]))
+    values = {field.name: data.draw(st.integers(field.least, field.most)) for field in layout.fields}
+    assert unpack(layout, pack(layout, values)) == values
+
+
+def test_a_number_out_of_range_becomes_the_nearest() -> None:
+    """A number too great for its bits spoils no other field."""
+    layout = Layout(2, (Field("low", 0, 4), Field("signed", 4, 4, is_signed=True), Field("high", 8, 8)))
+    assert pack(layout, {"low": 99, "signed": -99, "high": 300}) == bytes([0x8F, 0xFF])
+    with pytest.raises(KeyError, match="other"):
+        pack(layout, {"other": 1})
+
+
+def test_no_fields_lie_on_each_other() -> None:
+    """In every report each bit belongs to one field, and none to the checksum's byte."""
+    for identifier, layout in REPORT_LAYOUTS.items():
+        bits = [bit for field in layout.fields for bit in range(field.bit, field.bit + field.width)]
+        assert len(bits) == len(set(bits))
+        assert max(bits) < (64 if identifier == 0x2A4 else 56)
+        assert identifier in UNVERIFIED
+
+
+@given(
+    generation=st.sampled_from([1, 2]),
+    frames=st.lists(st.tuples(identifiers, st.binary(max_size=8), st.booleans(), st.integers(0, 30)), max_size=40),
+)
+def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, bytes, bool, int]]) -> None:
+    """Whatever is on the bus, nothing raises, and without a right checksum or an enable bit nothing is enabled."""
+    kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
+    now_ns = START_NS
+    for identifier, data, is_extended, wait_ms in frames:
+        frame = Frame(identifier, data, is_extended)
+        if generation == 2 and is_sealed(frame):
+            continue
+        enable_byte = {0x060: 3, 0x062: 3, 0x064: 2}.get(identifier)
+        if generation == 1 and enable_byte is not None and len(data) == 8 and not is_extended:
+            data = bytes(byte & ~(index == enable_byte) for index, byte in enumerate(data))  # noqa: PLW2901
+        now_ns += wait_ms * NS_PER_MS
+        kit.receive(Frame(identifier, data, is_extended), now_ns)
+        kit.frames_due(now_ns)
+        assert not any(actuator.is_enabled for actuator in kit.state.actuators.values())
+        assert kit.actuation(now_ns).throttle == 0.0
+        assert kit.next_wake_ns() > now_ns
+
+
+@given(
+    generation=st.sampled_from([1, 2]),
+    frames=st.lists(st.tuples(identifiers, st.binary(min_size=1, max_size=8), st.integers(0, 60)), max_size=60),
+)
+def test_valid_but_senseless_frames_raise_nothing(generation: int, frames: list[tuple[int, bytes, int]]) -> None:
+    """Frames with right checksums and anything in them raise nothing, and what reaches the wheels stays in range."""
+    kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
+    now_ns = START_NS
+    for identifier, data, wait_ms in frames:
+        now_ns += wait_ms * NS_PER_MS
+        sealed = data if generation == 1 else data[:-1] + bytes([checksum(identifier, data[:-1])])
+        kit.receive(Frame(identifier, sealed), now_ns)
+        actuation = kit.actuation(now_ns)
+        assert abs(actuation.steering_rad) <= 9.6 / 14.8
+        assert 0.0 <= actuation.throttle <= 1.0
+        assert 0.0 <= actuation.brake <= 1.0
+        assert all(len(frame.data) <= 8 for frame in kit.frames_due(now_ns))
+
+
+def test_it_shares_no_codec() -> None:
+    """The software car imports nothing of the adapter, of python-can and of cantools."""
+    for path in Path(package.__file__).parent.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(name.startswith(("lavt.vehicle.dbw", "can", "cantools")) for name in names), path

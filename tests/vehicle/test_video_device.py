@@ -1,0 +1,298 @@
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import pytest
+from tests.vehicle.moving_video import BARS, MODEL, number_of, write_video
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel
+from lavt.errors import UserError
+from lavt.vehicle.camera import CapturedFrame, FrameTimes
+from lavt.vehicle.video_device import RETRY_S, VideoDevice, buffer_time_ns
+
+LONG_S = 20.0
+"""Whatever has not come by then does not come."""
+Opens = Callable[..., VideoDevice]
+
+
+@pytest.fixture
+def opens() -> Iterator[Opens]:
+    opened: list[VideoDevice] = []
+
+    def device(
+        path: Path | str, *, rate_hz: float = 30.0, model: CameraModel = MODEL, pixel_format: str = ""
+    ) -> VideoDevice:
+        clock = MachineClock()
+        opened.append(VideoDevice(str(path), model=model, rate_hz=rate_hz, clock=clock, pixel_format=pixel_format))
+        return opened[-1]
+
+    yield device
+    for each in opened:
+        each.close()
+
+
+def now_ns() -> int:
+    return MachineClock().now().mono_ns
+
+
+def next_frame(camera: VideoDevice) -> CapturedFrame:
+    assert camera.wait(LONG_S)
+    frame = camera.capture(0, now_ns(), None)
+    assert frame is not None
+    return frame
+
+
+def wait_until(camera: VideoDevice, name: str, count: int) -> None:
+    """Wait for a counter, with frames taken out meanwhile."""
+    end_ns = now_ns() + round(LONG_S * NS_PER_S)
+    while camera.counts.get(name, 0) < count and now_ns() < end_ns:
+        if camera.wait(0.02):
+            camera.capture(0, now_ns(), None)
+    assert camera.counts.get(name, 0) >= count
+
+
+def test_a_picture_is_given_once(tmp_path: Path, opens: Opens) -> None:
+    """The first picture is there when the camera is; asked again before the next one comes, there is none."""
+    camera = opens(write_video(tmp_path / "slow.avi", rate_hz=1.0), rate_hz=1.0)
+
+    first = camera.capture(7, now_ns(), None)
+    assert first is not None
+    assert (first.number, first.capture_ns, number_of(first.picture)) == (7, None, 0)
+    assert camera.capture(8, now_ns(), None) is None
+
+
+def test_a_picture_that_is_late_by_a_little_is_waited_for(tmp_path: Path, opens: Opens) -> None:
+    """Who asks waits for a quarter of the period: some questions, one right after the other, see the next picture."""
+    camera = opens(write_video(tmp_path / "slow.avi", rate_hz=2.0), rate_hz=2.0)
+
+    assert number_of(next_frame(camera).picture) == 0
+    asked = [camera.capture(number, now_ns(), None) for number in range(7)]
+    frames = [frame for frame in asked if frame is not None]
+    assert [number_of(frame.picture) for frame in frames] in ([1], [1, 2])
+
+
+@pytest.mark.realtime
+def test_pictures_that_come_just_when_they_are_asked_for_are_not_missed(tmp_path: Path, opens: Opens) -> None:
+    """Asked at its own rate, at the very moment when its pictures come, a camera gives one for nearly each question."""
+    camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
+
+    next_frame(camera)
+    assert camera.wait(LONG_S)
+    due = FrameTimes(now_ns(), 50.0)
+    given = 0
+    for number in range(150):
+        pause(due.due_ns(number) - now_ns())
+        given += camera.capture(number, due.due_ns(number), None) is not None
+    assert given >= 145
+
+
+def test_pictures_come_in_order_and_the_newest_is_given(tmp_path: Path, opens: Opens) -> None:
+    """Who asks after a while gets the last picture that came; those between are counted as replaced."""
+    camera = opens(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
+
+    assert number_of(next_frame(camera).picture) == 0
+    second = number_of(next_frame(camera).picture)
+    end_ns = now_ns() + round(LONG_S * NS_PER_S)
+    while camera.counts["pictures_read"] < second + 4 and now_ns() < end_ns:
+        threading.Event().wait(0.005)
+    newest = number_of(next_frame(camera).picture)
+    counts = camera.counts
+    assert newest >= second + 3
+    assert counts["pictures_read"] - counts["pictures_replaced"] in {3, 4}  # the three, and perhaps one that waits
+
+
+@pytest.mark.realtime
+def test_a_file_is_played_at_its_own_pace_over_and_over(tmp_path: Path, opens: Opens) -> None:
+    """From picture to picture of a file goes its period (median), the first follows the last, and nothing is lost."""
+    camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
+
+    came = []
+    for _ in range(2 * BARS):
+        frame = next_frame(camera)
+        came.append((now_ns(), number_of(frame.picture)))
+    periods_ms = [(after[0] - before[0]) / NS_PER_MS for before, after in pairwise(came)]
+    assert 18 < median(periods_ms) < 22
+    assert [number for _, number in came].count(0) >= 2
+    assert camera.counts["times_opened_again"] >= 1
+    assert camera.counts["times_lost"] == 0
+
+
+def test_a_file_whose_pictures_have_a_position_has_no_capture_time(tmp_path: Path, opens: Opens) -> None:
+    """Only V4L2 tells when a picture was taken: with a file it is unknown, for each picture, and counted."""
+    camera = opens(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
+
+    assert {next_frame(camera).capture_ns for _ in range(5)} == {None}
+    assert camera.counts["pictures_without_a_time"] == camera.counts["pictures_read"] >= 5
+
+
+@pytest.mark.parametrize(
+    ("position_ms", "taken_ns"),
+    [
+        (5000.0, 5_000_000_000),
+        (4999.123, 4_999_123_000),
+        (4000.0, 4_000_000_000),
+        (3999.999, None),
+        (5000.001, None),
+        (0.0, None),
+        (1.8e12, None),
+        (-1.0, None),
+        (float("nan"), None),
+        (float("inf"), None),
+    ],
+)
+def test_a_buffers_time_counts_within_the_second_before_it_came(position_ms: float, taken_ns: int | None) -> None:
+    """A V4L2 buffer's time that is of another clock, ahead of the picture, or over a second old is not known."""
+    assert buffer_time_ns(position_ms, 5 * NS_PER_S) == taken_ns
+
+
+def test_a_buffers_time_keeps_its_microseconds_after_years() -> None:
+    """OpenCV gives the time as a number of milliseconds: after ten years of running it is good to a microsecond."""
+    taken_ns = 10 * 365 * 86_400 * NS_PER_S + 123_456_000
+    assert buffer_time_ns(taken_ns / NS_PER_MS, taken_ns + 5) is not None
+    assert abs((buffer_time_ns(taken_ns / NS_PER_MS, taken_ns + 500) or 0) - taken_ns) <= 500
+
+
+def test_a_picture_that_waited_too_long_is_not_given(tmp_path: Path, opens: Opens) -> None:
+    """The last picture of a camera that stopped is not given when it is two periods old, and counted."""
+    camera = opens(write_video(tmp_path / "slow.avi", rate_hz=1.0), rate_hz=1.0)
+
+    assert camera.capture(0, now_ns() + 3 * NS_PER_S, None) is None
+    assert camera.counts["pictures_too_old"] == 1
+    assert number_of(next_frame(camera).picture) == 1
+
+
+def test_what_is_given_away_is_not_written_again(tmp_path: Path, opens: Opens) -> None:
+    """The encoder's stamp goes into a buffer of its own: the next picture is in another one."""
+    camera = opens(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
+
+    first, second = next_frame(camera).picture, next_frame(camera).picture
+    assert first.flags.writeable
+    assert second.flags.writeable
+    assert not np.shares_memory(first, second)
+
+
+@pytest.mark.parametrize(
+    ("asked", "rate_hz"),
+    [(CameraModel(640, 480), 30.0), (MODEL, 25.0), (CameraModel(240, 320), 30.0)],
+)
+def test_another_size_or_rate_is_refused(tmp_path: Path, opens: Opens, asked: CameraModel, rate_hz: float) -> None:
+    """What does not give the size and rate that it is asked for is refused, with what it gives."""
+    path = write_video(tmp_path / "video.avi", rate_hz=30.0)
+    with pytest.raises(UserError, match=f"video.avi gives 320x240 at 30 Hz, but .*{asked.width_px}x{asked.height_px}"):
+        opens(path, model=asked, rate_hz=rate_hz)
+
+
+def test_another_format_is_refused(tmp_path: Path, opens: Opens) -> None:
+    """A format that was asked for and is not in force is refused; the one that is in force is taken."""
+    path = write_video(tmp_path / "video.avi", rate_hz=30.0)
+    assert number_of(next_frame(opens(path, pixel_format="MJPG")).picture) == 0
+    with pytest.raises(UserError, match=r"video.avi gives no pictures in the format YUYV: choose another"):
+        opens(path, pixel_format="YUYV")
+
+
+def test_a_rate_a_thousandth_off_is_the_same(tmp_path: Path, opens: Opens) -> None:
+    """Television's 29.97 Hz do for 30 Hz."""
+    assert number_of(next_frame(opens(write_video(tmp_path / "video.avi", rate_hz=30000 / 1001))).picture) == 0
+
+
+@pytest.mark.parametrize("device", ["/dev/video97", "97", "/dev/null", "nowhere.avi", "no_video.avi"])
+def test_what_cannot_be_opened_is_refused(
+    tmp_path: Path, opens: Opens, device: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A device that is not there, or is none, is one sentence, and OpenCV adds nothing to it."""
+    (tmp_path / "no_video.avi").write_bytes(bytes(5000))
+    given = str(tmp_path / device) if device.endswith(".avi") else device
+    with pytest.raises(UserError, match="cannot be opened as a camera") as refused:
+        opens(given)
+    assert "\n" not in str(refused.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_an_address_where_nobody_answers_is_refused(opens: Opens) -> None:
+    """A camera in the network that does not answer is one sentence too."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(UserError, match=f"{address} cannot be opened as a camera"):
+        opens(address)
+
+
+def test_a_video_without_pictures_is_refused(tmp_path: Path, opens: Opens) -> None:
+    """A file that begins like a video and has no picture is no camera."""
+    whole = write_video(tmp_path / "whole.avi", rate_hz=30.0).read_bytes()
+    path = tmp_path / "cut.avi"
+    path.write_bytes(whole[: whole.index(b"movi") + 4])
+    with pytest.raises(UserError, match=r"cut.avi (opens, but no picture comes of it|cannot be opened)"):
+        opens(path)
+
+
+def test_a_file_that_vanishes_comes_back(tmp_path: Path, opens: Opens, caplog: pytest.LogCaptureFixture) -> None:
+    """Without its file the camera has no pictures, says so once and tries each second; with it there are some again."""
+    path = write_video(tmp_path / "short.avi", rate_hz=50.0, pictures=5)
+    camera = opens(path, rate_hz=50.0)
+    hidden = path.rename(tmp_path / "elsewhere.avi")
+
+    wait_until(camera, "times_lost", 1)
+    begun_ns, tried = now_ns(), camera.counts["times_opened_again"]
+    wait_until(camera, "times_opened_again", tried + 2)
+    assert now_ns() - begun_ns > RETRY_S * NS_PER_S
+    assert camera.capture(0, now_ns(), None) is None
+    assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 0)
+    hidden.rename(path)
+    assert camera.wait(LONG_S)
+    assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 1)
+    assert [record.getMessage().split(path.name)[1][:21] for record in caplog.records] == [
+        " gives no pictures an", " gives pictures again",
+    ]  # fmt: skip
+
+
+def test_a_stream_that_breaks_off_is_connected_again(tmp_path: Path, opens: Opens) -> None:
+    """When the connection to a camera in the network ends, it is lost, and found again when it answers."""
+    video = write_video(tmp_path / "video.avi", rate_hz=30.0).read_bytes()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            for _ in range(2):
+                connection, _ = server.accept()
+                with connection:
+                    connection.sendall(video)
+
+        sender = threading.Thread(target=serve, daemon=True)
+        sender.start()
+        camera = opens(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        wait_until(camera, "times_back", 1)
+        sender.join(LONG_S)
+    wait_until(camera, "times_lost", 2)
+    assert camera.counts["pictures_read"] == 2 * BARS
+    assert camera.counts["times_back"] == 1
+
+
+def test_pictures_of_another_size_are_dropped(tmp_path: Path, opens: Opens) -> None:
+    """Where another camera has taken the place of one that vanished, its pictures of another size are not given."""
+    path = write_video(tmp_path / "short.avi", rate_hz=50.0, pictures=5)
+    camera = opens(path, rate_hz=50.0)
+    other = write_video(tmp_path / "other.avi", rate_hz=50.0, model=CameraModel(160, 120))
+    other.replace(path)
+
+    wait_until(camera, "pictures_of_another_size", 3)
+    read = camera.counts["pictures_read"]
+    wait_until(camera, "pictures_of_another_size", 6)
+    assert camera.counts["pictures_read"] == read == 5
+
+
+def test_it_ends_when_it_is_closed(tmp_path: Path, opens: Opens) -> None:
+    """A camera that is closed has let go of its device and its thread, at once and also while it waits to try again."""
+    path = write_video(tmp_path / "short.avi", rate_hz=50.0, pictures=2)
+    camera = opens(path, rate_hz=50.0)
+    path.unlink()
+    wait_until(camera, "times_lost", 1)
+    begun_ns = now_ns()
+    camera.close()
+    assert now_ns() - begun_ns < RETRY_S * NS_PER_S
+    assert "camera device" not in {thread.name for thread in threading.enumerate()}
