@@ -101,6 +101,30 @@ def test_with_rearm_it_asks_again_at_standstill() -> None:
     assert session.request_due(700) is not None
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_who_took_over_in_the_car_keeps_it_also_with_rearm(stopped: bool) -> None:
+    """A vehicle disarmed while it is driven, or while it stops, is not asked for again, whatever its server does."""
+    session = driving(rearm=True)
+    if stopped:
+        session.note_state(state("safe_stop", 3.0), 500)
+    session.note_state(state("disarmed", 3.0), 600)
+    session.note_state(state("disarmed"), 700)
+    session.note_state(replace(state("disarmed"), instance=2), 800)
+    assert (session.phase, session.request_due(10 * NS_PER_S)) == ("stopped", None)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_with_rearm_it_asks_a_server_that_was_started_again(stopped: bool) -> None:
+    """A new process of the server knows of no session and tells a disarmed vehicle: nobody has taken that over."""
+    session = driving(rearm=True)
+    if stopped:
+        session.note_state(state("safe_stop", 3.0), 500)
+    session.note_state(replace(state("disarmed"), instance=2), 600)
+    session.note_state(replace(state("disarmed"), instance=2), 700)
+    assert session.phase == "seeking"
+    assert session.request_due(700) is not None
+
+
 def test_an_emergency_stop_has_a_number_beyond_all_seen() -> None:
     """The number is the wall clock's or, where that is behind, one more than the highest seen, and it only grows."""
     session = new_session()

@@ -16,8 +16,8 @@ ASK_PERIOD_NS = NS_PER_S
 class ClientSession:
     """Asks for the vehicle until it is granted, and again until the vehicle is armed: asking twice changes nothing.
 
-    With `rearm` it begins anew after a safe stop, but not where a driver in the car has taken over, which disarms the
-    vehicle. With `clear_stop` it clears an emergency stop that it finds. With
+    With `rearm` it begins anew after a safe stop and with a server that was started again, but not where a driver in
+    the car has taken over, which disarms the vehicle. With `clear_stop` it clears an emergency stop that it finds. With
     `waits` it does not arm the vehicle before the network's condition is in force. With `take_over` it asks whoever
     holds the vehicle to hand it over.
     """
@@ -55,6 +55,10 @@ class ClientSession:
         """What was answered to either."""
         self._known_as_holder = False
         """Whether the vehicle's state has named this client as the one who holds it."""
+        self._server = 0
+        """Instance of the server's process that the last state came from."""
+        self._was_disarmed = False
+        """Whether the process that drove, or stopped for safety, has disarmed the vehicle since."""
         self._ask_ns = start_ns
         self._stop_ns: int | None = None
         """When the query of an emergency stop is sent again, as long as the vehicle does not know of it."""
@@ -132,7 +136,9 @@ class ClientSession:
 
     def note_state(self, state: State, now_ns: int) -> None:
         """Follow the vehicle's safety state."""
-        self.safety = state.safety
+        if self.phase in ("driving", "stopped") and self.safety != "disarmed" and state.instance == self._server:
+            self._was_disarmed |= state.safety == "disarmed"
+        self.safety, self._server = state.safety, state.instance
         if state.safety == "emergency_stop":
             self._stop_ns = None
         own = (state.holder, state.holder_instance) == (self._who, self._instance)
@@ -141,7 +147,7 @@ class ClientSession:
             self.phase = "driving"
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
             self.phase, self.because = "stopped", state.because
-        elif self.phase == "stopped" and self._rearm and abs(state.speed_mps) < 0.05 and state.safety != "disarmed":
+        elif self.phase == "stopped" and self._rearm and abs(state.speed_mps) < 0.05 and not self._was_disarmed:
             self.phase, self._ask_ns = "seeking", now_ns
         if others and self._known_as_holder and self.phase not in ("seeking", "watching"):
             # Taking over at standstill needs no consent; whoever took it back would have it taken again.
