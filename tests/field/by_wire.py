@@ -77,6 +77,11 @@ def run_config(profile: str, proof: Path) -> RunConfig:
     return parse_config(RunConfig, said, "the run")
 
 
+def ms_since(at_ns: int, since_ns: int) -> float:
+    """Tell how many ms there are between two times."""
+    return (at_ns - since_ns) / NS_PER_MS
+
+
 @dataclass
 class Car:
     """`lavt software-car` as a process, and what it told."""
@@ -124,6 +129,18 @@ class Car:
             pause(5 * NS_PER_MS)
         raise AssertionError(f"the car told no {kind!r} with {text!r}: {self.news}")
 
+    def held(self, since_ns: int) -> float:
+        """Wait until the kit has let go and brakes by its watchdog; tell how many ms after something."""
+        at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
+        return ms_since(at_ns, since_ns)
+
+    def parked(self, since_ns: int) -> float:
+        """Wait until it stands in park and nothing is enabled; tell how many ms after something it was in park."""
+        at_ns = self.wait("gear", "gear PARK", since_ns=since_ns)
+        self.wait("enabled", "lets go", since_ns=since_ns)
+        assert self.heard("watchdog", "brakes", since_ns=since_ns) is None, "it was stopped without the watchdog"
+        return ms_since(at_ns, since_ns)
+
     def end(self) -> None:
         """End it, as Ctrl-C does."""
         self.process.send_signal(signal.SIGINT)
@@ -135,10 +152,10 @@ class Car:
 
 
 @contextmanager
-def software_car(config: Path) -> Iterator[Car]:
+def software_car(config: str | Path, *changes: str) -> Iterator[Car]:
     """Start a software car of a server's config."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "lavt", "software-car", str(config), "--json"],
+        [sys.executable, "-m", "lavt", "software-car", str(config), *changes, "--json"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     car = Car(process)

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 from tests.field import by_wire
-from tests.field.by_wire import CLOCK, GENERATIONS, Driven, driving
+from tests.field.by_wire import CLOCK, GENERATIONS, driving, ms_since
 
 from lavt.clock import pause
 from lavt.config import RunConfig
-from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.domain import NS_PER_S
 
 pytest.importorskip("can")
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(180)]
@@ -43,24 +43,6 @@ def signs_of_hogging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LAVT_HOG", str(tmp_path))
 
 
-def ms_since(at_ns: int, since_ns: int) -> float:
-    return (at_ns - since_ns) / NS_PER_MS
-
-
-def held(driven: Driven, since_ns: int) -> float:
-    """Wait until the kit has let go and brakes by its watchdog; tell how long after something."""
-    at_ns = driven.car.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
-    return ms_since(at_ns, since_ns)
-
-
-def parked(driven: Driven, since_ns: int) -> float:
-    """Wait until the car stands in park, which the actuator asks for once it stands, and nothing is enabled."""
-    at_ns = driven.car.wait("gear", "gear PARK", since_ns=since_ns)
-    driven.car.wait("enabled", "lets go", since_ns=since_ns)
-    assert driven.car.heard("watchdog", "brakes", since_ns=since_ns) is None, "it was stopped without the watchdog"
-    return ms_since(at_ns, since_ns)
-
-
 @pytest.mark.parametrize("profile", GENERATIONS)
 def test_a_route_is_driven_over_can(profile: str, tmp_path: Path, tell: Tell, proved: Proved) -> None:
     """The server drives the software car over CAN to the end of the route, then parks it and lets go."""
@@ -68,7 +50,7 @@ def test_a_route_is_driven_over_can(profile: str, tmp_path: Path, tell: Tell, pr
         driven.wait(lambda _: driven.loop.server.latest.get("ending") is not None, "the drive does not end")
         assert driven.loop.server.latest["ending"] == "completed"
         ended_ns = CLOCK.now().mono_ns
-        tell(f"{profile}: parked {parked(driven, ended_ns - NS_PER_S):.0f} ms after the end of the drive was seen")
+        tell(f"{profile}: parked {driven.car.parked(ended_ns - NS_PER_S):.0f} ms after the end of the drive was seen")
 
 
 @pytest.mark.parametrize("how", ["frozen", "killed", "busy"])
@@ -81,7 +63,7 @@ def test_a_server_that_stands_still_stops_the_car(how: str, tmp_path: Path, tell
             (tmp_path / "hog_server").touch()
         else:
             server.send_signal(signal.SIGSTOP if how == "frozen" else signal.SIGKILL)
-        took_ms = parked(driven, since_ns)
+        took_ms = driven.car.parked(since_ns)
         tell(f"server {how}: in park {took_ms:.0f} ms after")
         assert SILENCE_MS < took_ms < 6000
         if how == "frozen":
@@ -105,7 +87,7 @@ def test_an_actuator_that_stands_still_leaves_a_braking_car(
             (tmp_path / "hog_actuator").touch()
         else:
             os.kill(driven.actuator_pid, signal.SIGSTOP if how == "frozen" else signal.SIGKILL)
-        took_ms = held(driven, since_ns)
+        took_ms = driven.car.held(since_ns)
         tell(f"actuator {how}, {profile}: the kit brakes {took_ms:.0f} ms after")
         assert KIT_MS - 25 < took_ms < KIT_MS + ROOM_MS
         if how == "frozen":
@@ -126,7 +108,7 @@ def test_a_machine_that_stands_still_leaves_a_braking_car(
     with driving(proved("dataspeed_gen2"), tmp_path) as driven:
         since_ns = CLOCK.now().mono_ns
         os.killpg(driven.loop.server.popen.pid, how)
-        took_ms = held(driven, since_ns)
+        took_ms = driven.car.held(since_ns)
         tell(f"both, {how.name}: the kit brakes {took_ms:.0f} ms after")
         assert KIT_MS - 25 < took_ms < KIT_MS + ROOM_MS
         if how == signal.SIGSTOP:
@@ -159,7 +141,7 @@ def test_a_server_that_is_told_to_end_parks_the_car(tmp_path: Path, tell: Tell, 
     with driving(proved("dataspeed_gen2"), tmp_path) as driven:
         since_ns = CLOCK.now().mono_ns
         driven.loop.server.popen.send_signal(signal.SIGINT)
-        tell(f"told to end: in park {parked(driven, since_ns):.0f} ms after")
+        tell(f"told to end: in park {driven.car.parked(since_ns):.0f} ms after")
         assert driven.loop.server.popen.wait(20) == 0
 
 

@@ -135,7 +135,7 @@ class ControllerConfig(Section):
     wheelbase_m: float = Field(2.8448, gt=0.5, lt=10)
     """Of the vehicle that is driven; the built-in car's."""
     rearm: bool = False
-    """Arm again by itself after a safe stop."""
+    """Arm again by itself after a safe stop, and when the server was started again (docs/session.md)."""
     clear_emergency_stop: bool = False
     """Clear an emergency stop that is found, as whoever set this has seen to what caused it."""
 

@@ -18,22 +18,23 @@ REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"
 LIGHT = ("vehicle.scenery=none",)
 """What a user-mode kernel, with its one processor and dear system calls, can draw in time."""
+BY_WIRE = "configs/server-by-wire.yaml"
 ROUTER_PORT = 7448
+SESSION_PORT = 7447
 LONGEST_S = 240
 
 
 @dataclass(frozen=True)
 class Loop:
-    """The four programs of a drive."""
+    """The programs of a drive."""
 
-    server_router: Started
+    routers: tuple[Started, ...]
     server: Started
-    client_router: Started
     client: Started
 
     def all(self) -> tuple[Started, ...]:
         """List them in the order in which they were started."""
-        return self.server_router, self.server, self.client_router, self.client
+        return *self.routers, self.server, self.client
 
 
 @dataclass(frozen=True)
@@ -56,22 +57,55 @@ def start_loop(
     client_changes: Sequence[str] = (),
 ) -> Loop:
     """Start the four programs; `out` is a new directory's name on both machines."""
-    server_router = _start(server, "router", "zenoh-configs/router-server.json5")
     dialled = json.dumps([f"udp/{server.address}:{ROUTER_PORT}?rel=1;mixed_rel=1"])
-    client_router = _start(
-        client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={dialled}"]
+    routers = (
+        _start(server, "router", "zenoh-configs/router-server.json5"),
+        _start(client, "router", "zenoh-configs/router-client.json5", changes=[f"connect.endpoints={dialled}"]),
     )
-    for router in (server_router, client_router):
-        router.first_line()
+    _wait_ready(*routers)
     changes = [f"vehicle.route={SHORT_ROAD}", *LIGHT, *server_changes]
-    server_program = _start(
-        server, "server", "configs/server.yaml", "--once", "--out", f"{out}/server", changes=changes
+    loop = Loop(
+        routers,
+        _start_server(server, "configs/server.yaml", out, changes),
+        _start_client(client, server, out, client_changes),
     )
-    changes = [f"video.server={server.address}", *client_changes]
-    client_program = _start(client, "client", "configs/client.yaml", "--out", f"{out}/client", changes=changes)
-    for program in (server_program, client_program):
+    _wait_ready(loop.server, loop.client)
+    return loop
+
+
+def start_by_wire(
+    server: Machine,
+    client: Machine,
+    out: Path,
+    *,
+    server_changes: Sequence[str] = (),
+    client_changes: Sequence[str] = (),
+) -> Loop:
+    """Start the programs of a drive by wire. The one router is the client's: the server's machine has more to do."""
+    listened = json.dumps([f"tcp/0.0.0.0:{SESSION_PORT}"])
+    router = _start(client, "router", "zenoh-configs/router-server.json5", changes=[f"listen.endpoints={listened}"])
+    _wait_ready(router)
+    changes = [f"zenoh.router=tcp/{client.address}:{SESSION_PORT}", *LIGHT, *server_changes]
+    client_changes = [f"zenoh.router=tcp/127.0.0.1:{SESSION_PORT}", *client_changes]
+    loop = Loop(
+        (router,), _start_server(server, BY_WIRE, out, changes), _start_client(client, server, out, client_changes)
+    )
+    _wait_ready(loop.server, loop.client)
+    return loop
+
+
+def _start_server(machine: Machine, config: str, out: Path, changes: Sequence[str]) -> Started:
+    return _start(machine, "server", config, "--once", "--out", f"{out}/server", changes=changes)
+
+
+def _start_client(machine: Machine, server: Machine, out: Path, changes: Sequence[str]) -> Started:
+    changes = [f"video.server={server.address}", *changes]
+    return _start(machine, "client", "configs/client.yaml", "--out", f"{out}/client", changes=changes)
+
+
+def _wait_ready(*programs: Started) -> None:
+    for program in programs:
         program.first_line()
-    return Loop(server_router, server_program, client_router, client_program)
 
 
 def wait_for_the_end(loop: Loop, meanwhile: Callable[[Loop], None]) -> None:

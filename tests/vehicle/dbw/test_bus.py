@@ -33,13 +33,13 @@ FAR = Frame(0x2F01, b"\x01", is_extended=True)
 class HandClock:
     """A clock that goes on by `step_ns` each time it is read."""
 
-    def __init__(self, mono_ns: int, step_ns: int = 0) -> None:
-        self.mono_ns, self.step_ns = mono_ns, step_ns
+    def __init__(self, mono_ns: int, step_ns: int = 0, ahead_ns: int = 0) -> None:
+        self.mono_ns, self.step_ns, self.ahead_ns = mono_ns, step_ns, ahead_ns
 
     def now(self) -> Now:
-        """Read both."""
+        """Read both; the wall clock is ahead of the machine's."""
         self.mono_ns += self.step_ns
-        return Now(self.mono_ns, MachineClock().now().wall_ns)
+        return Now(self.mono_ns, MachineClock().now().wall_ns + self.ahead_ns)
 
 
 def until(done: Callable[[], bool]) -> None:
@@ -166,6 +166,19 @@ def test_arrival(opened: Callable[..., CanPort]) -> None:
 
     until(is_there)
     assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
+
+
+@pytest.mark.parametrize(("ahead_s", "is_heard"), [(-3, True), (0, True), (3, False)])
+def test_what_waited_too_long_is_dropped(opened: Callable[..., CanPort], ahead_s: int, is_heard: bool) -> None:
+    """A frame that the kernel has had for more than a second is counted; one of the future came now."""
+    number = free_port()
+    port = opened("udp_multicast", GROUP, port=number, clock=HandClock(5 * NS_PER_S, ahead_ns=ahead_s * NS_PER_S))
+    opened("udp_multicast", GROUP, port=number).send([STEERING], now_ns())
+    if is_heard:
+        assert hear(port, 1) == [STEERING]
+    else:
+        until(lambda: port.counts["read_too_late"] == 1)
+        assert port.take(0) == []
 
 
 def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:

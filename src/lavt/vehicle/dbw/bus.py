@@ -38,7 +38,7 @@ QUEUE_FRAMES: Final = 8192
 POLL_S: Final = 0.1
 """The reader looks so often whether the port was closed."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A kernel's stamp further back than this is not believed: the wall clock was stepped in between."""
+"""A frame that has waited longer is dropped: whoever read it was frozen, or the wall clock was stepped in between."""
 IP_TIMEOUT_S: Final = 2
 
 logging.getLogger("can").addHandler(logging.NullHandler())  # what it says of errors is in the errors
@@ -57,8 +57,8 @@ PASSING: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})
 class CanPort:
     """A `Port` on a bus; `send` and `take` are for one thread, and one of its own reads.
 
-    `counts`: `frames_too_old` were not sent; `error_frames`, `remote_frames`, `fd_frames`, `unreadable` and
-    `own_frames` were heard and dropped; `overflowed` is what had to go because nobody took it.
+    `counts`: `frames_too_old` were not sent; `error_frames`, `remote_frames`, `fd_frames`, `unreadable`,
+    `read_too_late` and `own_frames` were heard and dropped; `overflowed` is what had to go because nobody took it.
 
     Raises `UserError` where python-can is missing or the bus cannot be opened.
     """
@@ -170,7 +170,10 @@ class CanPort:
         arrived_ns = now.mono_ns
         if self._interface in STAMPED_BY_KERNEL:
             waited_ns = now.wall_ns - round(message.timestamp * NS_PER_S)
-            arrived_ns -= waited_ns if 0 <= waited_ns < LATEST_READ_NS else 0
+            if waited_ns > LATEST_READ_NS:
+                self.counts["read_too_late"] += 1
+                return
+            arrived_ns -= max(waited_ns, 0)
         self.counts["overflowed"] += len(self._heard) == QUEUE_FRAMES
         self._heard.append(HeardFrame(frame, arrived_ns))
 
