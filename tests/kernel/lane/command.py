@@ -125,6 +125,7 @@ def _pair(python: str, tests: Sequence[str], writable: Sequence[Path]) -> int:
     if sys.stdout.isatty():
         environment.setdefault("FORCE_COLOR", "1")  # pytest sees a pipe
     agent = [python, "-B", "-m", "tests.kernel.lane.agent", CLIENT["vec1"]]
+    processors = sorted(os.sched_getaffinity(0))
     guests: list[Guest] = []
     with TemporaryDirectory(prefix="lavt-kernel-") as folder:
         scratch = Path(folder)
@@ -139,7 +140,7 @@ def _pair(python: str, tests: Sequence[str], writable: Sequence[Path]) -> int:
                 ends = {device: (pair[side].fileno(), addresses[device]) for device, pair in links.items()}
                 guest = start_guest(
                     name, command, tools=tools, scratch=scratch, environment=environment, links=ends,
-                    writable=writable, output=to,
+                    writable=writable, output=to, processor=processors[side % len(processors)],
                 )  # fmt: skip
                 guests.append(guest)
             os.close(inlet)

@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from tests.kernel.lane.packages import LIBRARIES, PROGRAMS, program, search_path
@@ -106,11 +107,14 @@ def start_guest(
     links: Mapping[str, tuple[int, str]],
     writable: Sequence[Path],
     output: int,
+    processor: int,
 ) -> Guest:
     """Start a machine that runs `command` and ends with it.
 
     `links` says of each network device which socket it is joined to and its address; `writable` are the directories of
-    this machine that it may write; its command's output goes to the descriptor `output`.
+    this machine that it may write; its command's output goes to the descriptor `output`. All of it runs on one
+    processor of this machine, as a system call of the guest is a change from one process to another, and back: from one
+    processor to another that took four times as long.
     """
     busybox = program(tools, "busybox")
     setup = ["ip link set lo up"]
@@ -144,7 +148,7 @@ def start_guest(
             stderr=subprocess.STDOUT,
             pass_fds=[output, *(descriptor for descriptor, _ in links.values())],
             start_new_session=True,  # a process group of its own: Ctrl-C goes to who started it, who ends it
-            preexec_fn=_settle,  # noqa: PLW1509 (there are no threads here)
+            preexec_fn=partial(_settle, processor),  # noqa: PLW1509 (there are no threads here)
             env={"PATH": os.environ.get("PATH", os.defpath), "TMPDIR": _memory_directory(scratch)},
         )
     return Guest(name, process, scratch)
@@ -177,8 +181,9 @@ def _write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def _settle() -> None:
+def _settle(processor: int) -> None:
     """Let the kernel end with the program that started it, even if that is killed outright, and go first if it may."""
+    os.sched_setaffinity(0, [processor])
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
