@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from tests.field.by_wire import GENERATIONS, Car, ms_since, software_car
 from tests.kernel.lane import processes
-from tests.kernel.lane.driving import BY_WIRE, Loop, collect, reasons_against, start_by_wire, wait_for_the_end
+from tests.kernel.lane.driving import BY_WIRE, Drive, Loop, collect, reasons_against, start_by_wire, wait_for_the_end
 from tests.kernel.lane.machine import Machine, wait_until
 
 from lavt.clock import MachineClock, pause
@@ -79,6 +79,7 @@ def by_wire(profile: str, work: Path) -> tuple[str, ...]:
         f"vehicle.dbw.watchdog_proof={work / f'{profile}.json'}",
         "clock.source=probe",
         "video.bit_rate_bps=1000000",
+        "record.video=false",
         *SMALL,
     )
 
@@ -192,7 +193,7 @@ def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
         with lab.started(profile, f"drive-{attempt}") as driven:
             wait_for_the_end(driven.loop, lambda _: None)
             drive = collect(driven.loop, lab.client, driven.out)
-        tell(in_short(profile, drive.result))
+        tell(f"{in_short(profile, drive.result)}; {'; '.join(changes_of_safety(drive))}")
         if not reasons_against(drive) and drive.result["ending"] == "completed":
             break
     assert drive.result["ending"] == "completed", driven.car.news
@@ -201,6 +202,12 @@ def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
     wheel = to_wheel(drive.result)
     assert wheel["n"] > 100
     assert 0 < wheel["p50"] < wheel["p95"]
+
+
+def changes_of_safety(drive: Drive) -> list[str]:
+    events = drive.server.table("event")
+    told = zip(events.texts("kind"), events.texts("detail"), strict=True)
+    return [detail for kind, detail in told if kind == "safety"]
 
 
 def to_wheel(result: dict[str, Any]) -> dict[str, Any]:
