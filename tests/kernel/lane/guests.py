@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from tests.kernel.lane import newer
 from tests.kernel.lane.packages import LIBRARIES, PROGRAMS, program, search_path
 
 MEMORY_MB = 1536
@@ -28,6 +29,10 @@ KEEP_MEMORY = {
     "MALLOC_TOP_PAD_": str(2**26),
 }
 """A page that is touched first costs a user-mode kernel 50 us and more: programs keep what they have been given."""
+
+MODULES = "usr/lib/uml/modules/*"
+KERNEL, LOADED = "linux.uml", "libraries"
+"""The kernel that runs, and what it loads, in the directory that the guests share."""
 
 INIT = """#!{busybox} sh
 b={busybox}
@@ -87,8 +92,13 @@ class Guest:
 
 def prepare(tools: Path, scratch: Path) -> None:
     """Lay out what the guests share."""
-    (scratch / "modules" / "lib").mkdir(parents=True)
-    (scratch / "modules" / "lib" / "modules").symlink_to(tools / "usr/lib/uml/modules")
+    modules = scratch / "modules/lib/modules"
+    modules.mkdir(parents=True)
+    for version in [*tools.glob(MODULES), *tools.glob(f"{newer.FOLDER}/{MODULES}")]:
+        (modules / version.name).symlink_to(version)
+    if not newer.lay_out(tools, scratch / KERNEL, scratch / LOADED):
+        (scratch / KERNEL).symlink_to(program(tools, "linux.uml"))
+        (scratch / LOADED).mkdir()
     (scratch / "modprobe.d").mkdir()
     (scratch / "modprobe.d" / "modprobe").symlink_to(program(tools, "kmod"))  # it looks at its own name
     text = MODPROBE.format(
@@ -137,7 +147,7 @@ def start_guest(
             scratch=shlex.quote(str(scratch)),
         ),
     )
-    kernel = [str(program(tools, "linux.uml")), f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro"]
+    kernel = [str(scratch / KERNEL), "seccomp=auto", f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro"]
     kernel += [f"init={scratch / name}.init", "quiet", "loglevel=1", f"umid={name}", f"uml_dir={scratch}/"]
     kernel += ["con=null", "con0=null,fd:1", f"con1=null,fd:{output}", "ssl=null", *devices]
     with (scratch / f"{name}.console").open("wb") as console:
@@ -149,7 +159,11 @@ def start_guest(
             pass_fds=[output, *(descriptor for descriptor, _ in links.values())],
             start_new_session=True,  # a process group of its own: Ctrl-C goes to who started it, who ends it
             preexec_fn=partial(_settle, processor),  # noqa: PLW1509 (there are no threads here)
-            env={"PATH": os.environ.get("PATH", os.defpath), "TMPDIR": _memory_directory(scratch)},
+            env={
+                "PATH": os.environ.get("PATH", os.defpath),
+                "TMPDIR": _memory_directory(scratch),
+                "LD_LIBRARY_PATH": str(scratch / LOADED),
+            },
         )
     return Guest(name, process, scratch)
 

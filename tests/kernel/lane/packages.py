@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from tests.kernel.lane import newer
 from tests.kernel.lane.refusal import Refusal
 
 WANTED = (
@@ -24,6 +25,8 @@ WANTED = (
     "chrony",
     "can-utils",
 )
+LIST = "".join(f"{package}\n" for package in (*WANTED, *(f"{each}/{newer.SUITE}" for each in newer.PACKAGES)))
+"""What a directory of unpacked packages was made from."""
 PROGRAMS = ("usr/bin", "usr/sbin", "bin", "sbin")
 LIBRARIES = ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu")
 
@@ -31,7 +34,7 @@ LIBRARIES = ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu")
 def fetched(cache: Path) -> Path:
     """Give the directory of the unpacked packages; raises `Refusal` where they are neither there nor can be fetched."""
     tools = cache / "root"
-    if (tools / "packages").is_file() and (tools / "packages").read_text().split() == list(WANTED):
+    if (tools / "packages").is_file() and (tools / "packages").read_text() == LIST:
         return tools
     if platform.machine() != "x86_64" or not sys.platform.startswith("linux"):
         raise Refusal("the user-mode kernel runs on amd64 Linux only: use such a machine")
@@ -79,7 +82,10 @@ def _fetch(folder: Path) -> None:
     (folder / "root").mkdir()
     for package in sorted(folder.glob("*.deb")):
         subprocess.run(["dpkg", "-x", str(package), str(folder / "root")], check=True)
-    (folder / "root" / "packages").write_text("\n".join(WANTED) + "\n")
+    why = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh)
+    if why:
+        print(f"the kernel is this release's own, slower one, as {newer.SUITE}'s cannot be had: {why}", file=sys.stderr)
+    (folder / "root" / "packages").write_text(LIST)
 
 
 def _download(folder: Path, options: Sequence[str]) -> str:
