@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lavt.cli.console import take_precedence
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US
 from lavt.experiment.processes import Processes
+from lavt.runtime import precedence
 from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
 from lavt.transport.rendezvous import REGISTER_EVERY_NS, Address, wrap, write_registration
 from lavt.transport.video_path import PathClient
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
-    take_precedence()
+    precedence.take()
     took_ns: dict[str, list[int]] = {"straight": [], "through": []}
     config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
     sets = [word for change in CHANGES for word in ("--set", change)]

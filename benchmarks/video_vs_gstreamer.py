@@ -24,8 +24,8 @@ from benchmarks.video.gstreamer import gstreamer
 from benchmarks.video.impaired import CASES, impaired_part
 from benchmarks.video.pictures import render_loop
 
-from lavt.cli.console import take_precedence
 from lavt.errors import LavtError, UserError
+from lavt.runtime import precedence
 
 QUICK = {"pairs": 1, "seconds": 4.0, "frames": 120}
 
@@ -58,7 +58,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure what is asked for; 2 where GStreamer is missing."""
     asked = arguments()
-    take_precedence()  # as the server and the client do; the processes of both sides and the relay inherit it
+    precedence.take()  # as the server and the client do; the processes of both sides and the relay inherit it
     try:
         gstreamer()
         with tempfile.TemporaryDirectory() as name:

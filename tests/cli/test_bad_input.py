@@ -19,6 +19,7 @@ from lavt.cli import console
 from lavt.cli.main import app
 from lavt.config_file import shipped
 from lavt.experiment.results import IDENTITY
+from lavt.runtime import precedence
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
@@ -461,7 +462,7 @@ def test_relay_port_in_use(taken: int, run: Run) -> None:
 
 def test_port_of_the_rendezvous_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A rendezvous of whose ports somebody else has one is refused in one sentence, and gives the other one back."""
-    monkeypatch.setattr(console, "take_precedence", lambda: None)
+    monkeypatch.setattr(precedence, "take", lambda: None)
     changes = ("--set", "bind=127.0.0.1", "--set", "video_port=0", "--set", f"probe_port={taken}")
     assert f"the probe port 127.0.0.1:{taken} cannot be opened" in run("rendezvous", RENDEZVOUS, *changes).refused()
 
@@ -476,14 +477,14 @@ WATCHES = {
 @pytest.mark.parametrize("case", WATCHES)
 def test_bad_watch(case: str, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A host that nobody knows, and an address that is not this machine's, are refused in one sentence."""
-    monkeypatch.setattr(console, "take_precedence", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
     arguments, said = WATCHES[case]
     assert said in run("watch", *arguments).refused()
 
 
 def test_watched_port_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A port that somebody else has is refused in one sentence."""
-    monkeypatch.setattr(console, "take_precedence", lambda: None)
+    monkeypatch.setattr(precedence, "take", lambda: None)
     said = run("watch", "--bind", "127.0.0.1", "--port", str(taken)).refused()
     assert f"the video port 127.0.0.1:{taken} cannot be opened" in said
 

@@ -21,6 +21,7 @@ from lavt.cli.main import app
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS
+from lavt.runtime import precedence
 from lavt.vehicle.dbw.proving import Seen
 
 Run = Callable[..., tuple[int, str, str]]
@@ -32,7 +33,7 @@ ATTEMPTS = 6
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Give a function that runs `lavt can prove` in this process: exit code, standard output, standard error."""
-    monkeypatch.setattr(console, "take_precedence", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
     monkeypatch.chdir(tmp_path)
 
     def run_here(*arguments: str) -> tuple[int, str, str]:

@@ -12,6 +12,7 @@ from tests.require import need
 from typer.testing import CliRunner
 
 from lavt.cli.main import app
+from lavt.runtime import precedence
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
@@ -60,7 +61,8 @@ def test_units_run_as_a_user_of_their_own(path: Path) -> None:
     service = unit(path)["Service"]
     assert (service["User"], service["Group"]) == ("lavt", "lavt")
     assert (service["CapabilityBoundingSet"], service["NoNewPrivileges"]) == ("", "yes")
-    assert service["LimitNICE"] == "-10"
+    asked = precedence.OF_THE_CAR if path.name == "lavt-server.service" else precedence.NICENESS
+    assert service["LimitNICE"] == str(asked)
 
 
 def test_the_directory_of_the_socket() -> None:

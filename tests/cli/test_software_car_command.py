@@ -21,6 +21,7 @@ from lavt.cli.main import app
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.runtime import precedence
 from lavt.vehicle.can_frame import Frame, HeardFrame
 from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.software_car.frames import unpack
@@ -35,7 +36,7 @@ LONGEST_S = 20
 
 @pytest.fixture(autouse=True)
 def _no_precedence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "take_precedence", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
 
 
 def free_port() -> int:

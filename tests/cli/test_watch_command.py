@@ -17,6 +17,7 @@ import pytest
 from lavt.cli import console, watch
 from lavt.cli.main import app
 from lavt.clock import MachineClock
+from lavt.runtime import precedence
 from lavt.transport.h264 import Encoder
 from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp, write_stamp
@@ -32,7 +33,7 @@ Run = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Give a function that runs `lavt watch` in this process: exit code, standard output, standard error."""
-    monkeypatch.setattr(console, "take_precedence", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
     before = sys.getswitchinterval()
 
     def run_here(*arguments: str) -> tuple[int, str, str]:

@@ -21,6 +21,7 @@ from lavt.clock import Clock, MachineClock
 from lavt.config import ServerConfig
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
+from lavt.runtime import precedence
 from lavt.runtime.elsewhere import NodeElsewhere, NodeHere
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
@@ -84,6 +85,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     """Be the actuator's process: drive until the server's process ends or says so, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
+    precedence.take(precedence.OF_THE_CAR)
     clock = MachineClock()
     try:
         vehicle, start = open_by_wire(config.vehicle, clock), clock.now()

@@ -19,6 +19,7 @@ from lavt.config import ServerConfig
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError, WorkError
+from lavt.runtime import precedence
 from lavt.vehicle.can_frame import BusGone
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import OwnBrake, Profile
@@ -54,7 +55,7 @@ def prove(
     dbw = settings.vehicle.dbw
     file = out or Path(dbw.watchdog_proof or "watchdog_proof.json")
     profile, watchdog = _provable(dbw)
-    console.take_precedence()
+    precedence.take()
     with closing(CanPort(dbw.interface, dbw.channel, dbw.options, clock=MachineClock())) as port:
         if not yes:
             _ask(dbw)

@@ -15,6 +15,7 @@ from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
 from lavt.config_file import load_config
+from lavt.runtime import precedence
 
 
 def register(app: typer.Typer) -> None:
@@ -37,7 +38,7 @@ def client(
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    console.take_precedence()
+    precedence.take()
     settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

@@ -21,10 +21,6 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Change a config va
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 
 
-NICENESS = -10
-"""Of 20 below the ordinary: enough to go first, not enough to starve the system."""
-
-
 def say(text: str) -> None:
     """Print a message for the user to standard error."""
     print(text, file=sys.stderr, flush=True)
@@ -60,15 +56,6 @@ def run_command(command: Callable[[], None]) -> None:
     except OSError as error:  # a disk or a right that no check has foreseen
         say(f"lavt: {error}")
         raise SystemExit(1) from None
-
-
-def take_precedence() -> None:
-    """Ask for more of the processor than ordinary programs get, where the system allows it (as root).
-
-    Whatever else the machine does must not show as latency. Threads begun later have it too.
-    """
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 
 @contextmanager

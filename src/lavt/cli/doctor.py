@@ -29,6 +29,7 @@ from lavt.errors import LavtError, UserError
 from lavt.experiment import checkup
 from lavt.experiment.checkup import Check
 from lavt.experiment.clock_check import compare
+from lavt.runtime import precedence
 from lavt.transport.clock_offset import ClockReport
 from lavt.transport.udp_link import look_up
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
@@ -61,7 +62,7 @@ def doctor(
     Example: lavt doctor configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    console.take_precedence()
+    precedence.take()
     if config is None and changes:
         raise UserError("--set changes a config: name one before it")
     settings = None if config is None else _load(config, changes or [])

@@ -14,6 +14,7 @@ from lavt.clock import MachineClock
 from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
+from lavt.runtime import precedence
 from lavt.transport.delay import DelayLaw, Lognormal
 from lavt.transport.link import Injected
 from lavt.transport.netem import Law
@@ -34,7 +35,7 @@ def relay(
 
     Example: lavt relay configs/relay.yaml --set video.constant_ms=75
     """
-    console.take_precedence()
+    precedence.take()
     settings = load_config(RelayConfig, config, changes or [])
     opened = Relay(MachineClock(), flows(settings))
     with console.until_told() as told:

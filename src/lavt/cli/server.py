@@ -15,6 +15,7 @@ from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
 from lavt.config_file import load_config
+from lavt.runtime import precedence
 from lavt.transport.clock_offset import kernel_identity
 
 
@@ -35,7 +36,7 @@ def server(
     Example: lavt server configs/server.yaml --out out/server
     """
     console.keep_stdout_for_results()
-    console.take_precedence()
+    precedence.take()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

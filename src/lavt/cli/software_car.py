@@ -24,6 +24,7 @@ from lavt.config.dbw import DbwConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
+from lavt.runtime import precedence
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.road import load_road
@@ -50,7 +51,7 @@ def software_car(
 
     Example: lavt software-car configs/server-by-wire.yaml --set vehicle.dbw.channel=vcan0
     """
-    console.take_precedence()
+    precedence.take(precedence.OF_THE_CAR)
     settings = load_config(ServerConfig, config, changes or [])
     dbw = settings.vehicle.dbw
     if dbw.interface == INSIDE:

@@ -309,4 +309,7 @@ class Adapter:
 
 def _joined(words: Iterable[str]) -> str:
     """Put sentences together, each once."""
-    return SEPARATOR.join(dict.fromkeys(part for each in words for part in each.split(SEPARATOR) if part))
+    said = [each for each in words if each]
+    if not said:  # nearly always
+        return ""
+    return SEPARATOR.join(dict.fromkeys(part for each in said for part in each.split(SEPARATOR) if part))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from typing import Final, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final, Literal, get_args
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import Frame
@@ -14,6 +14,7 @@ from lavt.vehicle.dbw.profile import AXES, Axis, Gear, Profile, Report, Sign
 Values = Mapping[str, float | None]
 Kind = Literal["override", "trip", "lapse", "fault", "reason"]
 """What hinders driving, as the profile's reports distinguish it."""
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 FOREIGN_NS: Final = NS_PER_S
 """Ours: somebody else who commanded the kit is taken to do so for so long."""
 
@@ -29,6 +30,8 @@ class Reports:
         self._profile = profile
         self._said: dict[str, dict[Kind, list[str]]] = {}
         """What each newest report says, by kind."""
+        self._all_said: dict[Kind, list[str]] = {kind: [] for kind in KINDS}
+        """What they say together; few reports say anything new."""
         self._heard_ns: dict[str, int] = {}
         """When each report came last with all its values."""
         self._commands = _commands(profile)
@@ -60,7 +63,7 @@ class Reports:
         ):
             self.counts["wrong_checksum"] += 1
             return
-        self._said[message] = self._read(message, report, values)
+        self._note(message, self._read(message, report, values))
         known = {
             word: number
             for word, signal in report.values.items()
@@ -71,6 +74,14 @@ class Reports:
             self._heard_ns[message] = now_ns
         else:
             self.counts["value_unknown"] += 1
+
+    def _note(self, message: str, said: dict[Kind, list[str]]) -> None:
+        if said != self._said.get(message):
+            self._said[message] = said
+            self._all_said = {
+                kind: list(dict.fromkeys(words for each in self._said.values() for words in each[kind]))
+                for kind in KINDS
+            }
 
     def _take(self, report: Report, known: Mapping[str, float], now_ns: int) -> None:
         if "speed" in known:
@@ -107,9 +118,9 @@ class Reports:
         deadlines = (heard_ns + reports[message].timeout_ns for message, heard_ns in self._heard_ns.items())
         return min((deadline_ns for deadline_ns in deadlines if deadline_ns > now_ns), default=None)
 
-    def said(self, kind: Kind) -> list[str]:
+    def said(self, kind: Kind) -> Sequence[str]:
         """Tell what the newest reports say of a kind, in words, each once."""
-        return list(dict.fromkeys(words for said in self._said.values() for words in said[kind]))
+        return self._all_said[kind]
 
     def _read(self, message: str, report: Report, values: Values) -> dict[Kind, list[str]]:
         """Put a report's signs into words."""
