@@ -183,10 +183,10 @@ class Driven:
         """Wait until it drives at more than 5 m/s; False where it was stopped before."""
         end_ns = CLOCK.now().mono_ns + LONGEST_NS
         while CLOCK.now().mono_ns < end_ns and self.status().get("safety") != "safe_stop":
-            if self.status().get("speed_mps", 0.0) > 5.0:
-                return True
             if self.car.heard("watchdog", "watchdog brakes") is not None:
                 break
+            if self.status().get("speed_mps", 0.0) > 5.0:
+                return True
             pause(20 * NS_PER_MS)
         return False
 

@@ -107,10 +107,10 @@ class Driven:
 
         def is_decided() -> bool:
             status = self.loop.server.latest().get("status", {})
-            if status.get("speed_mps", 0.0) >= DRIVEN_MPS:
-                told.append(True)
-            elif status.get("safety") == "safe_stop" or self.car.heard("watchdog", "watchdog brakes") is not None:
+            if status.get("safety") == "safe_stop" or self.car.heard("watchdog", "watchdog brakes") is not None:
                 told.append(False)
+            elif status.get("speed_mps", 0.0) >= DRIVEN_MPS:
+                told.append(True)
             return bool(told)
 
         wait_until("the vehicle is driven", is_decided, 90)
@@ -267,6 +267,7 @@ def test_a_kit_that_falls_silent_stops_the_drive(lab: Lab, tell: Tell) -> None:
 def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
     """Of a process that stands still the kernel sends nothing either, and thawed it sends nothing of before."""
     with lab.driving("dataspeed_gen2") as driven, a_port() as port:
+        pause(2 * KIT_MS * NS_PER_MS)  # a driven kit has been commanded, and that was heard
         since_ns = CLOCK.now().mono_ns
         os.kill(driven.actuator_pid, signal.SIGSTOP)
         took_ms = driven.car.held(since_ns)

@@ -73,6 +73,8 @@ class Adapter:
         """Steering commands sent and not yet seen in a report: in its steps, and when they were asked for."""
         self._reached: list[Reached] = []
         self._counts: Counter[str] = Counter()
+        self._seen = self._situation(start_ns)
+        """What the table of states looked at last."""
 
     @property
     def is_silent(self) -> bool:
@@ -101,12 +103,12 @@ class Adapter:
             self._counts["actuations_refused"] += 1
             return
         self._asked, self._asked_ns = actuation, now_ns
-        self._settle(now_ns)
 
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Hear whether somebody wants to drive."""
-        self._wanted = wanted
-        self._settle(now_ns)
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._settle(now_ns)
 
     # States.
 
@@ -121,7 +123,8 @@ class Adapter:
             self._moved_ns = now_ns
         self._tell(now_ns)
         while True:
-            state, why = following(self._state, self._situation(now_ns))
+            self._seen = self._situation(now_ns)
+            state, why = following(self._state, self._seen)
             if state == self._state:
                 return
             if state in {"lost", "overridden"}:
@@ -272,7 +275,7 @@ class Adapter:
         )
 
     def _hindrance(self) -> str:
-        now = self._situation(self._now_ns)
+        now = self._seen
         said = [self._why if self._state in {"lost", "overridden"} else "", now.hindrance]
         if self._state == "parking" and now.is_standing and now.since_ns >= ENABLING_LIMIT_NS:
             said.append(_joined(["the car stands and is not parked", now.reasons]))
