@@ -44,7 +44,7 @@ SENT_LATE_MS = 20
 SET_FLAGS = 0x8914
 """SIOCSIFFLAGS of linux/sockios.h."""
 PARKED_MS = 6000
-ATTEMPTS = 4
+ATTEMPTS = 6
 """At most, where the host holds the machines up before the fault."""
 DRIVEN_MPS = 5.0
 CLOCK = MachineClock()
