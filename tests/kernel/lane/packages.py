@@ -68,10 +68,10 @@ def _fetch(folder: Path) -> None:
     own = folder / "apt"
     (own / "lists" / "partial").mkdir(parents=True)
     (own / "archives" / "partial").mkdir(parents=True)
-    sandbox = "-oAPT::Sandbox::User=root"  # apt's own user could not write here
-    fresh = (sandbox, f"-oDir::State::Lists={own / 'lists'}", f"-oDir::Cache={own}")
+    patient = ("-oAPT::Sandbox::User=root", "-oAcquire::Retries=3")  # apt's own user could not write here
+    fresh = (*patient, f"-oDir::State::Lists={own / 'lists'}", f"-oDir::Cache={own}")
     print("fetching a user-mode kernel and its tools from Debian's packages, once", file=sys.stderr, flush=True)
-    said = _download(folder, (sandbox,))
+    said = _download(folder, patient)
     if said:
         _apt(folder, "apt-get", *fresh, "update")
         said = _download(folder, fresh)
