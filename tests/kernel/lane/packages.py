@@ -84,7 +84,11 @@ def _fetch(folder: Path) -> None:
         subprocess.run(["dpkg", "-x", str(package), str(folder / "root")], check=True)
     why = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh)
     if why:
-        print(f"the kernel is this release's own, slower one, as {newer.SUITE}'s cannot be had: {why}", file=sys.stderr)
+        print(
+            f"the kernel is this release's own, slower one, as {newer.SUITE}'s cannot be had ({why}); to try again: "
+            f"rm -r {folder.parent}",
+            file=sys.stderr,
+        )
     (folder / "root" / "packages").write_text(LIST)
 
 
