@@ -36,7 +36,7 @@ LONGEST_S = 20
 
 @pytest.fixture(autouse=True)
 def _no_precedence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(precedence, "take", lambda _niceness: None)  # it would be that of all tests
 
 
 def free_port() -> int:
