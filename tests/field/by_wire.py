@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from tests.held_up import HeldUp
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -30,7 +31,12 @@ GROUP = "239.74.163.2"
 """Of UDP multicast, which is a CAN bus between processes where the kernel has none."""
 CLOCK = MachineClock()
 LONGEST_NS = 60 * NS_PER_S
-ATTEMPTS = 4
+KIT_MS = 100
+"""The kit lets go so long after the last command, and had one before the fault."""
+ROOM_MS = 60
+"""For a busy machine, beside what the design promises."""
+HELD_UP_MS = 30
+"""A pause so much too long shows that other work held this machine up."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
@@ -88,6 +94,8 @@ class Car:
 
     process: subprocess.Popen[str]
     news: list[dict[str, Any]] = field(default_factory=list)
+    late_ms: float = 0.0
+    """By how much the pauses in waiting for it were too long, at most."""
     _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
     _reader: threading.Thread = field(default_factory=threading.Thread)
 
@@ -120,25 +128,45 @@ class Car:
         return next((each["mono_ns"] for each in told if each["mono_ns"] >= since_ns), None)
 
     def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = LONGEST_NS) -> int:
-        """Wait until it tells something; tell when that was."""
+        """Wait until it tells something, unless its watchdog brakes before; tell when that was."""
         end_ns = CLOCK.now().mono_ns + within_ns
-        while CLOCK.now().mono_ns < end_ns:
+        braked_ns = None
+        while braked_ns is None and CLOCK.now().mono_ns < end_ns:
+            braked_ns = self.heard("watchdog", "watchdog brakes")
             at_ns = self.heard(kind, text, since_ns=since_ns)
             if at_ns is not None:
                 return at_ns
-            pause(5 * NS_PER_MS)
-        raise AssertionError(f"the car told no {kind!r} with {text!r}: {self.news}")
+            self.rest(5)
+        if braked_ns is not None and braked_ns < since_ns:
+            raise HeldUp(f"the kit let go before the fault: {self.news}")
+        raise self.wrong(f"the car told no {kind!r} with {text!r}: {self.news}")
 
-    def held(self, since_ns: int) -> float:
-        """Wait until the kit has let go and brakes by its watchdog; tell how many ms after something."""
+    def rest(self, duration_ms: int) -> None:
+        """Pause, and note by how much that was too long."""
+        before_ns = CLOCK.now().mono_ns
+        pause(duration_ms * NS_PER_MS)
+        self.late_ms = max(self.late_ms, ms_since(CLOCK.now().mono_ns, before_ns) - duration_ms)
+
+    def wrong(self, said: str) -> Exception:
+        """Give what to raise for something that should not be; `HeldUp` where the machine was held up in waiting."""
+        if self.late_ms > HELD_UP_MS:
+            return HeldUp(f"a pause was {self.late_ms:.0f} ms too long; {said}")
+        return AssertionError(said)
+
+    def held(self, since_ns: int, *, room_ms: float = ROOM_MS) -> float:
+        """Wait until the kit has let go and brakes by its watchdog, in time; tell how many ms after something."""
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
-        return ms_since(at_ns, since_ns)
+        took_ms = ms_since(at_ns, since_ns)
+        if took_ms >= KIT_MS + room_ms:
+            raise self.wrong(f"the kit brakes only {took_ms:.0f} ms after: {self.news}")
+        return took_ms
 
     def parked(self, since_ns: int) -> float:
         """Wait until it stands in park and nothing is enabled; tell how many ms after something it was in park."""
         at_ns = self.wait("gear", "gear PARK", since_ns=since_ns)
         self.wait("enabled", "lets go", since_ns=since_ns)
-        assert self.heard("watchdog", "brakes", since_ns=since_ns) is None, "it was stopped without the watchdog"
+        if self.heard("watchdog", "watchdog brakes") is not None:
+            raise self.wrong(f"the watchdog stopped it: {self.news}")
         return ms_since(at_ns, since_ns)
 
     def end(self) -> None:
@@ -194,23 +222,21 @@ class Driven:
         """Wait until the server's status says something."""
         end_ns = CLOCK.now().mono_ns + LONGEST_NS
         while not what(self.status()):
-            assert CLOCK.now().mono_ns < end_ns, f"{why}: {self.loop.server.latest}, {self.car.news}"
-            pause(20 * NS_PER_MS)
+            if CLOCK.now().mono_ns >= end_ns:
+                raise self.car.wrong(f"{why}: {self.loop.server.latest}, {self.car.news}")
+            self.car.rest(20)
 
 
 @contextmanager
 def driving(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
     """Drive a software car at more than 5 m/s, over routers and sockets of the loopback.
 
-    Where other work on the machine holds it up before, so that the kit lets go, all is started again, with a new car.
+    Raises `HeldUp` where it is stopped before.
     """
-    for attempt in range(ATTEMPTS):
-        attempt_dir = work / f"attempt-{attempt}"
-        attempt_dir.mkdir()
-        with started(run, attempt_dir, program=program) as driven:
-            if driven.drives() or attempt == ATTEMPTS - 1:
-                yield driven
-                return
+    with started(run, work, program=program) as driven:
+        if not driven.drives():
+            raise HeldUp(f"stopped before it drove: {driven.status()}, {driven.car.news}")
+        yield driven
 
 
 @contextmanager

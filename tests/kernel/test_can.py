@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.field.by_wire import GENERATIONS, Car, ms_since, software_car
+from tests.field.by_wire import GENERATIONS, KIT_MS, ROOM_MS, Car, ms_since, software_car
+from tests.held_up import HeldUp, again_where_held_up
 from tests.kernel.lane import processes
 from tests.kernel.lane.driving import BY_WIRE, Drive, Loop, collect, reasons_against, start_by_wire, wait_for_the_end
 from tests.kernel.lane.machine import Machine, wait_until
@@ -27,7 +28,7 @@ from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.bus import CanPort
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.timeout(900), again_where_held_up]
 
 Tell = Callable[[str], None]
 
@@ -36,16 +37,10 @@ SMALL = ("camera.width_px=320", "camera.height_px=240", "camera.rate_hz=15")
 P95_M = 0.22
 COMMANDS = {0x200, 0x201, 0x202}
 """Steering, brake and throttle, of generation 2's set `remote`."""
-KIT_MS = 100
-"""The kit lets go so long after the last command, and had one before the fault."""
-ROOM_MS = 60
-"""For a busy machine, beside what the design promises."""
 SENT_LATE_MS = 20
 SET_FLAGS = 0x8914
 """SIOCSIFFLAGS of linux/sockios.h."""
 PARKED_MS = 6000
-ATTEMPTS = 6
-"""At most, where the host holds the machines up before the fault."""
 DRIVEN_MPS = 5.0
 CLOCK = MachineClock()
 
@@ -101,20 +96,16 @@ class Driven:
     out: Path
     actuator_pid: int
 
-    def drives(self) -> bool:
-        """Wait until it drives at speed; False where it was stopped before."""
-        told: list[bool] = []
+    def wait_driven(self) -> None:
+        """Wait until it drives at speed; raises `HeldUp` where it is stopped before."""
 
-        def is_decided() -> bool:
+        def is_driven() -> bool:
             status = self.loop.server.latest().get("status", {})
             if status.get("safety") == "safe_stop" or self.car.heard("watchdog", "watchdog brakes") is not None:
-                told.append(False)
-            elif status.get("speed_mps", 0.0) >= DRIVEN_MPS:
-                told.append(True)
-            return bool(told)
+                raise HeldUp(f"stopped before it drove: {status}, {self.car.news}")
+            return bool(status.get("speed_mps", 0.0) >= DRIVEN_MPS)
 
-        wait_until("the vehicle is driven", is_decided, 90)
-        return told[0]
+        wait_until("the vehicle is driven", is_driven, 90)
 
     def because(self) -> str:
         """Tell why the server stopped."""
@@ -139,29 +130,22 @@ class Lab:
     work: Path
 
     @contextmanager
-    def started(self, profile: str, name: str) -> Iterator[Driven]:
-        """Start a software car, a server that drives it, and a client. The proof is made once."""
+    def driving(self, profile: str) -> Iterator[Driven]:
+        """Drive a software car at speed, by a server that is proved to leave it braking. The proof is made once."""
         changes = by_wire(profile, self.proofs)
         if not (self.proofs / f"{profile}.json").exists():
             prove(self.server, changes)
-        out = self.work / name
+        out = self.work / "drive"
         with software_car(BY_WIRE, *sets(changes)) as car:
             client = ("clock.source=probe", *SMALL)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
             try:
-                yield Driven(car, loop, out, loop.server.first_line()["ready"]["actuator_pid"])
+                driven = Driven(car, loop, out, loop.server.first_line()["ready"]["actuator_pid"])
+                driven.wait_driven()
+                yield driven
             finally:
                 self.server.end_all()
                 self.client.end_all()
-
-    @contextmanager
-    def driving(self, profile: str) -> Iterator[Driven]:
-        """Drive at speed; where the host holds the machines up before, all is started again."""
-        for attempt in range(ATTEMPTS):
-            with self.started(profile, f"attempt-{attempt}") as driven:
-                if driven.drives() or attempt == ATTEMPTS - 1:
-                    yield driven
-                    return
 
 
 @pytest.fixture(scope="module")
@@ -184,30 +168,16 @@ def last_command_ns(port: CanPort) -> int:
     return max(each.arrived_ns for each in port.take(CLOCK.now().mono_ns) if each.frame.identifier in COMMANDS)
 
 
-def drive_whole(profile: str, lab: Lab, tell: Tell) -> Drive:
-    """Drive the route; again, where the host held the machines up."""
-    drives = []
-    for attempt in range(ATTEMPTS):
-        with lab.started(profile, f"drive-{attempt}") as driven:
-            if not driven.drives():
-                tell(f"{profile}: stopped before it drove: {driven.because()}")
-                continue
-            wait_for_the_end(driven.loop, lambda _: None)
-            drive = collect(driven.loop, lab.client, driven.out)
-        tell(f"{profile}: {in_short(drive.result)}; {'; '.join(changes_of_safety(drive))}")
-        drives.append(drive)
-        if not reasons_against(drive) and drive.result["ending"] == "completed":
-            break
-    assert drives, "it never drove"
-    return drives[-1]
-
-
 @pytest.mark.parametrize("profile", GENERATIONS)
 def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
     """Route A key at L0 over real SocketCAN, and how long a command takes to the wheel is in the record."""
-    drive = drive_whole(profile, lab, tell)
-    assert drive.result["ending"] == "completed"
-    assert reasons_against(drive) == []
+    with lab.driving(profile) as driven:
+        wait_for_the_end(driven.loop, lambda _: None)
+        drive = collect(driven.loop, lab.client, driven.out)
+    told = f"{profile}: {in_short(drive.result)}; {'; '.join(changes_of_safety(drive))}"
+    tell(told)
+    if drive.result["ending"] != "completed" or reasons_against(drive):
+        raise HeldUp(told)
     assert drive.result["p95_m"] <= P95_M
     wheel = to_wheel(drive.result)
     assert wheel["n"] > 100
@@ -242,13 +212,12 @@ def test_a_bus_that_goes_leaves_a_braking_car(lab: Lab, tell: Tell) -> None:
         since_ns = CLOCK.now().mono_ns
         take_down("vcan0")
         down_ms = ms_since(CLOCK.now().mono_ns, since_ns)
-        took_ms = driven.car.held(since_ns)
+        took_ms = driven.car.held(since_ns, room_ms=down_ms + ROOM_MS)
         driven.wait_stopped()
         tell(f"down took {down_ms:.0f} ms, the kit brakes {took_ms:.0f} ms after its begin, {driven.because()}")
         ip("link", "set", "vcan0", "up")
         pause(NS_PER_S)
         assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
-        assert 0 < took_ms < down_ms + KIT_MS + ROOM_MS
 
 
 def test_a_kit_that_falls_silent_stops_the_drive(lab: Lab, tell: Tell) -> None:
@@ -261,7 +230,6 @@ def test_a_kit_that_falls_silent_stops_the_drive(lab: Lab, tell: Tell) -> None:
         driven.car.act("bus_on")
         pause(NS_PER_S)
         assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
-        assert 0 < took_ms < KIT_MS + ROOM_MS
 
 
 def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
@@ -270,6 +238,7 @@ def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
         pause(2 * KIT_MS * NS_PER_MS)  # a driven kit has been commanded, and that was heard
         since_ns = CLOCK.now().mono_ns
         os.kill(driven.actuator_pid, signal.SIGSTOP)
+        frozen_ns = CLOCK.now().mono_ns
         took_ms = driven.car.held(since_ns)
         pause(NS_PER_S)
         last_ns = last_command_ns(port)
@@ -277,9 +246,8 @@ def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
         driven.wait_stopped()
         pause(NS_PER_S)
         tell(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes {took_ms:.0f} ms after")
-        assert last_ns < since_ns + SENT_LATE_MS * NS_PER_MS
+        assert last_ns < frozen_ns + SENT_LATE_MS * NS_PER_MS
         assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
-        assert 0 < took_ms < KIT_MS + ROOM_MS
 
 
 def test_a_server_that_is_killed_parks_the_car(lab: Lab, tell: Tell) -> None:
