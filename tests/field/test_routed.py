@@ -173,9 +173,9 @@ def test_everything_passes_two_nats_and_a_cloud(routed: Routed) -> None:
     assert per_second(routed.before(routed.client, "state")) >= 45
     assert per_second(routed.before(routed.client, "clock_probe")) >= 1.5
     assert len(routed.client.table("session_reply")) > 0
-    assert [each.after for each in transitions(routed.server) if each.at.mono_ns < routed.changed.mono_ns] == [
-        "arming", "driving",
-    ]  # fmt: skip
+    states = [each.after for each in transitions(routed.server) if each.at.mono_ns < routed.changed.mono_ns]
+    assert states[-2:] == ["arming", "driving"]
+    assert set(states[:-2]) <= {"arming", "disarmed"}  # a machine that is held up while arming begins anew
 
 
 def test_a_client_whose_address_changes_keeps_its_video(routed: Routed) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import queue
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -11,13 +12,13 @@ from typing import Any, Literal
 import pytest
 import zenoh
 
-from lavt.clock import MachineClock
+from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
-from lavt.domain import Now
+from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import MAX_MESSAGE_BYTES
-from lavt.transport.zenoh_link import Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import ARRIVING_KEPT, Router, ZenohLink, quiet_logs
 
 ARRIVES_S = 10.0
 CONFIGS = shipped("zenoh-configs")
@@ -117,6 +118,39 @@ def test_control(pair: Pair) -> None:
     command = Send("control", b"\x00command")
     arrived, _ = pair.server_heard.next(("control", b"\x00command"), lambda: pair.client.send(command))
     assert before.mono_ns <= arrived.mono_ns <= MachineClock().now().mono_ns
+
+
+def test_more_than_can_be_heard(routers: tuple[str, str]) -> None:
+    """While a command is being looked at the newest of the others are kept, and a query is heard at once."""
+    with closing(Pair(routers, "vehicle-busy")) as pair:
+        looking, seen = threading.Event(), threading.Event()
+        heard = pair.server_heard
+
+        def look(channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+            heard(channel, payload, arrived, peer)
+            if payload == b"look":
+                looking.set()
+                seen.wait(ARRIVES_S)
+
+        pair.server._deliver = look
+        heard.next(("control", b"look"), lambda: pair.client.send(Send("control", b"look")))
+        assert looking.wait(ARRIVES_S)
+        heard.payloads.clear()
+        for number in range(10 * ARRIVING_KEPT):
+            pair.client.send(Send("control", b"%d" % number))
+        heard.next(("session", b"who holds?"), lambda: pair.client.send(Send("session", b"who holds?")))
+        assert set(heard.payloads) == {b"who holds?"}
+        seen.set()
+        for _ in range(100):
+            pair.client.send(Send("control", b"last"))
+            pause(round(ARRIVES_S * NS_PER_S / 100))
+            if b"last" in heard.payloads:
+                break
+        numbers = [int(payload) for payload in heard.payloads if payload.isdigit()]
+        assert b"last" in heard.payloads
+        assert numbers == sorted(numbers)
+        assert 0 < len(numbers) < 2 * ARRIVING_KEPT
+        assert numbers[0] > ARRIVING_KEPT
 
 
 def test_state(pair: Pair) -> None:

@@ -35,6 +35,9 @@ PROTOCOLS_OF_PATHS = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANSWERS = {"session": "session_reply", "netem": "netem_reply"}
 """The queries, by the last part of their keys, and what answers them."""
 ASKED = {answer: query for query, answer in ANSWERS.items()}
+ARRIVING_KEPT = 256
+"""So many messages wait to be heard; of more the oldest goes. Zenoh's threads put down what comes and never wait for
+Python's lock, so that a flood makes no queue in sockets."""
 QUERIES_KEPT = 64
 """So many queries of each kind wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
 CONTROL: dict[str, Any] = {
@@ -188,6 +191,7 @@ class ZenohLink:
         self._declared: list[Any] = []
         self._closing = threading.Event()
         self._opener: threading.Thread | None = None
+        self._listener: threading.Thread | None = None
         self._waiting = waiting
         self._waits_because = ""
         try:
@@ -223,9 +227,13 @@ class ZenohLink:
 
     def _declare(self, session: zenoh.Session) -> None:
         heard, said, qos = ("control", "state", STATE) if self._side == "server" else ("state", "control", CONTROL)
-        listener: Any = zenoh.handlers.Callback(lambda sample: self._hear(heard, sample), indirect=False)
         self._publisher = session.declare_publisher(f"{self._base}/{said}", **qos)
-        self._declared.append(session.declare_subscriber(f"{self._base}/{heard}", listener))
+        arriving: Any = session.declare_subscriber(f"{self._base}/{heard}", zenoh.handlers.RingChannel(ARRIVING_KEPT))
+        self._declared.append(arriving)
+        self._listener = threading.Thread(
+            target=self._listen, args=(heard, arriving.handler), name=f"zenoh {heard}", daemon=True
+        )
+        self._listener.start()
         for channel in ANSWERS if self._side == "server" else ():
             asked: Any = zenoh.handlers.Callback(functools.partial(self._asked, channel), indirect=False)
             self._declared.append(session.declare_queryable(f"{self._base}/{channel}", asked))
@@ -272,10 +280,18 @@ class ZenohLink:
             return
         for declared in self._declared:
             declared.undeclare()
+        if self._listener is not None:
+            self._listener.join()
         self._session.close()
 
-    def _hear(self, channel: str, sample: zenoh.Sample) -> None:
-        self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
+    def _listen(self, channel: str, arriving: Any) -> None:
+        """Deliver what arrives until it is undeclared."""
+        while True:
+            try:
+                sample = arriving.recv()
+            except zenoh.ZError:
+                return
+            self._deliver(channel, sample.payload.to_bytes(), self._clock.now(), None)
 
     def _ask(self, channel: str, payload: bytes) -> None:
         answered: Any = zenoh.handlers.Callback(functools.partial(self._answered, channel), indirect=False)
