@@ -11,6 +11,7 @@ import json
 import os
 import queue
 import socket
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, make_dataclass
@@ -20,7 +21,7 @@ from typing import Any, Final, Protocol
 import zenoh
 
 from lavt.config_file import shipped
-from lavt.transport.zenoh_link import CONTROL
+from lavt.transport.zenoh_link import ARRIVING_KEPT, CONTROL
 
 LONGEST_BYTES: Final = 65_507
 LOOPBACK: Final = "127.0.0.1"
@@ -93,18 +94,24 @@ class Zenoh:
         self._heard: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         said, heard = ("ask", "echo") if asks else ("echo", "ask")
         qos: dict[str, Any] = CONTROL
-        listener: Any = zenoh.handlers.Callback(
-            lambda sample: self._heard.put(sample.payload.to_bytes()), indirect=False
-        )
         self._publisher = self._session.declare_publisher(f"lavt/round-trip/{said}", **qos)
-        self._subscriber = self._session.declare_subscriber(f"lavt/round-trip/{heard}", listener)
+        ring: Any = zenoh.handlers.RingChannel(ARRIVING_KEPT)
+        self._subscriber = self._session.declare_subscriber(f"lavt/round-trip/{heard}", ring)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    def _listen(self) -> None:
+        arriving = self._subscriber.handler
+        with suppress(zenoh.ZError):  # undeclared
+            while True:
+                self._heard.put(arriving.recv().payload.to_bytes())
 
     def send(self, data: bytes) -> None:
         """Publish."""
         self._publisher.put(data)
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Wait for what Zenoh's thread has put here, as a node does."""
+        """Wait for what the thread that listens has put here, as a node does."""
         with suppress(queue.Empty):
             return self._heard.get(timeout=timeout_s)
         return None
@@ -112,6 +119,7 @@ class Zenoh:
     def close(self) -> None:
         """Undeclare and close: without it the process would not end."""
         self._subscriber.undeclare()
+        self._listener.join()
         self._session.close()
 
 
