@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import socket
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -244,4 +245,8 @@ def started(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Ite
     """Start a software car, its server and a client."""
     with software_car(write_config(run, work / "car.yaml")) as car, Processes(work) as processes:
         loop = start_loop(processes, plan_run(run), work, work, once=False, server_program=program)
-        yield Driven(car, loop, work, loop.server_ready["actuator_pid"])
+        try:
+            yield Driven(car, loop, work, loop.server_ready["actuator_pid"])
+        finally:
+            with suppress(ProcessLookupError):  # what stands still cannot end, and would keep its ports
+                os.killpg(loop.server.popen.pid, signal.SIGCONT)

@@ -239,10 +239,12 @@ def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
         since_ns = CLOCK.now().mono_ns
         os.kill(driven.actuator_pid, signal.SIGSTOP)
         frozen_ns = CLOCK.now().mono_ns
-        took_ms = driven.car.held(since_ns)
-        pause(NS_PER_S)
-        last_ns = last_command_ns(port)
-        os.kill(driven.actuator_pid, signal.SIGCONT)
+        try:
+            took_ms = driven.car.held(since_ns)
+            pause(NS_PER_S)
+            last_ns = last_command_ns(port)
+        finally:
+            os.kill(driven.actuator_pid, signal.SIGCONT)
         driven.wait_stopped()
         pause(NS_PER_S)
         tell(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes {took_ms:.0f} ms after")
