@@ -171,19 +171,34 @@ class Site:
     def drive(self, beside: Callable[[], None] = lambda: None) -> None:
         """Have `ROUNDS` commands, states and answers of both questions come through, and do something in each round."""
         commands, states, answers = (len(each) for each in self._came())
-        limit_ns = self.clock.now().mono_ns + round(LIMIT_S * NS_PER_S)
+        limit_ns = self._limit_ns()
         while True:
-            beside()
-            self.operator.command()
-            self.vehicle.tell()
-            for question in ("session", "netem"):
-                self.operator.ask(f"{BASE}/{question}")
-            pause(ROUND_NS)
+            self._round(beside)
             now_commands, now_states, now_answers = (len(each) for each in self._came())
             came = min(now_commands - commands, now_states - states, (now_answers - answers) // 2)
             if came >= ROUNDS:
                 return
             assert self.clock.now().mono_ns < limit_ns, f"only {came} rounds came through in {LIMIT_S:g} s"
+
+    def attack(self, intruder: Intruder, aims: set[str]) -> set[str]:
+        """Have `intruder` try all it can in each round until it has achieved `aims`, or time is up; say what it has."""
+        limit_ns = self._limit_ns()
+        while True:
+            self._round(intruder.attempt)
+            achieved = intruder.achieved(self)
+            if achieved >= aims or self.clock.now().mono_ns >= limit_ns:
+                return achieved
+
+    def _limit_ns(self) -> int:
+        return self.clock.now().mono_ns + round(LIMIT_S * NS_PER_S)
+
+    def _round(self, beside: Callable[[], None]) -> None:
+        beside()
+        self.operator.command()
+        self.vehicle.tell()
+        for question in ("session", "netem"):
+            self.operator.ask(f"{BASE}/{question}")
+        pause(ROUND_NS)
 
     def _came(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
         return (

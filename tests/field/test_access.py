@@ -56,6 +56,8 @@ EVERYTHING = DRIVES | {
 WATCHES = {"state", "alive"}
 MAY = [("operator-1", DRIVES), ("operator-2", set()), ("monitor-1", WATCHES)]
 """Name in the certificate, and all that it achieves; operator-2 is of the same authority, but in no list."""
+OPEN_SITES = 3
+"""So many sites without the lists are attacked at most."""
 NOBODY = 65534
 CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
     "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
@@ -173,12 +175,20 @@ def test_by_name(site: Site, name: str, achieves: set[str], mode: str) -> None:
 
 
 def test_without_the_lists(keys: Path) -> None:
-    """With access and lengths not limited the same attempts all reach their aim: so the other tests would see them."""
-    with ExitStack() as stack:
-        site = site_of(stack, keys, "access_control.enabled=false", "low_pass_filter=[]", cloud=False)
-        intruder = stack.enter_context(closing(site.intruder("monitor-1", "router")))
-        site.drive(intruder.attempt)
-        assert intruder.achieved(site) == EVERYTHING
+    """With access and lengths not limited the same attempts all reach their aim: so the other tests would see them.
+
+    Where nothing is dropped, questions and answers may block routers for good (eclipse-zenoh/zenoh#1876), so that
+    some attempts come to nothing: they have another site to reach.
+    """
+    achieved: set[str] = set()
+    for _ in range(OPEN_SITES):
+        with ExitStack() as stack:
+            site = site_of(stack, keys, "access_control.enabled=false", "low_pass_filter=[]", cloud=False)
+            intruder = stack.enter_context(closing(site.intruder("monitor-1", "router")))
+            achieved |= site.attack(intruder, EVERYTHING - achieved)
+        if achieved == EVERYTHING:
+            return
+    assert achieved == EVERYTHING
 
 
 def test_operators_own_router(site: Site) -> None:
