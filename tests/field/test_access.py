@@ -177,8 +177,8 @@ def test_by_name(site: Site, name: str, achieves: set[str], mode: str) -> None:
 def test_without_the_lists(keys: Path) -> None:
     """With access and lengths not limited the same attempts all reach their aim: so the other tests would see them.
 
-    Where nothing is dropped, questions and answers may block routers for good (eclipse-zenoh/zenoh#1876), so that
-    some attempts come to nothing: they have another site to reach.
+    Where nothing is dropped, all traffic may stop for good (docs/security.md, "What is not protected"), so that some
+    attempts come to nothing: they have another site to reach.
     """
     achieved: set[str] = set()
     for _ in range(OPEN_SITES):
