@@ -1,13 +1,6 @@
-"""Tests of real time and real processes whose machine was held up by other work are run again."""
+"""Former names of what `tests/support` has, for tests that still use them."""
 
-from __future__ import annotations
+from tests.support import inconclusive, stalls
 
-import pytest
-
-
-class HeldUp(Exception):
-    """The machine was held up: what a test saw says nothing of what it asks."""
-
-
-again_where_held_up = pytest.mark.flaky(reruns=7, only_rerun="^HeldUp:")
-"""Up to eight times in all, and only after `HeldUp`; the summary says which and why."""
+HeldUp = stalls.HostStalled
+again_where_held_up = inconclusive.AGAIN

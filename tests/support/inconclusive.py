@@ -1,0 +1,118 @@
+"""Hooks of pytest: a test that the host stalled is run again, at most twice, and then it is inconclusive.
+
+`tests/conftest.py` loads this as a plugin. Every test that uses the fixture
+`stalls`, directly or through another fixture, is run again after `HostStalled` and after nothing else: any other
+exception fails it, also one that was raised while a `HostStalled` was handled. A session in which too many tests were
+inconclusive on an idle machine fails, and so does one whose probes did not last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from tests.support.stalls import TRIES, HostStalled, ProbeEnded, Stalls, inconclusive_too_often
+
+AGAIN = pytest.mark.flaky(reruns=TRIES - 1, rerun_except="^(?!HostStalled:)")
+"""pytest-rerunfailures searches "type: message" of the exception itself, not of those it was raised from."""
+INCONCLUSIVE = "inconclusive"
+
+
+@dataclass
+class Session:
+    """What this session's verdicts depend on."""
+
+    stalls: Stalls | None = None
+    tests: set[str] = field(default_factory=set)
+    said: list[str] = field(default_factory=list)
+
+
+SESSION = pytest.StashKey[Session]()
+
+
+@pytest.fixture(scope="session")
+def stalls(request: pytest.FixtureRequest) -> Stalls:
+    """Give the record of the host's stalls, and verdicts on timing; the probes end with the session."""
+    measured = Stalls.measured()
+    request.config.stash[SESSION].stalls = measured
+    return measured
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Begin."""
+    config.stash[SESSION] = Session()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let tests that use the fixture be run again."""
+    for item in items:
+        if "stalls" in getattr(item, "fixturenames", ()):
+            item.add_marker(AGAIN)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note in the report whether the host stalled; a report of another process has no exception any more."""
+    report = yield
+    noted: dict[str, Any] = {
+        "host_stalled": call.excinfo is not None and isinstance(call.excinfo.value, HostStalled),
+        "uses_stalls": "stalls" in getattr(item, "fixturenames", ()),
+    }
+    vars(report).update(noted)
+    if report.uses_stalls and report.when == "call":
+        item.config.stash[SESSION].tests.add(item.nodeid)
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_logreport(report: pytest.TestReport) -> Generator[None, object, object]:
+    """Call a last attempt that the host stalled inconclusive, before anything counts it as failed."""
+    if report.failed and getattr(report, "host_stalled", False):
+        vars(report)["outcome"] = INCONCLUSIVE
+    return (yield)
+
+
+def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
+    """Give inconclusive tests a category of their own."""
+    if report.outcome != INCONCLUSIVE:
+        return None
+    return INCONCLUSIVE, "I", ("INCONCLUSIVE", {"yellow": True})
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """End the probes; fail where one has ended before, or where too many tests were inconclusive."""
+    own = session.config.stash[SESSION]
+    if own.stalls is None:
+        return
+    reporter = session.config.pluginmanager.getplugin("terminalreporter")
+    inconclusive = {report.nodeid for report in reporter.stats.get(INCONCLUSIVE, [])} if reporter else set()
+    tests, idle = len(own.tests | inconclusive), own.stalls.idle_share()
+    failures = []
+    try:
+        own.stalls.collect()
+    except ProbeEnded as ended:
+        failures.append(str(ended))
+    own.stalls.end()
+    own.said.append(
+        f"HOST {own.stalls.summary()}; the machine was {idle:.0%} idle; "
+        f"{len(inconclusive)} of {tests} tests inconclusive"
+    )
+    if inconclusive_too_often(len(inconclusive), tests, idle):
+        failures.append(f"{len(inconclusive)} of {tests} tests were inconclusive on a machine that was {idle:.0%} idle")
+    own.said += [f"FAILED: {failure}" for failure in failures]
+    if failures and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Say which tests were run again or were inconclusive and why, and how often the host stalled."""
+    for category, word in (("rerun", "AGAIN"), (INCONCLUSIVE, "INCONCLUSIVE")):
+        for report in terminalreporter.getreports(category):
+            terminalreporter.write_line(f"{word} {report.nodeid}: {report.longrepr.reprcrash.message}")
+    for line in config.stash[SESSION].said:
+        terminalreporter.write_line(line)

@@ -1,0 +1,275 @@
+"""When the host stalled this machine, and verdicts on timing that take it into account.
+
+A test of real time can fail because a program is too slow, or because the host or hypervisor did not run this machine.
+One probe for each processor (`lateness_probe.py`) tells them apart. It has real-time priority, so no program of LAVT,
+at niceness -15 at most, can delay it. A timing assertion that fails is excused (`HostStalled`) only where a probe was
+late at the moment that counts; then pytest runs the test again, at most twice, and calls it inconclusive if the host
+stalls each time (`inconclusive.py`). Assertions on safety are plain `assert`s and are never excused.
+
+Without the right to real-time priority the probes are ordinary processes. They are still used, as the programs have
+no priority then either; but a stall may be the doing of the programs, and the summary says so.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S
+
+PROBE = Path(__file__).with_name("lateness_probe.py")
+STALL_MS = 30.0
+"""A stall this long matters where the caller says nothing else."""
+LISTED_MS = 10.0
+"""The session's summary counts stalls from this length on."""
+SHOWN = 4
+TRIES = 3
+MOST_INCONCLUSIVE = 0.05
+BUSY_BELOW = 0.5
+"""Of its time, a machine that is idle for less is busy, and may leave any number of tests inconclusive."""
+
+Result = TypeVar("Result")
+
+
+class HostStalled(Exception):
+    """The host stalled this machine: what the test saw does not answer its question. The test is run again."""
+
+
+class HostStalledEachTime(HostStalled):
+    """The host stalled each of several attempts; the test is not run again."""
+
+
+class ProbeEnded(Exception):
+    """A lateness probe ended before the session did: nothing can be excused any more."""
+
+
+@dataclass(frozen=True)
+class Stall:
+    """A time during which one processor did not run its probe (CLOCK_MONOTONIC)."""
+
+    processor: int
+    begin_ns: int
+    end_ns: int
+
+    @property
+    def length_ms(self) -> float:
+        """Return how long it was."""
+        return (self.end_ns - self.begin_ns) / NS_PER_MS
+
+
+def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
+    """Return the stalls of some length that overlap a time."""
+    return [
+        each
+        for each in stalls
+        if each.begin_ns <= until_ns and each.end_ns >= since_ns and each.length_ms >= at_least_ms
+    ]
+
+
+def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> float:
+    """Return which share of a time the processor with most stalls was stalled."""
+    total_ns: dict[int, int] = {}
+    for each in overlapping(stalls, since_ns, until_ns):
+        within_ns = min(each.end_ns, until_ns) - max(each.begin_ns, since_ns)
+        total_ns[each.processor] = total_ns.get(each.processor, 0) + within_ns
+    return max(total_ns.values(), default=0) / max(until_ns - since_ns, 1)
+
+
+def described(stalls: Sequence[Stall], since_ns: int) -> str:
+    """Return the longest stalls as a sentence; their times count from `since_ns`."""
+    longest = sorted(sorted(stalls, key=lambda each: -each.length_ms)[:SHOWN], key=lambda each: each.begin_ns)
+    said = [
+        f"{each.length_ms:.0f} ms on processor {each.processor} at {(each.begin_ns - since_ns) / NS_PER_MS:+.0f} ms"
+        for each in longest
+    ]
+    more = len(stalls) - len(longest)
+    return ", ".join(said) + (f" and {more} more" if more else "")
+
+
+def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> bool:
+    """Return whether more tests were inconclusive than a machine with so much idle time explains.
+
+    More than 5 % and more than one, where the machine was idle for more than half of the time.
+    """
+    return idle_share > BUSY_BELOW and inconclusive > max(1, MOST_INCONCLUSIVE * tests)
+
+
+def idle_share(before: str, after: str) -> float:
+    """Return which share of the time the processors were idle, from the first line of /proc/stat at both times.
+
+    Time of programs with a positive niceness counts as idle: other work may run at low priority.
+    """
+    old, new = ([int(each) for each in line.split()[1:9]] for line in (before, after))
+    _user, nice, _system, idle, wait, *_others = gone = [now - then for now, then in zip(new, old, strict=True)]
+    return (nice + idle + wait) / max(sum(gone), 1)
+
+
+class Probe(Protocol):
+    """What measures one processor."""
+
+    above: bool
+    """Whether no program without real-time priority can delay it."""
+
+    def report(self) -> tuple[int, list[Stall]]:
+        """Return the time, and the stalls since the last report; raise `ProbeEnded` where it has ended."""
+        ...
+
+    def end(self) -> None:
+        """End it."""
+        ...
+
+
+class ProbeProcess:
+    """`lateness_probe.py` on one processor."""
+
+    def __init__(self, processor: int) -> None:
+        self.processor = processor
+        self._process = subprocess.Popen(
+            [sys.executable, "-I", "-S", PROBE, str(processor)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+        self.above = bool(json.loads(self._line()))
+
+    @property
+    def pid(self) -> int:
+        """Return the process's id."""
+        return self._process.pid
+
+    def report(self) -> tuple[int, list[Stall]]:
+        """Return the time, and the stalls since the last report."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(b"?")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            raise self._ended() from None
+        now_ns, late = json.loads(self._line())
+        return now_ns, [Stall(self.processor, begin_ns, end_ns) for begin_ns, end_ns in late]
+
+    def end(self) -> None:
+        """Let it end."""
+        self._process.communicate()
+
+    def _line(self) -> bytes:
+        assert self._process.stdout is not None
+        line: bytes = self._process.stdout.readline()
+        if not line:
+            raise self._ended()
+        return line
+
+    def _ended(self) -> ProbeEnded:
+        return ProbeEnded(f"the lateness probe of processor {self.processor} ended with {self._process.wait()}")
+
+
+def read_processor_times() -> str:
+    """Return the first line of /proc/stat."""
+    return Path("/proc/stat").read_text().partition("\n")[0]
+
+
+@dataclass
+class Stalls:
+    """The record of all probes, and the verdicts that need it."""
+
+    probes: Sequence[Probe]
+    processor_times: Callable[[], str] = read_processor_times
+    recorded: list[Stall] = field(default_factory=list)
+    clock: MachineClock = field(default_factory=MachineClock)
+
+    def __post_init__(self) -> None:
+        self._before = self.processor_times()
+        self._began_ns = max((probe.report()[0] for probe in self.probes), default=0)
+        self._reported_ns = self._began_ns
+
+    @classmethod
+    def measured(cls) -> Stalls:
+        """Start one probe on each processor that this process may use."""
+        return cls([ProbeProcess(processor) for processor in sorted(os.sched_getaffinity(0))])
+
+    def during(self, since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
+        """Return the stalls that overlap a time; wait until all probes have reported beyond it."""
+        pause(until_ns - self.clock.now().mono_ns)
+        self.collect(until_ns)
+        return overlapping(self.recorded, since_ns, until_ns, at_least_ms=at_least_ms)
+
+    def collect(self, until_ns: int = 0) -> None:
+        """Take over what the probes have recorded, at least up to a time; raise `ProbeEnded` where one has ended."""
+        for probe in self.probes:
+            reported_ns, stalls = probe.report()
+            self.recorded += stalls
+            while reported_ns < until_ns:
+                reported_ns, stalls = probe.report()
+                self.recorded += stalls
+            self._reported_ns = max(self._reported_ns, reported_ns)
+
+    def require(self, ok: object, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> None:
+        """Raise AssertionError unless `ok`; `HostStalled` where one stall of `stall_ms` overlaps the time that counts.
+
+        The time that counts ends with the limit at the latest: what came late or never was due before.
+        """
+        if not ok:
+            raise self.verdict(said, since_ns, until_ns, stall_ms=stall_ms)
+
+    def verdict(self, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
+        """Return what to raise for something that was not as it should be at a time."""
+        stalls = self.during(since_ns, until_ns, at_least_ms=stall_ms)
+        if not stalls:
+            return AssertionError(said)
+        return HostStalled(f"{described(stalls, since_ns)}; {said}")
+
+    def require_share(self, ok: object, said: str, since_ns: int, until_ns: int, *, share: float) -> None:
+        """Raise AssertionError unless `ok`; `HostStalled` where a processor was stalled for this share of the time.
+
+        For rates and medians, which one stall does not explain.
+        """
+        if ok:
+            return
+        stalls = self.during(since_ns, until_ns)
+        stalled = stalled_share(stalls, since_ns, until_ns)
+        if stalled < share:
+            raise AssertionError(said)
+        raise HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {said}")
+
+    def idle_share(self) -> float:
+        """Return which share of the time since the start the processors were idle."""
+        return idle_share(self._before, self.processor_times())
+
+    def summary(self) -> str:
+        """Return what the probes have recorded until the last report, processor by processor."""
+        gone_ns = max(self._reported_ns - self._began_ns, 1)
+        said = []
+        for processor in sorted({each.processor for each in self.recorded}):
+            own = [each for each in self.recorded if each.processor == processor]
+            listed = [each for each in own if each.length_ms >= LISTED_MS]
+            share = stalled_share(own, self._began_ns, self._reported_ns)
+            longest_ms = max(each.length_ms for each in own)
+            said.append(f"processor {processor} {len(listed)}, longest {longest_ms:.0f} ms, {share:.2%} of the time")
+        told = f"stalls over {LISTED_MS:.0f} ms in {gone_ns / NS_PER_S:.0f} s: {'; '.join(said) or 'none'}"
+        if not all(probe.above for probe in self.probes):
+            told += " (no right to real-time priority: programs of the tests may have caused them)"
+        return told
+
+    def end(self) -> None:
+        """End all probes."""
+        for probe in self.probes:
+            probe.end()
+
+
+def again_where_stalled(attempt: Callable[[], Result]) -> Result:
+    """Return what an attempt returns; make it again, at most twice, where the host stalled.
+
+    For fixtures that many tests share: raises `HostStalledEachTime`, which makes all of them inconclusive at once.
+    """
+    said: list[str] = []
+    for _ in range(TRIES):
+        try:
+            return attempt()
+        except HostStalled as stalled:
+            said.append(str(stalled))
+    raise HostStalledEachTime(" | ".join(said))

@@ -1,0 +1,405 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from tests.support.stalls import (
+    STALL_MS,
+    HostStalled,
+    HostStalledEachTime,
+    ProbeEnded,
+    ProbeProcess,
+    Stall,
+    Stalls,
+    again_where_stalled,
+    idle_share,
+    inconclusive_too_often,
+    overlapping,
+    stalled_share,
+)
+
+from lavt.clock import MachineClock, pause
+from lavt.domain import NS_PER_MS, NS_PER_S
+
+pytest_plugins = ["pytester"]
+
+MS = NS_PER_MS
+QUIET, BUSY = "cpu 0 0 0 0 0 0 0 0 0 0", "cpu 90 0 0 10 0 0 0 0 0 0"
+
+
+@dataclass
+class FakeProbe:
+    """Reports what it is given, one report after the other."""
+
+    reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
+    above: bool = True
+    asked: int = 0
+
+    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
+        self.asked += 1
+        return self.reports.pop(0) if self.reports else (2**62, [])
+
+    def end(self) -> None:  # noqa: D102 (of `Probe`)
+        pass
+
+
+def stalls_of(*recorded: Stall) -> Stalls:
+    return Stalls([FakeProbe()], lambda: QUIET, list(recorded))
+
+
+@pytest.mark.parametrize(
+    ("since_ms", "until_ms", "found"),
+    [(0, 99, 0), (0, 100, 1), (120, 130, 1), (150, 200, 1), (151, 200, 0), (0, 1000, 2)],
+)
+def test_a_stall_counts_where_it_overlaps_the_time(since_ms: int, until_ms: int, found: int) -> None:
+    """A stall that ended before the time, or began after it, is not among those that overlap it."""
+    stalls = [Stall(0, 100 * MS, 150 * MS), Stall(1, 600 * MS, 610 * MS)]
+    assert len(overlapping(stalls, since_ms * MS, until_ms * MS)) == found
+
+
+def test_a_short_stall_does_not_count() -> None:
+    """Only stalls of the length that the caller names count."""
+    stalls = [Stall(0, 0, 29 * MS), Stall(0, 100 * MS, 131 * MS)]
+    assert overlapping(stalls, 0, 1000 * MS, at_least_ms=30) == [stalls[1]]
+
+
+def test_the_share_is_that_of_the_worst_processor_within_the_time() -> None:
+    """Stalls of one processor add up, those of another do not, and what is outside of the time does not count."""
+    stalls = [Stall(0, 0, 20 * MS), Stall(0, 50 * MS, 60 * MS), Stall(1, 0, 15 * MS), Stall(0, 90 * MS, 500 * MS)]
+    assert stalled_share(stalls, 10 * MS, 100 * MS) == pytest.approx((10 + 10 + 10) / 90)
+    assert stalled_share([], 0, 100) == 0
+
+
+def test_what_is_in_time_asks_for_no_record() -> None:
+    """A verdict on what is as it should be does not wait for the probes."""
+    stalls = stalls_of()
+    asked = stalls.probes[0].asked  # type: ignore[attr-defined]
+    stalls.require(True, "late", 0, 100)
+    stalls.require_share(True, "slow", 0, 100, share=0.1)
+    assert stalls.probes[0].asked == asked  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("stall", "raised"),
+    [
+        (None, AssertionError),
+        (Stall(0, 0, 29 * MS), AssertionError),
+        (Stall(0, 0, 31 * MS), HostStalled),
+        (Stall(1, 990 * MS, 2000 * MS), HostStalled),
+        (Stall(0, 1001 * MS, 2000 * MS), AssertionError),
+    ],
+)
+def test_only_a_stall_at_the_moment_excuses_a_failure(stall: Stall | None, raised: type[Exception]) -> None:
+    """What is late fails, unless a stall of at least 30 ms overlaps the time that counts; the message says both."""
+    stalls = stalls_of(*([stall] if stall else []))
+    with pytest.raises(raised, match="it was late") as caught:
+        stalls.require(False, "it was late", 0, 1000 * MS)
+    assert caught.type is raised
+    assert STALL_MS == 30
+
+
+@pytest.mark.parametrize(("share", "raised"), [(0.05, HostStalled), (0.2, AssertionError)])
+def test_a_rate_is_excused_by_a_share_of_the_time(share: float, raised: type[Exception]) -> None:
+    """A rate that is wrong fails, unless a processor was stalled for the share of the time that the caller names."""
+    stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + 10) * MS) for at in range(10)))
+    with pytest.raises(raised) as caught:
+        stalls.require_share(False, "slow", 0, 1000 * MS, share=share)
+    assert caught.type is raised
+
+
+def test_a_verdict_waits_for_a_record_that_reaches_the_time() -> None:
+    """Probes are asked until each has reported beyond the end of the time that counts."""
+    late = Stall(0, 50 * MS, 90 * MS)
+    slow = FakeProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
+    assert Stalls([slow], lambda: QUIET).during(0, 100 * MS) == [late]
+    assert slow.reports == []
+
+
+@pytest.mark.parametrize(
+    ("inconclusive", "tests", "idle", "fails"),
+    [
+        (0, 0, 1.0, False),
+        (0, 100, 0.9, False),
+        (1, 1, 0.9, False),
+        (2, 2, 0.9, True),
+        (5, 100, 0.9, False),
+        (6, 100, 0.9, True),
+        (6, 100, 0.5, False),
+        (100, 100, 0.4, False),
+        (6, 100, 0.51, True),
+    ],
+)
+def test_an_idle_machine_may_not_leave_many_tests_inconclusive(
+    inconclusive: int, tests: int, idle: float, *, fails: bool
+) -> None:
+    """Above 5 % inconclusive tests, and more than one, the session fails where the machine was more than half idle."""
+    assert inconclusive_too_often(inconclusive, tests, idle) is fails
+
+
+def test_the_idle_share_counts_work_at_low_priority_as_idle() -> None:
+    """Idle time, waiting for disks and programs with a positive niceness are idle; stolen time is not."""
+    before, after = "cpu  100 100 100 100 100 100 100 100 0 0", "cpu  110 120 110 130 110 100 100 120 0 0"
+    assert idle_share(before, after) == pytest.approx((20 + 30 + 10) / 100)
+    assert idle_share(before, before) == 0
+
+
+def test_what_many_tests_share_is_tried_three_times() -> None:
+    """An attempt that the host stalled is made again at most twice, then it is inconclusive with all that was said."""
+    outcomes: Iterator[str] = iter(["first", "second", "third", "fourth"])
+
+    def stalled() -> None:
+        raise HostStalled(next(outcomes))
+
+    with pytest.raises(HostStalledEachTime, match=r"first \| second \| third"):
+        again_where_stalled(stalled)
+    assert next(outcomes) == "fourth"
+
+
+CONFTEST = """
+import pytest
+from tests.support.inconclusive import SESSION
+from tests.support.stalls import Stalls
+from tests.test_stalls import {probe}
+
+pytest_plugins = ["tests.support.inconclusive"]
+
+@pytest.fixture(scope="session")
+def stalls(request):
+    times = iter([{before!r}, {after!r}])
+    request.config.stash[SESSION].stalls = Stalls([{probe}()], lambda: next(times))
+
+@pytest.fixture
+def stalled_fixture(stalls):
+    from tests.support.stalls import HostStalled
+    raise HostStalled("in its setup")
+"""
+TESTS = """
+from tests.support.stalls import HostStalled, HostStalledEachTime
+
+tries = []
+
+def test_good(stalls):
+    pass
+
+def test_stalled_once(stalls):
+    tries.append(1)
+    if len(tries) == 1:
+        raise HostStalled("300 ms")
+
+def test_stalled_each_time(stalls):
+    tries.append(2)
+    raise HostStalled("300 ms")
+
+def test_given_up(stalls):
+    tries.append(3)
+    raise HostStalledEachTime("300 ms")
+
+def test_stalled_in_setup(stalled_fixture):
+    pass
+
+def test_without_the_fixture():
+    assert tries == [1, 1, 2, 2, 2, 3]
+"""
+FAULTS = """
+from tests.support.stalls import HostStalled
+
+tries = []
+
+def test_fault(stalls):
+    tries.append(1)
+    raise AssertionError("HostStalled: a frame after the freeze")
+
+def test_fault_while_stalled(stalls):
+    tries.append(2)
+    try:
+        raise HostStalled("300 ms")
+    finally:
+        assert False
+
+def test_fault_after_a_stall(stalls):
+    tries.append(3)
+    if tries.count(3) == 1:
+        raise HostStalled("300 ms")
+    assert False
+
+def test_tries():
+    assert tries == [1, 2, 3, 3]
+"""
+
+
+class EndedProbe(FakeProbe):
+    """Has ended after its first report."""
+
+    def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
+        if self.asked:
+            raise ProbeEnded("the lateness probe of processor 7 ended with -9")
+        return super().report()
+
+
+def run_inner(
+    pytester: pytest.Pytester, tests: str, *, after: str = BUSY, probe: type[FakeProbe] = FakeProbe
+) -> pytest.RunResult:
+    pytester.makeconftest(CONFTEST.format(before=QUIET, after=after, probe=probe.__name__))
+    pytester.makepyfile(tests)
+    return pytester.runpytest_inprocess("-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:randomly")
+
+
+def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
+    """After two more attempts a stalled test is listed as inconclusive with its stalls; it neither passes nor fails."""
+    result = run_inner(pytester, TESTS)
+    assert result.parseoutcomes() == {"passed": 3, "rerun": 5, "inconclusive": 3}
+    assert result.ret == pytest.ExitCode.OK
+    result.stdout.fnmatch_lines([
+        "AGAIN *::test_stalled_once: *HostStalled: 300 ms",
+        "INCONCLUSIVE *::test_stalled_each_time: *HostStalled: 300 ms",
+        "INCONCLUSIVE *::test_given_up: *: 300 ms",
+        "INCONCLUSIVE *::test_stalled_in_setup: *HostStalled: in its setup",
+        "HOST *; the machine was 10% idle; 3 of 5 tests inconclusive",
+    ])  # fmt: skip
+
+
+def test_a_fault_fails_at_once_whatever_else_was_stalled(pytester: pytest.Pytester) -> None:
+    """Nothing but `HostStalled` itself lets a test be run again, and an attempt that fails is not excused by others."""
+    result = run_inner(pytester, FAULTS)
+    assert result.parseoutcomes() == {"failed": 3, "rerun": 1, "passed": 1}
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+
+
+def test_many_inconclusive_tests_on_an_idle_machine_fail_the_session(pytester: pytest.Pytester) -> None:
+    """Three inconclusive tests of five fail a session whose machine was idle, and it says so."""
+    result = run_inner(pytester, TESTS, after="cpu 40 0 0 60 0 0 0 0 0 0")
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.stdout.fnmatch_lines(["FAILED: 3 of 5 tests were inconclusive on a machine that was 60% idle"])
+
+
+def test_a_probe_that_ends_fails_the_session(pytester: pytest.Pytester) -> None:
+    """Though all tests pass, the session fails where a probe did not last as long as it."""
+    result = run_inner(pytester, "def test_good(stalls): pass", probe=EndedProbe)
+    assert result.parseoutcomes() == {"passed": 1}
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.stdout.fnmatch_lines(["FAILED: the lateness probe of processor 7 ended with -9"])
+
+
+SPIN = """
+import os, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+if sys.argv[2] == "real-time":
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(90))
+else:
+    os.setpriority(os.PRIO_PROCESS, 0, -15)
+print(time.monotonic_ns())
+end_ns = time.monotonic_ns() + int(sys.argv[3]) * 1_000_000
+while time.monotonic_ns() < end_ns: pass
+print(time.monotonic_ns())
+"""
+
+
+def spin(processor: int, how: str, duration_ms: int) -> tuple[int, int]:
+    """Occupy a processor; return when that began and ended."""
+    arguments = [sys.executable, "-I", "-S", "-c", SPIN, str(processor), how, str(duration_ms)]
+    began, ended = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout.split()
+    return int(began), int(ended)
+
+
+@contextmanager
+def measuring() -> Iterator[Stalls]:
+    measured = Stalls.measured()
+    try:
+        if not all(probe.above for probe in measured.probes):
+            pytest.skip("needs the right to real-time priority")
+        yield measured
+    finally:
+        measured.end()
+
+
+@pytest.mark.realtime
+def test_a_stalled_processor_is_recorded() -> None:
+    """A processor that a program of higher real-time priority takes for 100 ms is recorded as stalled so long."""
+    with measuring() as stalls:
+        processor = min(os.sched_getaffinity(0))
+        began_ns, ended_ns = spin(processor, "real-time", 100)
+        recorded = stalls.during(began_ns, ended_ns, at_least_ms=60)
+        assert [each.processor for each in recorded if 60 < each.length_ms < 130] == [processor]
+
+
+@pytest.mark.realtime
+def test_a_program_that_occupies_a_processor_is_no_stall() -> None:
+    """The highest priority that LAVT's programs have does not delay a probe: it excuses nothing that such a one does.
+
+    One of five tries without a stall shows it: the host may stall this machine meanwhile.
+    """
+    with measuring() as stalls:
+        tries = [spin(min(os.sched_getaffinity(0)), "nice", 200) for _ in range(5)]
+        assert not all(stalls.during(*each, at_least_ms=20) for each in tries)
+
+
+@pytest.mark.realtime
+def test_a_probe_costs_next_to_nothing() -> None:
+    """A probe uses less than 2 % of its processor."""
+    probe = ProbeProcess(min(os.sched_getaffinity(0)))
+    try:
+        before_s = processor_time_s(probe.pid)
+        pause(2 * NS_PER_S)
+        assert processor_time_s(probe.pid) - before_s < 0.04
+    finally:
+        probe.end()
+
+
+def processor_time_s(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / NS_PER_S
+
+
+PARENT = """
+import signal, sys, time
+from tests.support.stalls import Stalls
+measured = Stalls.measured()
+print(*(probe.pid for probe in measured.probes), flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_probes_end_with_the_tests(how: signal.Signals) -> None:
+    """However pytest is killed, no probe is left."""
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    probes = parent.stdout.readline().split()
+    parent.send_signal(how)
+    parent.wait()
+    parent.stdout.close()
+    assert probes
+    for pid in probes:
+        wait_for_end(int(pid))
+
+
+def wait_for_end(pid: int) -> None:
+    clock = MachineClock()
+    limit_ns = clock.now().mono_ns + 10 * NS_PER_S
+    while is_running(pid):
+        assert clock.now().mono_ns < limit_ns, f"process {pid} is left"
+        pause(10 * NS_PER_MS)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_a_probe_that_is_killed_is_noticed() -> None:
+    """Whoever asks a probe that has ended gets an error, not an empty record."""
+    probe = ProbeProcess(min(os.sched_getaffinity(0)))
+    os.kill(probe.pid, signal.SIGKILL)
+    wait_for_end(probe.pid)
+    with pytest.raises(ProbeEnded, match="ended with -9"):
+        probe.report()
+    probe.end()
