@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from tests.held_up import HeldUp
+from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -36,8 +36,10 @@ KIT_MS = 100
 """The kit lets go so long after the last command, and had one before the fault."""
 ROOM_MS = 60
 """For a busy machine, beside what the design promises."""
-HELD_UP_MS = 30
-"""A pause so much too long shows that other work held this machine up."""
+BEFORE_MS = 200
+"""What the host did so long before the kit let go may be why."""
+STOP_BEFORE_MS, STOP_STALL_MS = 1500, 100
+"""The same for a safe stop, which comes after 500 ms and is told within 200 ms; a shorter stall does not explain it."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
@@ -47,14 +49,15 @@ def free_port() -> int:
         return int(trial.getsockname()[1])
 
 
-def proved(profile: str, work: Path) -> RunConfig:
+def proved(profile: str, work: Path, stalls: Stalls) -> RunConfig:
     """Give a run whose vehicle is a software car on a bus of its own; that its watchdog brakes is proved."""
     run = run_config(profile, work / f"{profile}.json")
     config = write_config(run, work / f"{profile}.yaml")
     with software_car(config) as car:
         command = [sys.executable, "-m", "lavt", "can", "prove", str(config), "--yes"]
+        since_ns = CLOCK.now().mono_ns
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, (done.stderr, car.news)
+        stalls.require(done.returncode == 0, f"{done.stderr}, {car.news}", since_ns, CLOCK.now().mono_ns)
     return run
 
 
@@ -91,12 +94,14 @@ def ms_since(at_ns: int, since_ns: int) -> float:
 
 @dataclass
 class Car:
-    """`lavt software-car` as a process, and what it told."""
+    """`lavt software-car` as a process, and what it told.
+
+    What it does too late is excused by stalls of the host at that time; without their record nothing is.
+    """
 
     process: subprocess.Popen[str]
+    stalls: Stalls | None = None
     news: list[dict[str, Any]] = field(default_factory=list)
-    late_ms: float = 0.0
-    """By how much the pauses in waiting for it were too long, at most."""
     _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
     _reader: threading.Thread = field(default_factory=threading.Thread)
 
@@ -129,45 +134,49 @@ class Car:
         return next((each["mono_ns"] for each in told if each["mono_ns"] >= since_ns), None)
 
     def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = LONGEST_NS) -> int:
-        """Wait until it tells something, unless its watchdog brakes before; tell when that was."""
+        """Wait until it tells something, unless its watchdog brakes before; tell when that was.
+
+        What never comes is a fault, whatever the host did.
+        """
         end_ns = CLOCK.now().mono_ns + within_ns
         braked_ns = None
         while braked_ns is None and CLOCK.now().mono_ns < end_ns:
-            braked_ns = self.heard("watchdog", "watchdog brakes")
+            braked_ns = self.braked_ns()
             at_ns = self.heard(kind, text, since_ns=since_ns)
             if at_ns is not None:
                 return at_ns
-            self.rest(5)
-        if braked_ns is not None and braked_ns < since_ns:
-            raise HeldUp(f"the kit let go before the fault: {self.news}")
-        raise self.wrong(f"the car told no {kind!r} with {text!r}: {self.news}")
+            pause(5 * NS_PER_MS)
+        said = f"the car told no {kind!r} with {text!r}: {self.news}"
+        raise AssertionError(said) if braked_ns is None else self.let_go_wrongly(braked_ns, said)
 
-    def rest(self, duration_ms: int) -> None:
-        """Pause, and note by how much that was too long."""
-        before_ns = CLOCK.now().mono_ns
-        pause(duration_ms * NS_PER_MS)
-        self.late_ms = max(self.late_ms, ms_since(CLOCK.now().mono_ns, before_ns) - duration_ms)
+    def braked_ns(self) -> int | None:
+        """Tell when its watchdog braked first; None: it did not."""
+        return self.heard("watchdog", "watchdog brakes")
 
-    def wrong(self, said: str) -> Exception:
-        """Give what to raise for something that should not be; `HeldUp` where the machine was held up in waiting."""
-        if self.late_ms > HELD_UP_MS:
-            return HeldUp(f"a pause was {self.late_ms:.0f} ms too long; {said}")
-        return AssertionError(said)
+    def let_go_wrongly(self, braked_ns: int, said: str) -> Exception:
+        """Give what to raise where the kit got no command in time though nothing was broken."""
+        return self.verdict(said, braked_ns - BEFORE_MS * NS_PER_MS, braked_ns)
+
+    def verdict(self, said: str, since_ns: int, until_ns: int) -> Exception:
+        """Give what to raise for something that was too late."""
+        return AssertionError(said) if self.stalls is None else self.stalls.verdict(said, since_ns, until_ns)
 
     def held(self, since_ns: int, *, room_ms: float = ROOM_MS) -> float:
         """Wait until the kit has let go and brakes by its watchdog, in time; tell how many ms after something."""
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
-        took_ms = ms_since(at_ns, since_ns)
-        if took_ms >= KIT_MS + room_ms:
-            raise self.wrong(f"the kit brakes only {took_ms:.0f} ms after: {self.news}")
+        took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_MS + room_ms
+        if took_ms >= limit_ms:
+            said = f"the kit brakes only {took_ms:.0f} ms after: {self.news}"
+            raise self.verdict(said, since_ns - KIT_MS * NS_PER_MS, since_ns + round(limit_ms * NS_PER_MS))
         return took_ms
 
     def parked(self, since_ns: int) -> float:
         """Wait until it stands in park and nothing is enabled; tell how many ms after something it was in park."""
         at_ns = self.wait("gear", "gear PARK", since_ns=since_ns)
         self.wait("enabled", "lets go", since_ns=since_ns)
-        if self.heard("watchdog", "watchdog brakes") is not None:
-            raise self.wrong(f"the watchdog stopped it: {self.news}")
+        braked_ns = self.braked_ns()
+        if braked_ns is not None:
+            raise self.let_go_wrongly(braked_ns, f"the watchdog stopped it: {self.news}")
         return ms_since(at_ns, since_ns)
 
     def end(self) -> None:
@@ -181,13 +190,13 @@ class Car:
 
 
 @contextmanager
-def software_car(config: str | Path, *changes: str) -> Iterator[Car]:
+def software_car(config: str | Path, *changes: str, stalls: Stalls | None = None) -> Iterator[Car]:
     """Start a software car of a server's config."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "software-car", str(config), *changes, "--json"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    car = Car(process)
+    car = Car(process, stalls)
     try:
         yield car
     finally:
@@ -202,51 +211,61 @@ class Driven:
     loop: Loop
     out: Path
     actuator_pid: int
+    stalls: Stalls
 
     def status(self) -> dict[str, Any]:
         """Give what the server told of itself last."""
         told: dict[str, Any] = self.loop.server.latest.get("status", {})
         return told
 
-    def drives(self) -> bool:
-        """Wait until it drives at more than 5 m/s; False where it was stopped before."""
-        end_ns = CLOCK.now().mono_ns + LONGEST_NS
-        while CLOCK.now().mono_ns < end_ns and self.status().get("safety") != "safe_stop":
-            if self.car.heard("watchdog", "watchdog brakes") is not None:
-                break
-            if self.status().get("speed_mps", 0.0) > 5.0:
-                return True
-            pause(20 * NS_PER_MS)
-        return False
+    def reach_speed(self) -> None:
+        """Wait until it drives at more than 5 m/s; a stop before is a fault, unless the host stalled."""
+        self.wait(lambda status: status.get("speed_mps", 0.0) > 5.0 or self.stopped(), "it does not drive")
+        if self.stopped():
+            raise self.stopped_wrongly()
+
+    def stopped(self) -> bool:
+        """Tell whether its watchdog has braked, or its server has stopped it."""
+        return self.status().get("safety") == "safe_stop" or self.car.braked_ns() is not None
+
+    def stopped_wrongly(self) -> Exception:
+        """Give what to raise where it stopped though nothing was broken; it must be called soon after the stop."""
+        said, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.news}", self.car.braked_ns()
+        if braked_ns is not None:
+            return self.car.let_go_wrongly(braked_ns, said)
+        now_ns = CLOCK.now().mono_ns
+        return self.stalls.verdict(said, now_ns - STOP_BEFORE_MS * NS_PER_MS, now_ns, stall_ms=STOP_STALL_MS)
+
+    def in_time(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
+        """Judge how long something took; only stalls until the limit excuse it."""
+        until_ns = since_ns + round(limit_ms * NS_PER_MS)
+        said = f"{what} only {took_ms:.0f} ms after: {self.car.news}"
+        self.stalls.require(took_ms < limit_ms, said, since_ns, until_ns, stall_ms=STOP_STALL_MS)
 
     def wait(self, what: Callable[[dict[str, Any]], bool], why: str) -> None:
-        """Wait until the server's status says something."""
+        """Wait until the server's status says something; what never comes is a fault, whatever the host did."""
         end_ns = CLOCK.now().mono_ns + LONGEST_NS
         while not what(self.status()):
-            if CLOCK.now().mono_ns >= end_ns:
-                raise self.car.wrong(f"{why}: {self.loop.server.latest}, {self.car.news}")
-            self.car.rest(20)
+            assert CLOCK.now().mono_ns < end_ns, f"{why}: {self.loop.server.latest}, {self.car.news}"
+            pause(20 * NS_PER_MS)
 
 
 @contextmanager
-def driving(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
-    """Drive a software car at more than 5 m/s, over routers and sockets of the loopback.
-
-    Raises `HeldUp` where it is stopped before.
-    """
-    with started(run, work, program=program) as driven:
-        if not driven.drives():
-            raise HeldUp(f"stopped before it drove: {driven.status()}, {driven.car.news}")
+def driving(run: RunConfig, work: Path, stalls: Stalls, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
+    """Drive a software car at more than 5 m/s, over routers and sockets of the loopback."""
+    with started(run, work, stalls, program=program) as driven:
+        driven.reach_speed()
         yield driven
 
 
 @contextmanager
-def started(run: RunConfig, work: Path, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
+def started(run: RunConfig, work: Path, stalls: Stalls, *, program: Sequence[str] = LAVT) -> Iterator[Driven]:
     """Start a software car, its server and a client."""
-    with software_car(write_config(run, work / "car.yaml")) as car, Processes(work) as processes:
+    config = write_config(run, work / "car.yaml")
+    with software_car(config, stalls=stalls) as car, Processes(work) as processes:
         loop = start_loop(processes, plan_run(run), work, work, once=False, server_program=program)
         try:
-            yield Driven(car, loop, work, loop.server_ready["actuator_pid"])
+            yield Driven(car, loop, work, loop.server_ready["actuator_pid"], stalls)
         finally:
             with suppress(ProcessLookupError):  # what stands still cannot end, and would keep its ports
                 os.killpg(loop.server.popen.pid, signal.SIGCONT)
