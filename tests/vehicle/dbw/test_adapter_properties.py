@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import START_NS, Rig, driving, profile
+from tests.vehicle.dbw.rig import START_NS, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
@@ -130,7 +130,7 @@ def reports_of(generation: int) -> tuple[Frame, ...]:
 @settings(max_examples=25, deadline=None)
 def test_garbage_beside_reports(generation: int, garbage: list[tuple[Frame, int]]) -> None:
     """Garbage between the reports of a car that only stands there never makes it engaged while nobody wants it."""
-    rig = Rig(generation)
+    rig = started(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)
         rig.run_ms(wait_ms)
