@@ -35,7 +35,7 @@ def decide(controller: DriveController, seen: list[tuple[Lane, float]]) -> list[
 
 
 @every_one
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seen=SEEN)
 def test_decisions_are_in_range_and_repeat(kind: str, preset: str, seen: list[tuple[Lane, float]]) -> None:
     """Whatever is seen, decisions are what a command may hold, and the same for the same inputs."""

@@ -85,7 +85,7 @@ def test_its_capabilities_are_those_of_a_car(name: str) -> None:
 
 
 @each_vehicle
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.integers(1, 800)), max_size=6))
 def test_whatever_it_is_asked_its_state_is_finite(name: str, asked: list[tuple[float, float, float, int]]) -> None:
     """Any series of actuations within their ranges leaves a finite state, and the wheel within its limits."""

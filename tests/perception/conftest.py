@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lavt.domain import CameraModel, FloatArray, Picture
 from lavt.perception.calibration import calibrated, ground_to_picture
@@ -47,28 +49,45 @@ class Scene:
         heading_rad: float = 0.0,
     ) -> Picture:
         """Show the road from a car whose rear axle is `offset_m` left of the centre, turned left by `heading_rad`."""
-        x_m, y_m = self._ground()
-        seen = np.isfinite(x_m) & (x_m < 120)
-        along, across = on_road(
-            np.where(seen, x_m, 0.0), np.where(seen, y_m, 0.0), curvature_per_m, offset_m, heading_rad
-        )
-        fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
-        fine[np.isfinite(x_m)] = ROAD_GREY
+        places, x_m, y_m = fine_ground(self.model)
+        along, across = on_road(x_m, y_m, curvature_per_m, offset_m, heading_rad)
+        fine = bare_ground(self.model).copy()
+        rays = fine.reshape(-1, 3)
         for line in lines:
-            paint = np.abs(across - line.offset_m) < MARK_WIDTH_M / 2
-            fine[seen & paint & (np.mod(along - line.phase_m, 9.0) < line.dash_m)] = line.colour_bgr
+            paint = np.flatnonzero(np.abs(across - line.offset_m) < MARK_WIDTH_M / 2)
+            paint = paint[np.mod(along[paint] - line.phase_m, 9.0) < line.dash_m]
+            rays[places[paint]] = line.colour_bgr
         shrunk = cv2.resize(fine, (self.model.width_px, self.model.height_px), interpolation=cv2.INTER_AREA)
         return np.asarray(shrunk.round(), dtype=np.uint8)
 
-    def _ground(self) -> tuple[FloatArray, FloatArray]:
-        """Give the ground seen along each fine ray, infinite above the horizon."""
-        u = (np.arange(self.model.width_px * FINE) + 0.5) / FINE - 0.5
-        v = (np.arange(self.model.height_px * FINE) + 0.5) / FINE - 0.5
-        inverse = np.linalg.inv(ground_to_picture(calibrated(self.model)))
-        rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
-        below = rays[..., 2] > 1e-9  # the inverse's third row is the depth turned round: positive below the horizon
-        scale = np.where(below, rays[..., 2], 1.0)
-        return np.where(below, rays[..., 0] / scale, np.inf), np.where(below, rays[..., 1] / scale, np.inf)
+
+@cache
+def fine_depths(model: CameraModel) -> tuple[FloatArray, FloatArray]:
+    """Return the ground (x, y) that each fine ray sees, infinite above the horizon."""
+    u = (np.arange(model.width_px * FINE) + 0.5) / FINE - 0.5
+    v = (np.arange(model.height_px * FINE) + 0.5) / FINE - 0.5
+    inverse = np.linalg.inv(ground_to_picture(calibrated(model)))
+    rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
+    below = rays[..., 2] > 1e-9  # the inverse's third row is the depth turned round: positive below the horizon
+    scale = np.where(below, rays[..., 2], 1.0)
+    return np.where(below, rays[..., 0] / scale, np.inf), np.where(below, rays[..., 1] / scale, np.inf)
+
+
+@cache
+def fine_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Return which fine rays see ground that is near enough to have lines, and its x and y."""
+    x_m, y_m = (each.ravel() for each in fine_depths(model))
+    places = np.flatnonzero(x_m < 120)
+    return places, x_m[places], y_m[places]
+
+
+@cache
+def bare_ground(model: CameraModel) -> NDArray[np.float32]:
+    """Return the fine picture of a road without lines."""
+    x_m, _ = fine_depths(model)
+    fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
+    fine[np.isfinite(x_m)] = ROAD_GREY
+    return fine
 
 
 def on_road(

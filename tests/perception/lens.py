@@ -29,6 +29,7 @@ def straightened(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
         target = camera.middle_px + part * (pixels - camera.middle_px)
         for _ in range(4):
             here = _bent(camera, rays)
-            slopes = np.stack([(_bent(camera, rays + d) - here) / step for d in np.eye(2) * step], axis=-1)
-            rays = rays - np.linalg.solve(slopes, (here - target)[..., None])[..., 0]
+            (a, c), (b, d) = (((_bent(camera, rays + each) - here) / step).T for each in np.eye(2) * step)
+            u, v = (here - target).T
+            rays = rays - np.column_stack([d * u - b * v, a * v - c * u]) / (a * d - b * c)[:, None]
     return rays

@@ -20,11 +20,11 @@ CROSSED = ("old yellow line", "old white line", "diagonal", "arrow")
 Found = dict[str, list[tuple[Judged, Judged]]]
 
 
-@pytest.fixture(scope="module")
-def found() -> Found:
-    """Three pictures of each kind, other ones than those of the page, searched and followed."""
+@pytest.fixture(scope="module", params=[1, pytest.param(3, marks=pytest.mark.full)], ids="{} of each".format)
+def found(request: pytest.FixtureRequest) -> Found:
+    """Return pictures of each kind, other ones than those of the page, searched and followed."""
     by_kind: Found = defaultdict(list)
-    for case in cases(3, seed=7):
+    for case in cases(request.param, seed=7):
         by_kind[case.kind].append(look(case))
     return by_kind
 
@@ -37,7 +37,7 @@ def test_one_threshold_decides() -> None:
 def test_a_lane_that_is_wrong_is_not_believed(found: Found) -> None:
     """Of all pictures with a lane that is more than half a metre off, or with none, at most 2 % are believed."""
     searched = [pair[0] for kind, pairs in found.items() if kind != UNDECIDED for pair in pairs]
-    assert sum(judged.wrong for judged in searched) > 20
+    assert sum(judged.wrong for judged in searched) > 0.15 * len(searched)
     assert sum(judged.wrong and judged.believed for judged in searched) <= 0.02 * len(searched)
 
 

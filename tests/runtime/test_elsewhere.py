@@ -137,7 +137,6 @@ def test_a_node_elsewhere_hears_and_is_heard() -> None:
         wait_until(lambda: both.notes.of("event") == ["heard"])
 
 
-@pytest.mark.realtime
 def test_an_answer_finds_who_asked() -> None:
     """A peer, which nothing but its link understands, stays in its process; the answer is for it."""
     with rig() as both:
@@ -148,7 +147,6 @@ def test_an_answer_finds_who_asked() -> None:
         assert [(send.payload, send.peer) for send in both.notes.sent] == [(b"of alice", alice), (b"of bob", bob)]
 
 
-@pytest.mark.realtime
 def test_what_is_in_force_is_known_before_its_answer_leaves() -> None:
     """What the node notes is told before whatever it sends by a link."""
     with rig() as both:
@@ -171,7 +169,6 @@ def test_a_command_that_was_late_between_the_processes_is_dropped() -> None:
     assert (counted["control_late"], counted["session_late"], counted["record_overflow"]) == (1, 1, 0)
 
 
-@pytest.mark.realtime
 def test_the_end_of_the_other_process_is_noticed() -> None:
     """When the server's process closes or ends, the node's is told that they have parted."""
     with rig() as both:
@@ -190,7 +187,6 @@ def test_a_node_that_fails_elsewhere_ends_the_run_here() -> None:
         assert str(both.main.failed) == "actuator: broken on purpose"
 
 
-@pytest.mark.realtime
 def test_a_process_that_vanishes_ends_the_run_here() -> None:
     """A node's process that ends without a word ends the server's run, with a sentence."""
     with rig() as both:
@@ -199,7 +195,6 @@ def test_a_process_that_vanishes_ends_the_run_here() -> None:
         assert str(both.main.failed) == "the process of the actuator has ended"
 
 
-@pytest.mark.realtime
 @pytest.mark.parametrize("where", ["sent", "read", "taken"])
 def test_a_pipe_that_works_by_half_is_gone(where: str) -> None:
     """An entry that cannot be sent, read or taken ends the pipe at both ends: neither process goes on by itself."""
@@ -222,7 +217,6 @@ def test_a_pipe_that_works_by_half_is_gone(where: str) -> None:
     one.close(1)
 
 
-@pytest.mark.realtime
 def test_a_server_that_never_began_lets_the_process_end() -> None:
     """A server that fails before it hands anything over closes the pipe all the same: the node's process ends."""
     ours, theirs = multiprocessing.Pipe()

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import shake_256
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.errors import BadPacket
@@ -77,7 +77,6 @@ def test_missing_by_hand(places: list[int], parities: Mapping[int, bytes]) -> No
     assert missing(without(BY_HAND, *places), parities) == [filled[place] for place in places]
 
 
-@settings(deadline=None)
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=40), st.data())
 def test_any_missing(symbols: list[bytes], data: st.DataObject) -> None:
     """Any one or two missing of any symbols come back from any parity symbols that are as many or more."""

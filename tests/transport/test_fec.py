@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -184,7 +184,6 @@ def test_given_up() -> None:
 FRAMES = st.lists(st.binary(min_size=1, max_size=60), min_size=1, max_size=60)
 
 
-@settings(deadline=None)
 @given(FRAMES, FRAMES, st.integers(1, 2), st.integers(0, 2**16 - 1), st.data())
 def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first: int, data: st.DataObject) -> None:
     """A block that lost no more media than it has repair packets is whole again; else nothing but what was sent comes.
@@ -291,7 +290,6 @@ HEADERS = st.tuples(
 """Payloads that are nearly those of repair packets for the packets of EIGHT."""
 
 
-@settings(deadline=None)
 @given(st.lists(st.one_of(st.binary(max_size=60), HEADERS, st.sampled_from(EIGHT)), max_size=30))
 def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
     """Whatever comes as repair payload raises nothing, and what cannot be right is counted."""

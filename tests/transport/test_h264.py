@@ -182,7 +182,7 @@ def test_other_size_on_the_way(access_units: list[bytes]) -> None:
     assert decoded.picture.shape == (96, 128, 3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=200), st.booleans())
 def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> None:
     """No bytes make the decoder raise, nor keep the next keyframe from being decoded."""
@@ -194,7 +194,7 @@ def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> 
     assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 14), st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=12))
 def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[int, int, int]]) -> None:
     """What is made of a damaged stream is the same every time: made-up parts come from no stray memory."""

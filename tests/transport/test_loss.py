@@ -73,7 +73,7 @@ def test_reordered(sent: Sent) -> None:
     assert buffer.reordered > 0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sets(st.integers(0, 500), max_size=12))
 def test_lost(sent: Sent, lost: set[int]) -> None:
     """Whatever is lost, a picture with nothing incomplete since the last complete keyframe is exactly the one sent."""

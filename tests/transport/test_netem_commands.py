@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -512,25 +512,25 @@ def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, mo
     assert netem.doubts() == []
 
 
-class Ahead(MachineClock):
-    """A clock that can be set ahead."""
+class HandClock:
+    """A clock that goes on by hand only."""
 
-    ahead_ns = 0
+    mono_ns = 0
 
     def now(self) -> Now:
-        """Tell the time."""
-        now = super().now()
-        return replace(now, mono_ns=now.mono_ns + self.ahead_ns)
+        """Return its time."""
+        return Now(self.mono_ns, 0)
 
 
 def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A wander that steps is in no doubt; one whose thread has died is, a second after its last step, not before."""
     monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
     monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
-    clock = Ahead()
+    clock = HandClock()
     wander = Wander("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    clock.mono_ns = NS_PER_S
     now = wander.doubts()
-    clock.ahead_ns = NS_PER_S
+    clock.mono_ns += 1
     later = wander.doubts()
     wander.end()
 

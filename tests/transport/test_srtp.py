@@ -54,7 +54,6 @@ def test_sequence_numbers_begin_again() -> None:
     assert counters(unprotector) == (0, 0)
 
 
-@settings(deadline=None)
 @given(st.permutations(range(65500, 65572)))
 def test_reordered_where_numbers_begin_again(order: list[int]) -> None:
     """Packets around 65535 and 0 come out in whatever order they arrive, once the stream is known."""
@@ -135,7 +134,7 @@ def test_plain_packets() -> None:
     assert counters(unprotector) == (2, 0)
 
 
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=1000)
 @given(st.binary(max_size=2000) | st.binary(max_size=100).map(lambda tail: packet(1) + tail))
 def test_bytes_from_outside(garbage: bytes) -> None:
     """Whatever bytes arrive, nothing comes out, nothing is raised, and each is counted."""

@@ -120,6 +120,7 @@ def test_control(pair: Pair) -> None:
     assert before.mono_ns <= arrived.mono_ns <= MachineClock().now().mono_ns
 
 
+@pytest.mark.realtime
 def test_more_than_can_be_heard(routers: tuple[str, str]) -> None:
     """While a command is being looked at the newest of the others are kept, and a query is heard at once."""
     with closing(Pair(routers, "vehicle-busy")) as pair:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -20,8 +21,8 @@ from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit
 
 START_NS = 77_000_000_123
-STEP_NS = NS_PER_MS
-"""The rig's time goes in steps of so much; nothing is measured finer."""
+COARSE_MS = 5
+"""A step of the rig's time where nothing is measured; elsewhere it is 1 ms, and nothing is measured finer."""
 
 
 @cache
@@ -46,16 +47,16 @@ class Moment:
 
 
 class Rig:
-    """An adapter that drives a software car; `tick_ms` apart it is told `actuation`.
+    """An adapter that drives a software car; every `tick_ns` it is told `actuation`.
 
     `spoil` may change what the adapter sends on its way to the car, or lose it (None); `lose_report` loses what the car
     sends; `is_cut` loses both.
     """
 
-    def __init__(self, generation: int, *, tick_ms: int = 20, start_frames: bool = True, **keys: Any) -> None:
+    def __init__(self, generation: int, *, start_frames: bool = True, **keys: Any) -> None:
         name = keys.pop("profile", f"dataspeed_gen{generation}")
         self.profile: Profile = name if isinstance(name, Profile) else profile(name)
-        self.generation, self.tick_ns = generation, tick_ms * NS_PER_MS
+        self.generation, self.tick_ns = generation, 20 * NS_PER_MS
         adapter_keys = {key: keys.pop(key) for key in ("hindrance",) if key in keys}
         self.adapter = Adapter(self.profile, start_ns=START_NS, **adapter_keys)
         self.simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
@@ -73,18 +74,24 @@ class Rig:
         if start_frames:
             self.run_ms(400)
 
-    def run_ms(self, duration_ms: int) -> None:
-        """Let time pass."""
-        for _ in range(duration_ms):
-            self.now_ns += STEP_NS
+    def copy(self) -> Rig:
+        """Return a rig in the same state that shares only what never changes."""
+        constants = (self.profile, self.profile.codec, road(), *self.moments)
+        return deepcopy(self, {id(each): each for each in constants})
+
+    def run_ms(self, duration_ms: int, *, step_ms: int = 1) -> None:
+        """Let time pass, in coarser steps where nothing is measured."""
+        end_ns = self.now_ns + duration_ms * NS_PER_MS
+        while self.now_ns < end_ns:
+            self.now_ns = min(self.now_ns + step_ms * NS_PER_MS, end_ns)
             self._step()
 
-    def run_until(self, condition: Callable[[Rig], bool], limit_ms: int = 5000) -> int:
+    def run_until(self, condition: Callable[[Rig], bool], limit_ms: int = 5000, *, step_ms: int = 1) -> int:
         """Let time pass until something is so; gives how many milliseconds it took."""
-        for passed_ms in range(limit_ms):
+        for passed_ms in range(0, limit_ms, step_ms):
             if condition(self):
                 return passed_ms
-            self.run_ms(1)
+            self.run_ms(step_ms, step_ms=step_ms)
         raise AssertionError(f"not in {limit_ms} ms: {self.adapter.state()}")
 
     def _step(self) -> None:
@@ -129,14 +136,35 @@ class Rig:
         return (self.now_ns - since_ns) // NS_PER_MS
 
 
-def driving(generation: int, **keys: Any) -> Rig:
-    """A car that goes at 5 m/s or a little more, steered a little to the left."""
-    rig = Rig(generation, **keys)
+def started(generation: int) -> Rig:
+    """Return a car at rest whose reports have all come."""
+    return _started(generation).copy()
+
+
+def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> Rig:
+    """Return a car that goes at 5 m/s or a little more, steered a little to the left."""
+    rig = _accelerated(Rig(generation, **keys)) if keys else _driving(generation).copy()
+    rig.tick_ns = tick_ms * NS_PER_MS
+    return rig
+
+
+@cache
+def _started(generation: int) -> Rig:
+    return Rig(generation)
+
+
+@cache
+def _driving(generation: int) -> Rig:
+    return _accelerated(started(generation))
+
+
+def _accelerated(rig: Rig) -> Rig:
     rig.engage()
     rig.actuation = Actuation(0.01, 0.5, 0.0)
-    rig.run_until(lambda rig: rig.speed_mps > 5.0, 10_000)
-    rig.sent.clear()
-    rig.events.clear()
+    rig.run_until(lambda rig: rig.speed_mps > 5.0, 10_000, step_ms=COARSE_MS)
+    for record in (rig.sent, rig.events, rig.moments):
+        record.clear()
+    rig.adapter.take_reached()
     return rig
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.control.rig import new_limiter
-from tests.vehicle.dbw.rig import Rig, both
+from tests.vehicle.dbw.rig import Rig, both, started
 
 from lavt.control.limits import LIMITS
 from lavt.control.safety import SafetyGate
@@ -26,7 +26,7 @@ def decide(rig: Rig, gate: SafetyGate) -> None:
 @both
 def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generation: int) -> None:
     """After an emergency stop, at rest and parked, a driver drives off by hand: the kit is not engaged again."""
-    rig, gate = Rig(generation), new_gate()
+    rig, gate = started(generation), new_gate()
     rig.engage()
     assert gate.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
     for _ in range(2000):

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import START_NS, Rig, both, driving, profile, road
+from tests.vehicle.dbw.rig import COARSE_MS, START_NS, Rig, both, driving, profile, road, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
@@ -32,7 +32,7 @@ def names(rig: Rig) -> list[str]:
 @both
 def test_idle_is_silent(generation: int) -> None:
     """Until driving is wanted nothing is sent, and nothing hinders: the car can be engaged, and is not."""
-    rig = Rig(generation)
+    rig = started(generation)
     rig.run_ms(1000)
     state = rig.adapter.state()
     assert rig.sent == []
@@ -51,7 +51,7 @@ def test_before_reports(generation: int) -> None:
 @both
 def test_engaging(generation: int) -> None:
     """CLEAR for 120 ms, all axes with the brake on, then DRIVE: the car obeys in the time of two gear reports."""
-    rig = Rig(generation)
+    rig = started(generation)
     rig.adapter.engage(True, rig.now_ns)
     passed_ms = rig.run_until(lambda rig: rig.state == "engaged")
     assert passed_ms <= 120 + 20 + 100 + 20
@@ -68,7 +68,7 @@ def test_engaging(generation: int) -> None:
 @both
 def test_drive_waits_for_the_brake(generation: int) -> None:
     """Where no brake is asked for, the holding brake is on when DRIVE is asked for; so the shift is not refused."""
-    rig = Rig(generation)
+    rig = started(generation)
     rig.actuation = Actuation(0.0, 0.9, 0.0)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.kit.state.gear == Gear.DRIVE)
@@ -80,7 +80,7 @@ def test_drive_waits_for_the_brake(generation: int) -> None:
 
 def test_clearing_frames_of_generation_1() -> None:
     """Generation 1 is cleared with frames of four bytes at 20 Hz, and the gearbox with its one byte."""
-    rig = Rig(1)
+    rig = started(1)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
     frames = [frame for _, frame in rig.sent]
@@ -100,7 +100,7 @@ def test_counters(generation: int) -> None:
     """Counters go up by one with each frame that has one, also over a pause."""
     rig = driving(generation)
     rig.adapter.engage(False, rig.now_ns)
-    rig.run_until(lambda rig: rig.state == "idle", 20_000)
+    rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
     rig.run_ms(500)
     rig.engage()
     identifier = 0x064 if generation == 1 else 0x200
@@ -212,7 +212,7 @@ def test_again(generation: int) -> None:
     """After it was parked the car can be engaged again."""
     rig = driving(generation)
     rig.adapter.engage(False, rig.now_ns)
-    rig.run_until(lambda rig: rig.state == "idle", 20_000)
+    rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
     rig.engage()
     assert rig.enabled() == ALL
 
@@ -220,10 +220,11 @@ def test_again(generation: int) -> None:
 @both
 def test_not_wanted_while_enabling(generation: int) -> None:
     """What was begun is taken back in order where it is not wanted any more, at whatever moment."""
+    begun = started(generation)
+    begun.adapter.engage(True, begun.now_ns)
     for after_ms in range(0, 220, 7):
-        rig = Rig(generation)
-        rig.adapter.engage(True, rig.now_ns)
-        rig.run_ms(after_ms)
+        rig = begun.copy()
+        begun.run_ms(7)
         rig.adapter.engage(False, rig.now_ns)
         rig.run_until(lambda rig: rig.state == "idle" and not rig.enabled(), 1000)
         rig.run_ms(200)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from tests.vehicle.dbw.rig import Rig, both, driving, profile
+from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
@@ -32,12 +32,12 @@ def is_lost(rig: Rig) -> bool:
 def stop_and_disengage(rig: Rig) -> None:
     """Let the car come to a stand as somebody has to, by the brake pedal, and be wanted no more."""
     rig.kit.driver_brakes(0.5, rig.now_ns)
-    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000, step_ms=COARSE_MS)
     rig.run_ms(50)
     rig.adapter.engage(False, rig.now_ns)
-    rig.run_ms(150)
+    rig.run_ms(150, step_ms=COARSE_MS)
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    rig.run_ms(150)
+    rig.run_ms(150, step_ms=COARSE_MS)
 
 
 # Commands that do not arrive, or are wrong.
@@ -53,7 +53,7 @@ def test_commands_lost(generation: int) -> None:
     assert rig.let_go_ms(cut_ns) == 100
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
-    rig.run_ms(150)
+    rig.run_ms(150, step_ms=COARSE_MS)
     state = rig.adapter.state()
     assert not state.is_engaged
     assert "the kit has let go of" in state.hindrance or "watchdog" in state.hindrance
@@ -128,7 +128,7 @@ def test_ticks_stop(generation: int) -> None:
     assert rig.adapter.counts["ticks_missed"] == 1
     assert "no command has left for 100 ms" in [event.detail for event in rig.events]
     rig.is_ticking = True
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.state == "lost"
     assert rig.enabled() == set()
 
@@ -149,7 +149,7 @@ def test_frozen(generation: int) -> None:
         for sent in rig.adapter.frames_due(rig.now_ns):
             rig.sent.append((rig.now_ns, sent))
             rig.car.receive(sent, rig.now_ns)
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.state == "lost"
     assert rig.now_ns > frozen_ns
     assert rig.sent
@@ -174,7 +174,7 @@ SOMEBODY_ELSES = {
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_somebody_else_commands_and_nobody_is_engaged(generation: int, which: int) -> None:
     """While somebody else commands the kit, and for 1 s after, it is not engaged: a server may still be stopping it."""
-    rig = Rig(generation)
+    rig = started(generation)
     rig.adapter.receive(SOMEBODY_ELSES[generation][which], rig.now_ns)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(999)
@@ -194,7 +194,7 @@ def test_somebody_else_commands_while_driving(generation: int) -> None:
     assert rig.state == "lost"
     assert "somebody else on the bus commands the kit" in rig.adapter.state().hindrance
     rig.actuation = Actuation(0.01, 0.5, 0.4)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     assert (rig.moments[-1].wheels.throttle, round(rig.moments[-1].wheels.brake, 2)) == (0.0, 0.4)
 
 
@@ -250,16 +250,16 @@ def test_override_is_latched(generation: int, part: str) -> None:
     OVERRIDES[part](rig)
     rig.run_until(lambda rig: rig.state == "overridden")
     HANDS_OFF[part](rig)
-    rig.run_ms(300)
+    rig.run_ms(300, step_ms=COARSE_MS)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(20)
     rig.adapter.engage(True, rig.now_ns)  # while it moves: of no use
-    rig.run_ms(300)
+    rig.run_ms(300, step_ms=COARSE_MS)
     assert (rig.state, rig.enabled()) == ("overridden", set())
     rig.kit.driver_brakes(0.5, rig.now_ns)
-    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000, step_ms=COARSE_MS)
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert (rig.state, rig.adapter.state().is_overridden) == ("overridden", True)
     assert rig.kit.state.is_overridden
     rig.adapter.engage(False, rig.now_ns)
@@ -318,7 +318,7 @@ def test_gear_fault_of_generation_1() -> None:
     assert (rig.now_ns - broken_ns) // NS_PER_MS <= 101
     assert rig.enabled() == set(AXES)
     rig.actuation = Actuation(0.0, 1.0, 0.6)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     assert (rig.kit.state.throttle, round(rig.kit.state.brake, 3)) == (0.0, 0.6)
     assert rig.adapter.state().hindrance == "the gearbox has a bus fault"
 
@@ -333,10 +333,10 @@ def test_fault_without_a_watchdog() -> None:
     assert rig.enabled() == {"brake", "throttle"}
     rig.kit.set_fault("steering.FLTPWR", rig.now_ns, is_set=False)
     rig.actuation = Actuation(0.0, 0.5, 0.6)
-    rig.run_ms(300)
+    rig.run_ms(300, step_ms=COARSE_MS)
     assert rig.enabled() == {"brake", "throttle"}
     assert (rig.kit.state.throttle, round(rig.kit.state.brake, 3)) == (0.0, 0.6)
-    rig.run_until(lambda rig: rig.speed_mps == 0.0)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle")
     assert rig.kit.state.gear == Gear.PARK
@@ -348,9 +348,9 @@ def test_fault_latches(generation: int) -> None:
     name = "steering.FLTPWR" if generation == 1 else "steering.fault"
     rig = driving(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     rig.kit.set_fault(name, rig.now_ns, is_set=False)
-    rig.run_ms(1000)
+    rig.run_ms(1000, step_ms=COARSE_MS)
     assert rig.state == "lost"
     assert rig.adapter.state().hindrance != ""
     stop_and_disengage(rig)
@@ -363,11 +363,11 @@ def test_fault_latches(generation: int) -> None:
 def test_fault_before(generation: int) -> None:
     """A fault that is there hinders before anything was begun, and nothing is sent while it is."""
     name = "brake.FLT1" if generation == 1 else "brake.fault"
-    rig = Rig(generation)
+    rig = started(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.run_ms(50)
     rig.adapter.engage(True, rig.now_ns)
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.sent == []
     assert "the brake has a fault" in rig.adapter.state().hindrance
 
@@ -377,23 +377,23 @@ def test_watchdog(generation: int) -> None:
     """After the watchdog has tripped somebody has to take over; then the car is engaged anew, by CLEAR."""
     rig = driving(generation)
     rig.is_ticking = False
-    rig.run_ms(300)
+    rig.run_ms(300, step_ms=COARSE_MS)
     rig.is_ticking = True
-    rig.run_until(lambda rig: rig.speed_mps == 0.0, 10_000)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, 10_000, step_ms=COARSE_MS)
     rig.adapter.engage(False, rig.now_ns)
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.kit.state.watchdog_brakes
     if generation == 1:
         assert rig.adapter.state().hindrance == "the kit's watchdog brakes: take over by a pedal"
     rig.adapter.engage(True, rig.now_ns)
-    rig.run_ms(4000)
+    rig.run_ms(4000, step_ms=COARSE_MS)
     assert rig.enabled() == set()
     assert "watchdog" in rig.adapter.state().hindrance
     rig.adapter.engage(False, rig.now_ns)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.run_ms(100)
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     rig.engage()
     assert rig.enabled() == set(AXES)
     assert rig.kit.state.watchdog == 0
@@ -416,7 +416,7 @@ def test_bus_off(generation: int) -> None:
     rig.run_ms(400)
     assert rig.adapter.state().hindrance.count("no ") == len(rig.profile.reports)
     rig.kit.bus_off(rig.now_ns, is_off=False)
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.enabled() == set()
     assert not rig.adapter.state().is_engaged
 
@@ -433,7 +433,7 @@ def test_bus_gone(generation: int) -> None:
     assert rig.let_go_ms(cut_ns) == 100
     assert last_sent_ns(rig) == cut_ns
     rig.is_cut = False
-    rig.run_ms(500)
+    rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.state == "lost"
     assert rig.enabled() == set()
     stop_and_disengage(rig)
@@ -466,7 +466,7 @@ def test_report_missing(generation: int, message: str) -> None:
     assert timeout_ms <= (rig.now_ns - heard_ns) // NS_PER_MS <= timeout_ms + 1
     assert rig.adapter.state().hindrance == f"no {message} for {timeout_ms} ms"
     rig.actuation = Actuation(0.0, 0.0, 0.6)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     assert rig.kit.state.brake == pytest.approx(0.6, abs=1e-3)
 
 
@@ -522,7 +522,7 @@ def test_remote_switch_elsewhere() -> None:
     assert (rig.now_ns - turned_ns) // NS_PER_MS <= 101
     assert rig.adapter.state().hindrance == "RemoteReport has STATE control allowed"
     rig.kit.switch_remote(2, rig.now_ns)
-    rig.run_ms(200)
+    rig.run_ms(200, step_ms=COARSE_MS)
     assert rig.state == "lost"
 
 
@@ -568,10 +568,10 @@ def test_park_refused() -> None:
     rig = driving(1)
     rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
     rig.actuation = Actuation(0.0, 0.0, 0.5)
-    rig.run_until(lambda rig: rig.speed_mps == 0.0)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
     rig.actuation = Actuation(0.0, 0.0, 0.0)
     rig.adapter.engage(False, rig.now_ns)
-    rig.run_ms(5000)
+    rig.run_ms(5000, step_ms=COARSE_MS)
     assert rig.speed_mps == 0.0
     assert rig.kit.state.brake == pytest.approx(rig.profile.limits.holding_brake, abs=1e-3)
     assert rig.enabled() == set(AXES)
@@ -601,7 +601,7 @@ def test_nothing_goes_unsaid(generation: int) -> None:
     for cause in causes:
         rig = driving(generation)
         cause(rig)
-        rig.run_ms(500)
+        rig.run_ms(500, step_ms=COARSE_MS)
         assert rig.events, cause
         assert all(event.kind == "fault" and event.detail for event in rig.events)
         details = [event.detail for event in rig.events]

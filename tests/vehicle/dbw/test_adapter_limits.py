@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import Rig, both, driving, profile, with_limits
+from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started, with_limits
 
 from lavt.domain import NS_PER_S, Actuation
 from lavt.vehicle.dbw.profile import TICK_LIMIT_NS, Limits
@@ -58,7 +58,7 @@ def test_rate(generation: int) -> None:
 def test_rate_of_the_kit() -> None:
     """The kit is told the greatest rate in its own steps: 452 deg/s are 113 of 4 deg/s, in both generations."""
     for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
-        rig = Rig(int(name[-1]))
+        rig = started(int(name[-1]))
         rig.engage()
         told = {
             frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
@@ -92,8 +92,8 @@ def test_begins_where_the_wheel_is(generation: int) -> None:
     """The first angle after enabling is at most a set's turn from where the wheel is."""
     rig = driving(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
-    rig.run_until(lambda rig: rig.speed_mps == 0.0)
-    rig.run_ms(1000)
+    rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
+    rig.run_ms(1000, step_ms=COARSE_MS)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle")
     rig.sent.clear()

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import START_NS, Rig, driving, profile
+from tests.vehicle.dbw.rig import START_NS, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
@@ -91,7 +91,7 @@ steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.intege
 
 @names
 @given(steps)
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_random_bus(name: str, happening: list[tuple[Frame, int, int]]) -> None:
     """Whatever comes from the bus nothing is raised, and without all the reports the car is never engaged."""
     adapter = Adapter(profile(name), start_ns=START_NS)
@@ -127,10 +127,10 @@ def reports_of(generation: int) -> tuple[Frame, ...]:
 
 @pytest.mark.parametrize("generation", [1, 2])
 @given(st.lists(st.tuples(any_frame, st.integers(0, 30)), min_size=1, max_size=20))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_garbage_beside_reports(generation: int, garbage: list[tuple[Frame, int]]) -> None:
     """Garbage between the reports of a car that only stands there never makes it engaged while nobody wants it."""
-    rig = Rig(generation)
+    rig = started(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)
         rig.run_ms(wait_ms)
@@ -140,7 +140,7 @@ def test_garbage_beside_reports(generation: int, garbage: list[tuple[Frame, int]
 
 @pytest.mark.parametrize("generation", [1, 2])
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_one_bit(generation: int, data: st.DataObject) -> None:
     """A report with a wrong bit raises nothing; generation 2's checksum finds each."""
     frame = data.draw(st.sampled_from(reports_of(generation)))

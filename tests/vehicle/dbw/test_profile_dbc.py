@@ -13,7 +13,7 @@ import pytest
 import yaml
 from cantools.database import EncodeError
 from cantools.database.can import Database, Message, Signal
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.vehicle.dbw.crc8 import frame_crc8
@@ -117,6 +117,7 @@ def test_marked(message: Message, vector: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("message", MESSAGES)
 @given(data=st.data())
+@settings(max_examples=25)
 def test_round_trip(message: Message, data: st.DataObject) -> None:
     """What is encoded within a signal's range is decoded as it was, and leaves every bit that is no signal's 0."""
     multiplexer = selector_of(message)

@@ -19,7 +19,7 @@ def line_of(segments: list[Segment]) -> Centreline:
     return Centreline(-10.0, (3.0, -2.0, 0.7), segments)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(SEGMENTS, st.floats(0, 1), st.floats(-8.0, 8.0), st.floats(-12.0, 12.0))
 def test_projection_finds_the_station_and_the_offset_a_place_was_made_from(
     segments: list[Segment], share: float, offset_m: float, beside_m: float
@@ -35,7 +35,7 @@ def test_projection_finds_the_station_and_the_offset_a_place_was_made_from(
     assert found[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.floats(20.0, 200.0), CURVATURES, CURVATURES)
 def test_a_clothoid_is_where_its_heading_leads(length_m: float, begin: float, end: float) -> None:
     """Positions are the integral of the heading, to less than a tenth of a millimetre over 200 m."""
@@ -57,7 +57,7 @@ def test_a_clothoid_is_the_fresnel_integral() -> None:
     assert (float(x_m), float(y_m)) == pytest.approx((90.4524238, 31.0268302), abs=1e-6)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(SEGMENTS)
 def test_a_line_has_no_gap_and_no_kink(segments: list[Segment]) -> None:
     """Across every joint place and heading are continuous, and curvature is where the segments say so."""

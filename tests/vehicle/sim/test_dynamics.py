@@ -166,7 +166,7 @@ def energy_j(car: Car) -> float:
     ) / 2
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.floats(4.0, 30.0), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=12), st.floats(0.0, 1.0))
 def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: list[float], brake: float) -> None:
     """However it is steered, and sliding too, a car that only rolls or brakes loses energy, while tyres have slip."""
@@ -181,7 +181,7 @@ def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: lis
     assert energy_j(car) < CAR.mass_kg * speed_mps**2 / 2
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.floats(0.0, 20.0), st.floats(-5.0, 5.0), st.floats(-1.0, 1.0), st.floats(-3.2, 3.2), st.booleans())
 def test_a_rail_takes_the_motion_into_it_and_gives_none(
     speed_mps: float, side_mps: float, yaw_radps: float, out_rad: float, front: bool

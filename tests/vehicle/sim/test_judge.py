@@ -262,7 +262,7 @@ ROADS = [load_road("a_key"), *(parse_road(text, source="x") for text in (OPEN_RA
 STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 @given(st.sampled_from(ROADS), st.lists(STEPS, min_size=50, max_size=300), st.floats(0.0, 90.0), st.floats(-6.0, 6.0))
 def test_looking_only_when_needed_changes_no_verdict(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from lavt.vehicle.sim.pinhole import view_from
 from lavt.vehicle.sim.road import Road, load_road
 
 NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
-each_light = pytest.mark.parametrize("light", NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -24,24 +24,26 @@ def road() -> Road:
     return load_road("a_key")
 
 
-def asphalt(road: Road, light: LightName) -> FloatArray:
-    """Means (n, 3) of small pieces of the driven lane in front of the car, all along the route."""
+@cache
+def asphalt(light: LightName) -> FloatArray:
+    """Return the means (n, 3) of small pieces of the driven lane in front of the car, all along the route."""
+    road = load_road("a_key")
     camera = camera_on(road, light=light)
     pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.length_m, 6.0)]
     return np.array([picture[420:470, 300:340].reshape(-1, 3).mean(axis=0) for picture in pictures])
 
 
-def test_the_low_sun_is_warm_and_dark(road: Road) -> None:
+def test_the_low_sun_is_warm_and_dark() -> None:
     """With a low sun the road is darker than at noon and redder than blue; under clouds it is bluish, if anything."""
-    noon, low, clouds = (np.median(asphalt(road, light), axis=0) for light in NAMES)
+    noon, low, clouds = (np.median(asphalt(light), axis=0) for light in NAMES)
     assert low.mean() < 0.9 * noon.mean()
     assert low[2] / low[0] > 1.2 * noon[2] / noon[0]
     assert clouds[2] <= clouds[0]
 
 
-def test_only_the_sun_throws_shadows(road: Road) -> None:
+def test_only_the_sun_throws_shadows() -> None:
     """With a low sun the lane has pieces in the shade, about half as bright as the others; under clouds it has none."""
-    low, clouds = asphalt(road, "low_sun").mean(axis=1), asphalt(road, "overcast").mean(axis=1)
+    low, clouds = asphalt("low_sun").mean(axis=1), asphalt("overcast").mean(axis=1)
     assert low.min() < 0.55 * np.median(low)
     assert clouds.min() > 0.8 * np.median(clouds)
 
@@ -64,7 +66,7 @@ def test_a_rails_shadow_is_where_the_sun_throws_it(road: Road) -> None:
     assert inside < 0.7 * beyond
 
 
-@each_light
+@pytest.mark.parametrize("light", NAMES)
 def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
     """In every light a solid mark is at least half as bright again as the asphalt beside it."""
     picture = picture_of(camera_on(road, light=light), pose_at(road, 0.0)).astype(np.uint8)
@@ -79,7 +81,9 @@ print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.
 """
 
 
-@each_light
+@pytest.mark.parametrize(
+    "light", ["low_sun", *(pytest.param(light, marks=pytest.mark.full) for light in ("noon", "overcast"))]
+)
 def test_a_frame_is_the_same_to_the_byte_everywhere(road: Road, light: LightName) -> None:
     """Equal pose, number and seed give an equal picture with cold and warm caches, and in another process."""
     renderer.world.cache_clear()

@@ -143,7 +143,7 @@ def test_a_good_driver_completes_the_route(road: Road) -> None:
     assert simulator.ground_truth().progress_m >= road.length_m
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.integers(0, 400 * NS_PER_MS), max_size=30))
 def test_the_trajectory_does_not_depend_on_how_advance_is_called(pauses_ns: list[int]) -> None:
     """However late and unevenly the physics is called, commands at the same times give the same drive to the bit."""
