@@ -5,7 +5,8 @@
 Drives the way `lavt run` does (`plan_run`, `build_loop`, `drive`), at L0, with everything recorded. What is counted is
 CPU time of this process and its children, as the operating system has it, against the virtual time that went by in the
 drive: medians over the repetitions. Building the loop (reading the road, painting the ground, opening the codec) is
-no part of a drive and has a figure of its own; imports have none. The stages are timed in one more drive, hop by hop.
+no part of a drive and has a figure of its own; imports have none. The stages are timed in one more drive, hop by hop,
+and have to make up that drive.
 
 The last line is JSON: how many times real time each setting reaches, and two stages of the one with everything; null
 is what was not measured.
@@ -20,7 +21,7 @@ import platform
 import resource
 import sysconfig
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -32,6 +33,7 @@ import cv2
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
+from lavt.errors import WorkError
 from lavt.experiment.plan import plan_run
 from lavt.experiment.virtual_run import VirtualLoop, build_loop, drive
 from lavt.node import Hop, Node
@@ -88,7 +90,10 @@ def drive_once(changes: Iterable[str], limit_s: float, change: Callable[[Virtual
 
 
 def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
-    """Drive once more with a stopwatch in each stage: milliseconds of CPU time for each frame."""
+    """Drive once more with a stopwatch in each stage; return milliseconds of CPU time for each frame, with the rest.
+
+    Raises `WorkError` where the stages do not make up the drive.
+    """
     spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
 
     def timed(node: Node, name: str, hop: Callable[..., Any]) -> Hop:
@@ -101,13 +106,30 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
         return name, run
 
     def watch(loop: VirtualLoop) -> None:
-        for node in (loop.server.camera, loop.client.driver):
-            node.chains = {
-                channel: tuple(timed(node, name, hop) for name, hop in hops) for channel, hops in node.chains.items()
-            }
+        for host in loop.runtime.hosts.values():
+            for running in host.running.values():  # the runtime has looked the chains up already
+                running.chains = {
+                    channel: (tuple(timed(running.node, name, hop) for name, hop in hops), spent_ns)
+                    for channel, (hops, spent_ns) in running.chains.items()
+                }
 
     driven = drive_once(changes, limit_s, watch)
-    return {stage: 1e3 * sum(spent_s[hop] for hop in hops) / driven.frames for stage, hops in STAGES.items()}
+    stages = {stage: 1e3 * sum(spent_s[hop] for hop in hops) / driven.frames for stage, hops in STAGES.items()}
+    return with_rest(stages, 1e3 * driven.drive_cpu_s / driven.frames)
+
+
+def with_rest(stages: Mapping[str, float], whole: float) -> dict[str, float]:
+    """Return the stages and what they leave of the whole, in its unit.
+
+    Raises `WorkError` where a stage took no time, so that it was not measured, or where all took more than the whole.
+    """
+    nothing = [stage for stage, took in stages.items() if took <= 0]
+    if nothing:
+        raise WorkError(f"{', '.join(nothing)} took no time: the stopwatch is not where the work is done")
+    rest = whole - sum(stages.values())
+    if rest < 0:
+        raise WorkError(f"the stages took {sum(stages.values()):.3f} ms of a frame's {whole:.3f} ms")
+    return {**stages, "rest": rest}
 
 
 def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit_s: float) -> dict[str, float | None]:
@@ -123,14 +145,14 @@ def measure(names: Iterable[str], routes: Sequence[str], repetitions: int, limit
             building_s = median(each.build_cpu_s for each in drives)
             frame_ms = median(1e3 * each.drive_cpu_s / each.frames for each in drives)
             stages = stages_ms(changes, limit_s)
-            stages["rest"] = frame_ms - sum(stages.values())
             found[f"{name}_x"].append(speed)
             if name == "full":
                 found["perception_ms"].append(stages["perception"])
                 found["render_ms"].append(stages["render"])
             print(f"{name}, {route}: {drives[0].simulated_s:.1f} s simulated, {repetitions} drives")
             print(f"  {speed:.2f} times real time; with {building_s:.2f} s to build the loop {whole:.2f}")
-            print(f"  a frame {frame_ms:.3f} ms: " + ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items()))
+            parts = ", ".join(f"{stage} {ms:.3f}" for stage, ms in stages.items())
+            print(f"  a frame {frame_ms:.3f} ms; with a stopwatch {sum(stages.values()):.3f} ms: {parts}")
     return {name: round(median(found[name]), 3) if found[name] else None for name in SAID}
 
 

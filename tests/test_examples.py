@@ -20,6 +20,7 @@ def test_every_example_is_known() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(SAYS)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", SAYS)
 def test_the_examples_run(name: str, tmp_path: Path) -> None:
     """Each example runs and prints what it promises."""
