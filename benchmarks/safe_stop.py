@@ -2,7 +2,7 @@
 
     python -m benchmarks.safe_stop [PICTURE]        # at the top of the repository
 
-About two minutes on one core. The stops are those of tests/field/test_safe_stop.py.
+About two minutes on one core. The stops are those of tests/control/test_safe_stop.py.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import groupby
 from operator import itemgetter
 
 from matplotlib.figure import Figure
-from tests.field.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
+from tests.control.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
 
 from lavt.experiment.figure_style import COLOURS, new_figure
 

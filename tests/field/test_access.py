@@ -41,7 +41,6 @@ from lavt.streams import stream
 from lavt.transport.zenoh_link import quiet_logs
 
 pytest.importorskip("cryptography")
-pytestmark = pytest.mark.realtime
 
 DRIVES = {"commands", "questions", "session", "netem", "state", "alive"}
 EVERYTHING = DRIVES | {

@@ -21,7 +21,7 @@ from lavt.experiment.processes import LAVT
 from lavt.runtime import precedence
 
 pytest.importorskip("can")
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.timeout(600)]
 
 Tell = Callable[[str], None]
 Proved = Callable[[str], RunConfig]

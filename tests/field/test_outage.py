@@ -23,7 +23,7 @@ from lavt.domain import NS_PER_S
 from lavt.experiment.processes import LAVT
 from lavt.experiment.record import read_record
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(900), pytest.mark.usefixtures("namespaces")]
+pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("namespaces")]
 """The drive, of which a fixture waits for the end, takes 150 s on a quiet machine."""
 
 DEGRADED_AFTER_S = 0.3

@@ -26,7 +26,7 @@ from lavt.experiment.record import Record
 from lavt.experiment.table import Table
 from lavt.transport.video_path import HELLO_AGAIN_NS
 
-pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("namespaces")]
+pytestmark = [pytest.mark.usefixtures("namespaces")]
 
 VIDEO_PORT, PROBE_PORT = 5600, 5602
 """As in configs/server.yaml."""

@@ -27,8 +27,6 @@ from lavt.transport.stamp import read_stamp, rtp_timestamp, write_stamp
 from lavt.transport.stamp_check import LEARNED_AFTER
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 
-pytestmark = pytest.mark.realtime
-
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 640, 480, 30
 COUNT = 60
 """Frames, of two seconds; the tools send them in real time."""

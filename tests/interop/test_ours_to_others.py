@@ -24,8 +24,6 @@ from lavt.runtime.realtime import RealRuntime
 from lavt.transport.stamp import read_stamp
 from lavt.transport.udp_link import UdpLink
 
-pytestmark = pytest.mark.realtime
-
 SERVER = shipped("configs/server.yaml")
 WIDTH_PX, HEIGHT_PX = 320, 240
 FRAME_BYTES = WIDTH_PX * HEIGHT_PX * 3 // 2

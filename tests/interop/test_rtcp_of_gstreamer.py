@@ -109,7 +109,6 @@ def packet(sequence: int, ssrc: int) -> bytes:
     return RtpPacket(96, sequence % 2**16, 3000 * sequence, ssrc, True, b"\x41abc").to_bytes()
 
 
-@pytest.mark.realtime
 @pytest.mark.timeout(60)
 def test_gstreamer_hears_our_sender() -> None:
     """GStreamer's receiver reads our sender report to the last bit and sends the middle of its time back."""
@@ -134,7 +133,6 @@ def test_gstreamer_hears_our_sender() -> None:
         assert [source[name] for name in names] == [True, sent.ntp_time, 123, 10, 40]
 
 
-@pytest.mark.realtime
 @pytest.mark.timeout(60)
 def test_gstreamer_hears_our_receiver() -> None:
     """GStreamer's sender reads our receiver report, knows the round trip that we made, and obeys a picture loss."""

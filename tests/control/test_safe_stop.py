@@ -11,7 +11,7 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-from tests.field.stops import ALLOWED_M, ROUTES, SPEED_MPS, Curve, Stop, curves, metres, stops
+from tests.control.stops import ALLOWED_M, ROUTES, SPEED_MPS, Curve, Stop, curves, metres, stops
 
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
@@ -21,6 +21,8 @@ from lavt.domain import PATH_POINTS, PATH_STEP_M
 from lavt.experiment.plan import plan_run
 from lavt.experiment.watched_drive import watch_drive
 from lavt.vehicle.sim.road import load_road
+
+pytestmark = pytest.mark.full
 
 
 @cache
