@@ -307,6 +307,7 @@ def small(*changes: str) -> BoundaryConfig:
     return config("routes=[a_key]", "presets=[paper_calibrated]", "repetitions=1", "longest_delay_ms=400", *changes)
 
 
+@pytest.mark.full
 def test_one_real_search() -> None:
     """One seed: the swing grows within 10 ms of the theory, then the car leaves its lane, then it does not arrive."""
     (asked,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
@@ -320,6 +321,7 @@ def test_one_real_search() -> None:
     json.dumps(found)
 
 
+@pytest.mark.full
 def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
     """With a limit of 100 ms the vehicle is not even armed beyond it: completion ends there, and no swing has begun."""
     (asked,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
@@ -386,6 +388,7 @@ def killed_by(asked: boundary_module.Search) -> dict[str, Any]:
     return run_entry("a_key", repetition)
 
 
+@pytest.mark.full
 def test_a_process_that_dies_costs_no_search(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """What a process that died was at is searched again, alone; only the one that dies there too has failed."""
     monkeypatch.setattr(boundary_module, "search", killed_by)

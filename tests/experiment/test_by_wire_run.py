@@ -27,7 +27,7 @@ def result_of(out: Path, kind: str, profile: str = GENERATIONS[0]) -> dict[str, 
     return run_once(plan_run(parse_config(RunConfig, said, "the run")), out)
 
 
-@pytest.mark.parametrize("profile", GENERATIONS)
+@pytest.mark.parametrize("profile", [pytest.param(GENERATIONS[0], marks=pytest.mark.full), GENERATIONS[1]])
 def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None:
     """Over a bus the key part of route A is driven about as well as without, and each hop to the wheel is timed."""
     result, without = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
@@ -39,6 +39,7 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None
     assert 0 < wheel["p50"] < wheel["p95"] < 20, "a frame's time on the bus, the kit's report, and half its period"
 
 
+@pytest.mark.full
 def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
     """Bus, kit and adapter are as deterministic as all else in virtual time."""
     first, second = result_of(tmp_path / "first", "dbw"), result_of(tmp_path / "second", "dbw")

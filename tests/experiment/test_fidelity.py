@@ -36,6 +36,7 @@ def result(fidelity: str, condition: str) -> dict[str, Any]:
         return run_once(planned(f"fidelity={fidelity}", f"network.condition={condition}"), Path(folder) / "run")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("condition", ["L0", "L2"])
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
 def test_latency_is_the_same_in_all(fidelity: str, condition: str) -> None:
@@ -48,6 +49,7 @@ def test_latency_is_the_same_in_all(fidelity: str, condition: str) -> None:
     assert (other["frames_sent"], other["frames_unreadable"]) == (pytest.approx(video["frames_sent"], abs=2), 0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("condition", ["L0", "L2"])
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
 def test_driving_is_similar_in_all(fidelity: str, condition: str) -> None:
@@ -127,6 +129,7 @@ def badness(fidelity: str, condition: str) -> tuple[bool, float]:
     return entry["ending"] != "completed", entry["p95_m"] if entry["ending"] == "completed" else -entry["distance_m"]
 
 
+@pytest.mark.full
 def test_pixels_and_geometry_order_the_conditions_alike() -> None:
     """From L0 to L5 drives get worse with total delay, with pixels as without them; L3 and L4, of equal delay, tie."""
     orders = {}

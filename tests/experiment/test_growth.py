@@ -20,6 +20,7 @@ LOOPBACK_MS = 11.8
 WITHIN_MS = 10.0
 
 CASES = list(itertools.product((0.74, 1.01, 1.3), (15, 30), (6.0, 10.0)))
+QUICK = (1.01, 30, 6.0)
 
 
 def swinging(rate_per_s: float, *, size_m: float = 0.01, limited_s: tuple[float, ...] = ()) -> WatchedDrive:
@@ -102,12 +103,16 @@ def check_onset(config: RunConfig) -> None:
         assert rate_per_s * side > 0, (total_ms, theory_ms)
 
 
-@pytest.mark.parametrize(("lookahead_s", "rate_hz", "speed_mps"), CASES)
+@pytest.mark.parametrize(
+    ("lookahead_s", "rate_hz", "speed_mps"),
+    [pytest.param(*case, marks=() if case == QUICK else pytest.mark.full) for case in CASES],
+)
 def test_the_swing_begins_to_grow_where_theory_says(lookahead_s: float, rate_hz: float, speed_mps: float) -> None:
     """On a straight road, far from every limit, the whole loop's onset of growth is within 10 ms of the theory."""
     check_onset(loop_config(lookahead_s, rate_hz, speed_mps))
 
 
+@pytest.mark.full
 def test_dead_time_and_lag_of_the_steering_move_the_onset_as_theory_says() -> None:
     """With 60 ms of dead time and another lag, the onset is within 10 ms of the theory for that car."""
     check_onset(loop_config(1.01, 30, 30 / 3.6, "vehicle.steering_dead_time_ms=60", "vehicle.steering_lag_ms=200"))

@@ -12,6 +12,8 @@ from lavt.config_file import load_config, shipped
 from lavt.experiment.plan import plan_sweep
 from lavt.experiment.sweep import run_all
 
+pytestmark = pytest.mark.full
+
 ROUTES = {"a", "a_key", "b", "b_key", "c", "c_key"}
 EACH_P95_M, MEAN_P95_M = 0.22, 0.15
 """Without delay the car's own 0.8 m to either line are never in question: what is left to see is the delay."""

@@ -29,7 +29,7 @@ from lavt.experiment.run import RESULT, run_once
 from lavt.experiment.sweep import base_of, open_sweep, recorded_base, run_all, sweep
 from lavt.experiment.workers import Workers, processes
 
-CHANGES = ("vehicle.scenery=none", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
+CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
 
 def asked(*changes: str) -> SweepConfig:
@@ -151,7 +151,7 @@ def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[
     assert recorded_base(tmp_path) == base
 
 
-@pytest.mark.realtime
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("number", "options"), [(signal.SIGINT, ()), (signal.SIGHUP, ()), (signal.SIGINT, ("--cluster", "local"))]
 )
@@ -222,7 +222,7 @@ sys.meta_path.insert(0, Finder())
 """Makes the import of the report a place to interrupt: it executes a string, as the definition of a dataclass does."""
 
 
-@pytest.mark.realtime
+@pytest.mark.full
 def test_a_sweep_that_is_stopped_in_an_import_ends_with_its_own_exit_code(tmp_path: Path) -> None:
     """`python -m` dies of a signal that finds the main thread executing a string, although it was handled."""
     (tmp_path / "sitecustomize.py").write_text(IMPORT_FOR_LONG)
@@ -252,6 +252,7 @@ def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
     return config, plan_sweep(config)
 
 
+@pytest.mark.full
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     """The same runs have the same digests on a repeat, with one process, with two, and on Dask's workers."""
     pytest.importorskip("distributed")
@@ -293,6 +294,7 @@ def test_files_from_far_are_let_go_once_they_are_written(tmp_path: Path, monkeyp
     assert held == [3, 2, 1]
 
 
+@pytest.mark.full
 def test_without_a_scheduler_there_is_a_sentence(tmp_path: Path) -> None:
     """An address at which no Dask scheduler answers is an error of the user's, before anything is driven."""
     pytest.importorskip("distributed")
@@ -324,7 +326,7 @@ def test_a_process_that_begins_does_not_hear_the_terminal(number: signal.Signals
         assert workers.executor.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(60) == set()
 
 
-@pytest.mark.realtime
+@pytest.mark.full
 def test_a_process_that_dies_costs_no_run(tmp_path: Path) -> None:
     """When a process is killed from outside, what it was at is driven again, and all runs are there in the end."""
     _, planned = geometry()
@@ -359,7 +361,7 @@ def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: 
     assert len(driven.drives[0].truth) > 0
 
 
-@pytest.mark.realtime
+@pytest.mark.full
 def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
     """A sweep killed (SIGKILL) in its middle and resumed gives the summary of one that nobody disturbed."""
     sets = [part for change in ("fidelity=geometry", "conditions=[L0, L3, L5]") for part in ("--set", change)]

@@ -21,6 +21,11 @@ from lavt.experiment.virtual_run import build_loop, drive
 MORE = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
 
 
+def all_but_one_full(names: list[str], quick: str) -> list[Any]:
+    """Mark all names but one as `full`."""
+    return [name if name == quick else pytest.param(name, marks=pytest.mark.full) for name in names]
+
+
 def driven(out: Path, *changes: str) -> dict[str, Any]:
     given = ("vehicle.scenery=none", "record.video=false", *changes)
     return run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given)), out)
@@ -44,7 +49,7 @@ def test_a_constant_delay_counts_nothing(tmp_path: Path) -> None:
     assert link_counts(tmp_path / "run/server.mcap") == link_counts(tmp_path / "run/client.mcap") == {}
 
 
-@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize("name", all_but_one_full(MORE, "loss_burst"))
 def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> None:
     """Without pixels every condition is driven to the goal, validly, and with equal digests when driven again."""
     changes = ("fidelity=geometry", f"network.condition={name}")
@@ -57,7 +62,7 @@ def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> Non
 
 def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
     """The record of who sends says how many packets were lost, and so many less have come; pixels record all."""
-    driven(tmp_path / "run", "fidelity=pixels", "vehicle.scenery=none", "network.condition=loss")
+    driven(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
     control = link_counts(tmp_path / "run/client.mcap")["link control"]
@@ -69,7 +74,7 @@ def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
         assert 0 <= sent - counts["lost"] - received <= 10  # the rest was under way at the end
 
 
-@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize("name", all_but_one_full(MORE, "reorder"))
 def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
     """With real video the first seconds under every condition go by, and the link does what it is for."""
     given = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
@@ -123,7 +128,10 @@ AXES: list[tuple[str, list[Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("key", "values", "fidelity"), AXES, ids=[key for key, _, _ in AXES])
+@pytest.mark.parametrize(
+    ("key", "values", "fidelity"),
+    [pytest.param(*axis, id=axis[0], marks=() if axis[2] == "geometry" else pytest.mark.full) for axis in AXES],
+)
 def test_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> None:
     """Each of these config values is an axis: its runs share their seed, say its value, and go differently."""
     sweep = {

@@ -131,12 +131,13 @@ def test_forgetting_the_clock_offset_is_noticed(tmp_path: Path) -> None:
 def test_injected_delay_is_what_is_measured(l0: Path, tmp_path: Path) -> None:
     """The medians of tau_v and tau_c at L5 are those at L0 plus what was injected, and so is the loop latency."""
     out = tmp_path / "l5"
-    run(out, planned("network.condition=L5"), seconds=12)
+    run(out, planned(BARE, "network.condition=L5"), seconds=8)
     before, after = measure(*records(l0)).entry, measure(*records(out)).entry
     for name, injected_ms in (("tau_v_ms", 225.0), ("tau_c_ms", 100.0), ("loop_ms", 325.0)):
         assert after[name]["p50"] - before[name]["p50"] == pytest.approx(injected_ms, abs=0.5), name
 
 
+@pytest.mark.full
 def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> None:
     """With `paper_wifi5` tau_v has the paper's median of 62 and P95 of 86 ms, and tau_c is 9 ms."""
     out = tmp_path / "run"
@@ -165,7 +166,7 @@ print(loop.digest.hexdigest())
 
 
 def digest(out: Path, *changes: str, change: Change = lambda _: None) -> str:
-    digest: str = run(out, planned(*changes), change=change, seconds=4).digest.hexdigest()
+    digest: str = run(out, planned(BARE, *changes), change=change, seconds=3).digest.hexdigest()
     return digest
 
 
@@ -200,6 +201,7 @@ def test_the_digest_repeats_and_sees_everything(tmp_path: Path) -> None:
     assert digest(tmp_path / "again") == digests[0]
 
 
+@pytest.mark.full
 def test_the_digest_does_not_depend_on_the_hash_seed(tmp_path: Path) -> None:
     """Processes with other PYTHONHASHSEEDs give the same digest."""
     said = set()
@@ -230,7 +232,7 @@ def mirrored(_number: int, picture: Picture) -> Picture:
     return np.ascontiguousarray(picture[:, ::-1])
 
 
-@pytest.mark.parametrize("change", [noisy_grey, grey])
+@pytest.mark.parametrize("change", [pytest.param(noisy_grey, marks=pytest.mark.full), grey])
 def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Picture], Picture]) -> None:
     """Grey pictures, with noise or frozen, lead to a safe stop within 3 s."""
     out = tmp_path / "run"
@@ -278,7 +280,7 @@ def test_a_car_whose_state_is_not_heard_is_stopped(tmp_path: Path) -> None:
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: int, step_s: int) -> None:
     """A wall clock that steps by a second, either way, on either host, changes no safety state; the run is invalid."""
-    config = planned(BARE)
+    config = planned("fidelity=geometry")
     clocks = host_clocks(config.config)
     clocks[side].steps = [(8 * NS_PER_S, step_s * NS_PER_S)]
     out = tmp_path / "run"
