@@ -16,9 +16,9 @@ from tests.support.stalls import (
     HostStalledEachTime,
     ProbeEnded,
     ProbeProcess,
+    Shared,
     Stall,
     Stalls,
-    again_where_stalled,
     idle_share,
     inconclusive_too_often,
     overlapping,
@@ -82,7 +82,8 @@ def test_what_is_in_time_asks_for_no_record() -> None:
     stalls = stalls_of()
     asked = stalls.probes[0].asked  # type: ignore[attr-defined]
     stalls.require(True, "late", 0, 100)
-    stalls.require_share(True, "slow", 0, 100, share=0.1)
+    with stalls.judging(0, 100):
+        pass
     assert stalls.probes[0].asked == asked  # type: ignore[attr-defined]
 
 
@@ -109,8 +110,8 @@ def test_only_a_stall_at_the_moment_excuses_a_failure(stall: Stall | None, raise
 def test_a_rate_is_excused_by_a_share_of_the_time(share: float, raised: type[Exception]) -> None:
     """A rate that is wrong fails, unless a processor was stalled for the share of the time that the caller names."""
     stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + 10) * MS) for at in range(10)))
-    with pytest.raises(raised) as caught:
-        stalls.require_share(False, "slow", 0, 1000 * MS, share=share)
+    with pytest.raises(raised, match="slow") as caught, stalls.judging(0, 1000 * MS, share=share):
+        raise AssertionError("slow")
     assert caught.type is raised
 
 
@@ -150,16 +151,46 @@ def test_the_idle_share_counts_work_at_low_priority_as_idle() -> None:
     assert idle_share(before, before) == 0
 
 
-def test_what_many_tests_share_is_tried_three_times() -> None:
-    """An attempt that the host stalled is made again at most twice, then it is inconclusive with all that was said."""
-    outcomes: Iterator[str] = iter(["first", "second", "third", "fourth"])
+@pytest.mark.parametrize(("stall", "raised"), [(None, AssertionError), (Stall(0, 0, 31 * MS), HostStalled)])
+def test_an_assertion_inside_is_excused_by_a_stall(stall: Stall | None, raised: type[Exception]) -> None:
+    """An assertion that fails while times are judged is excused as a sentence is; any other exception is not."""
+    stalls = stalls_of(*([stall] if stall else []))
+    with pytest.raises(raised, match="late") as caught, stalls.judging(0, 100 * MS):
+        raise AssertionError("late")
+    assert caught.type is raised
+    assert stalls.excused == (raised is HostStalled)
+    with pytest.raises(ValueError, match="broken"), stalls.judging(0, 100 * MS):
+        raise ValueError("broken")
+
+
+def test_what_many_tests_share_is_made_anew_after_a_stall() -> None:
+    """It is made once while nothing is excused, again after each excuse, at most three times in all."""
+    stalls, numbers = stalls_of(), iter(range(9))
+    shared = Shared(stalls, lambda: next(numbers))
+    assert [shared.get(), shared.get()] == [0, 0]
+    stalls.excused += 1
+    assert [shared.get(), shared.get()] == [1, 1]
+    stalls.excused += 2
+    assert shared.get() == 2
+    stalls.excused += 1
+    assert shared.get() == 2
+
+
+def test_what_cannot_be_made_on_a_stalled_host_is_given_up() -> None:
+    """Where the host stalls each of three attempts, what comes after says so and attempts nothing."""
+    attempts = []
 
     def stalled() -> None:
-        raise HostStalled(next(outcomes))
+        attempts.append(1)
+        raise HostStalled("300 ms")
 
-    with pytest.raises(HostStalledEachTime, match=r"first \| second \| third"):
-        again_where_stalled(stalled)
-    assert next(outcomes) == "fourth"
+    shared = Shared(stalls_of(), stalled)
+    for _ in range(3):
+        with pytest.raises(HostStalled, match="300 ms"):
+            shared.get()
+    with pytest.raises(HostStalledEachTime):
+        shared.get()
+    assert len(attempts) == 3
 
 
 CONFTEST = """
@@ -261,7 +292,7 @@ def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytes
         "INCONCLUSIVE *::test_stalled_each_time: *HostStalled: 300 ms",
         "INCONCLUSIVE *::test_given_up: *: 300 ms",
         "INCONCLUSIVE *::test_stalled_in_setup: *HostStalled: in its setup",
-        "HOST *; the machine was 10% idle; 3 of 5 tests inconclusive",
+        "HOST *; the machine was 10% idle; 3 of 6 tests inconclusive",
     ])  # fmt: skip
 
 
@@ -273,10 +304,10 @@ def test_a_fault_fails_at_once_whatever_else_was_stalled(pytester: pytest.Pytest
 
 
 def test_many_inconclusive_tests_on_an_idle_machine_fail_the_session(pytester: pytest.Pytester) -> None:
-    """Three inconclusive tests of five fail a session whose machine was idle, and it says so."""
+    """Three inconclusive tests of six fail a session whose machine was idle, and it says so."""
     result = run_inner(pytester, TESTS, after="cpu 40 0 0 60 0 0 0 0 0 0")
     assert result.ret == pytest.ExitCode.TESTS_FAILED
-    result.stdout.fnmatch_lines(["FAILED: 3 of 5 tests were inconclusive on a machine that was 60% idle"])
+    result.stdout.fnmatch_lines(["FAILED: 3 of 6 tests were inconclusive on a machine that was 60% idle"])
 
 
 def test_a_probe_that_ends_fails_the_session(pytester: pytest.Pytester) -> None:

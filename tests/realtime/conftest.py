@@ -9,10 +9,12 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -22,16 +24,22 @@ from lavt.experiment.metrics import measure
 from lavt.experiment.plan import PlannedRun, plan_run
 from lavt.experiment.real_run import relay_reasons
 from lavt.experiment.record import read_record
-from lavt.experiment.run import run_once
 
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS
+BUSY_SHARE = 0.05
+"""A host that takes this share of a drive moves the medians of its latencies."""
+LONG_STALL_MS = 100
+"""A stall this long can cost a drive its lane, or its driver: commands time out after 300 ms."""
+LONGEST_S = 900
+"""A test may have to drive several times, on a host that is busy."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.realtime)
+            item.add_marker(pytest.mark.timeout(LONGEST_S))
 
 
 @pytest.fixture(scope="session")
@@ -73,23 +81,30 @@ def real_drive_in(out: Path, result: dict[str, Any]) -> RealDrive:
     return RealDrive(out, result, relay_says, measure(server, client).closure_p95_ms)
 
 
-@pytest.fixture(scope="session")
-def real_drive(tmp_path_factory: pytest.TempPathFactory) -> Callable[[PlannedRun], RealDrive]:
-    def drive(planned: PlannedRun) -> RealDrive:
-        out = tmp_path_factory.mktemp("real")
-        return real_drive_in(out, run_once(planned, out))
-
-    return drive
-
-
 @dataclass(frozen=True)
 class Demo:
-    """What the demo left and what it said on a terminal."""
+    """What the demo left and what it said on a terminal, and when it ran."""
 
     out: Path
     code: int
     said: str
-    summary: dict[str, Any]
+    since_ns: int
+    until_ns: int
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """Return what summary.json had at the end."""
+        summary: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
+        return summary
+
+    @cached_property
+    def injected(self) -> dict[str, RealDrive]:
+        """Return its drives in real time, by condition."""
+        drives = {}
+        for name in ("L0", "L5"):
+            out = self.out / "runs" / f"real_a_key_{name}_00"
+            drives[name] = real_drive_in(out, json.loads((out / "result.json").read_text()))
+        return drives
 
 
 def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
@@ -111,19 +126,19 @@ def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Give the demo, run once."""
-    out = tmp_path_factory.mktemp("demo") / "out"
-    code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
-    assert code == 0, said
-    return Demo(out, code, said, json.loads((out / "summary.json").read_text()))
+def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[Demo]:
+    clock = MachineClock()
+
+    def run() -> Demo:
+        out, since_ns = tmp_path_factory.mktemp("demo") / "out", clock.now().mono_ns
+        code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
+        assert code == 0, said
+        return Demo(out, code, said, since_ns, clock.now().mono_ns)
+
+    return Shared(stalls, run)
 
 
-@pytest.fixture(scope="session")
-def injected(demo: Demo) -> dict[str, RealDrive]:
-    """Give the demo's drives under L0 and L5."""
-    drives = {}
-    for name in ("L0", "L5"):
-        out = demo.out / "runs" / f"real_a_key_{name}_00"
-        drives[name] = real_drive_in(out, json.loads((out / "result.json").read_text()))
-    return drives
+@pytest.fixture
+def demo(demos: Shared[Demo]) -> Demo:
+    """Give the demo, run once where the host lets it."""
+    return demos.get()

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
+from tests.realtime.conftest import BUSY_SHARE, LONG_STALL_MS
+from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -115,40 +117,50 @@ class Hostile:
 
 
 @pytest.fixture(scope="module")
-def attacked(
+def drives(
     tmp_path_factory: pytest.TempPathFactory,
     wait_until: Callable[[str, Callable[[], bool], float], None],
     planned: Callable[..., PlannedRun],
-) -> SimpleNamespace:
-    """Give a drive that was attacked for some seconds, and then ended by Ctrl-C on both sides."""
-    work = tmp_path_factory.mktemp("attacked")
+    stalls: Stalls,
+) -> Shared[SimpleNamespace]:
     clock = MachineClock()
-    with Processes(work) as processes:
-        loop = start_loop(processes, planned("vehicle.scenery=none"), work, work, once=False)
-        wait_until("somebody drives", lambda: loop.server.latest.get("status", {}).get("safety") == "driving", 20.0)
-        hostile = Hostile(loop.router, udp_ports(loop.server) | udp_ports(loop.client))
-        began_ns = clock.now().mono_ns
-        for number in range(ROUNDS):
-            hostile.attack()
-            pause(began_ns + (number + 1) * ROUND_NS - clock.now().mono_ns)
-        ended_ns = clock.now().mono_ns
-        hostile.close()
-        status = loop.server.latest["status"]
-        took_s = {}
-        for process in (loop.client, loop.server):
-            told_ns = clock.now().mono_ns
-            process.end()
-            took_s[process.name] = (clock.now().mono_ns - told_ns) / NS_PER_S
-        return SimpleNamespace(
-            began_ns=began_ns,
-            ended_ns=ended_ns,
-            received=hostile.received,
-            status=status,
-            took_s=took_s,
-            codes=[each.popen.returncode for each in (loop.client, loop.server)],
-            server=read_record(work / "server" / "server.mcap"),
-            client=read_record(work / "client" / "client.mcap"),
-        )
+
+    def drive() -> SimpleNamespace:
+        work = tmp_path_factory.mktemp("attacked")
+        with Processes(work) as processes:
+            loop = start_loop(processes, planned("vehicle.scenery=none"), work, work, once=False)
+            wait_until("somebody drives", lambda: loop.server.latest.get("status", {}).get("safety") == "driving", 60.0)
+            hostile = Hostile(loop.router, udp_ports(loop.server) | udp_ports(loop.client))
+            began_ns = clock.now().mono_ns
+            for number in range(ROUNDS):
+                hostile.attack()
+                pause(began_ns + (number + 1) * ROUND_NS - clock.now().mono_ns)
+            ended_ns = clock.now().mono_ns
+            hostile.close()
+            status = loop.server.latest["status"]
+            took_s = {}
+            for process in (loop.client, loop.server):
+                told_ns = clock.now().mono_ns
+                process.end()
+                took_s[process.name] = (clock.now().mono_ns - told_ns) / NS_PER_S
+            return SimpleNamespace(
+                began_ns=began_ns,
+                ended_ns=ended_ns,
+                received=hostile.received,
+                status=status,
+                took_s=took_s,
+                codes=[each.popen.returncode for each in (loop.client, loop.server)],
+                server=read_record(work / "server" / "server.mcap"),
+                client=read_record(work / "client" / "client.mcap"),
+            )
+
+    return Shared(stalls, drive)
+
+
+@pytest.fixture
+def attacked(drives: Shared[SimpleNamespace]) -> SimpleNamespace:
+    """Give a drive that was attacked for some seconds, and then ended by Ctrl-C on both sides."""
+    return drives.get()
 
 
 def counted(record: Record, name: str) -> int:
@@ -156,7 +168,7 @@ def counted(record: Record, name: str) -> int:
     return int(np.sum(values[values != MISSING]))
 
 
-def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace) -> None:
+def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """Under 6000 random datagrams at each port and garbage at 200 Hz on all keys the vehicle is driven on.
 
     At least half of the pictures give a command: room for a machine that others use too.
@@ -167,9 +179,12 @@ def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace) -> None:
     meanwhile = obeyed.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
     age_ms = (meanwhile.ints("received_wall_ns") - meanwhile.ints("stamp_ns")) / NS_PER_MS
 
-    assert attacked.status["safety"] == "driving"
-    assert np.median(age_ms) < 60
-    assert len(np.unique(meanwhile.ints("stamp_ns"))) > 0.5 * 30 * (attacked.ended_ns - attacked.began_ns) / NS_PER_S
+    with stalls.judging(attacked.began_ns, attacked.ended_ns, stall_ms=LONG_STALL_MS):
+        assert attacked.status["safety"] == "driving"
+    with stalls.judging(attacked.began_ns, attacked.ended_ns, share=BUSY_SHARE):
+        assert np.median(age_ms) < 60
+        pictures = 30 * (attacked.ended_ns - attacked.began_ns) / NS_PER_S
+        assert len(np.unique(meanwhile.ints("stamp_ns"))) > 0.5 * pictures
 
 
 def test_nothing_of_a_stranger_is_obeyed(attacked: SimpleNamespace) -> None:
@@ -184,30 +199,32 @@ def test_nothing_of_a_stranger_is_obeyed(attacked: SimpleNamespace) -> None:
     assert all("refused" in detail for detail in sessions)
 
 
-def test_pictures_are_not_spoilt_by_strangers(attacked: SimpleNamespace) -> None:
+def test_pictures_are_not_spoilt_by_strangers(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """Nothing that a stranger sends to the client's video port gets into the pictures: none is lost or in doubt."""
     pictures = attacked.client.table("picture")
     at_ns = pictures.ints("read_mono_ns")
     meanwhile = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
 
-    assert np.mean(meanwhile.flags("readable")) > 0.99
-    assert np.mean(meanwhile.flags("in_doubt")) < 0.05
+    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # a side that is stalled loses what strangers drown
+        assert np.mean(meanwhile.flags("readable")) > 0.99
+        assert np.mean(meanwhile.flags("in_doubt")) < 0.05
 
 
-def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace) -> None:
+def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """The counters of both sides tell of the datagrams and messages that were refused."""
     server, client = attacked.server, attacked.client
     at_the_server = sum(
         counted(server, name) for name in ("feedback_from_strangers", "path_malformed", "path_wrong_token")
     )
 
-    assert at_the_server > 0.9 * DATAGRAMS
-    assert counted(client, "datagrams_from_strangers") > 0.9 * 2 * DATAGRAMS
-    assert counted(server, "probes_refused") > 0.9 * DATAGRAMS
-    assert counted(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
-    assert counted(server, "session_requests_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
     netem = counted(server, "netem_requests_unreadable") + counted(server, "netem_requests_screened_out")
-    assert netem > 0.9 * ROUNDS * GARBAGE_PER_ROUND
+    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # the sockets of a side that is stalled overflow
+        assert at_the_server > 0.9 * DATAGRAMS
+        assert counted(client, "datagrams_from_strangers") > 0.9 * 2 * DATAGRAMS
+        assert counted(server, "probes_refused") > 0.9 * DATAGRAMS
+        assert counted(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
+        assert counted(server, "session_requests_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
+        assert netem > 0.9 * ROUNDS * GARBAGE_PER_ROUND
 
 
 def test_no_stranger_gets_video(attacked: SimpleNamespace) -> None:
@@ -215,10 +232,11 @@ def test_no_stranger_gets_video(attacked: SimpleNamespace) -> None:
     assert attacked.received == 0
 
 
-def test_ctrl_c_ends_both_sides_in_order(attacked: SimpleNamespace) -> None:
+def test_ctrl_c_ends_both_sides_in_order(attacked: SimpleNamespace, stalls: Stalls) -> None:
     """SIGINT in the middle of a drive ends `lavt server` and `lavt client` soon, with 0 and with complete records."""
     assert attacked.codes == [0, 0]
-    assert max(attacked.took_s.values()) < ENDED_WITHIN_S
+    with stalls.judging(attacked.ended_ns, stall_ms=LONG_STALL_MS):
+        assert max(attacked.took_s.values()) < ENDED_WITHIN_S
     assert attacked.server.complete
     assert attacked.client.complete
     assert counted(attacked.server, "record_overflow") == 0

@@ -3,10 +3,12 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
@@ -34,10 +36,10 @@ SLOW_MPS = 2.5
 FAST_MPS = 8.0
 """Nearly the 30 km/h that the controller keeps."""
 AT_ALL_MPS = 0.5
-AGAIN_S = 20.0
+AGAIN_S = 60.0
 """Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
 MARGIN_S = 0.5
-"""For brakes that build up and a machine that is busy."""
+"""For brakes that build up."""
 LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
 LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
 """The client hears 75 ms late that the vehicle has stopped: until then it commands on under the old epoch."""
@@ -111,6 +113,11 @@ class Drive:
             process.end()
             self.codes[name] = process.popen.returncode
 
+    @cached_property
+    def record(self) -> Record:
+        """Return what the server recorded, once it has ended."""
+        return read_record(self.work / "server" / "server.mcap")
+
 
 def what_the_network_does(drive: Drive) -> None:
     relay = drive.loop.relay
@@ -123,23 +130,32 @@ def what_the_network_does(drive: Drive) -> None:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
+def drives(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan, stalls: Stalls) -> Shared[Drive]:
     """One drive with all outages, one after the other, the server's death last."""
-    work = tmp_path_factory.mktemp("outages")
-    with Processes(work) as processes:
-        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
-        drive.start()
-        what_the_network_does(drive)
-        drive.reach(FAST_MPS)
-        drive.kill("client killed", drive.client)
-        drive.start_another_client()
-        drive.reach(SLOW_MPS)
-        drive.suspend("client suspended", drive.client, OUTAGE_S)
-        drive.reach(AT_ALL_MPS)
-        drive.kill("server killed", drive.loop.server)
-        pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
-        drive.end()
-    return drive
+
+    def drive_with_outages() -> Drive:
+        work = tmp_path_factory.mktemp("outages")
+        with Processes(work) as processes:
+            drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
+            drive.start()
+            what_the_network_does(drive)
+            drive.reach(FAST_MPS)
+            drive.kill("client killed", drive.client)
+            drive.start_another_client()
+            drive.reach(SLOW_MPS)
+            drive.suspend("client suspended", drive.client, OUTAGE_S)
+            drive.reach(AT_ALL_MPS)
+            drive.kill("server killed", drive.loop.server)
+            pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
+            drive.end()
+        return drive
+
+    return Shared(stalls, drive_with_outages)
+
+
+@pytest.fixture
+def drive(drives: Shared[Drive]) -> Drive:
+    return drives.get()
 
 
 @pytest.fixture(scope="module")
@@ -155,14 +171,14 @@ def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planne
     return drive
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def server(drive: Drive) -> Record:
-    return read_record(drive.work / "server" / "server.mcap")
+    return drive.record
 
 
 @pytest.fixture(scope="module")
 def unguarded_server(unguarded: Drive) -> Record:
-    return read_record(unguarded.work / "server" / "server.mcap")
+    return unguarded.record
 
 
 def obeyed(record: Record) -> Table:
@@ -205,7 +221,9 @@ OUTAGES = ("router killed", "network stalled", "client killed", "client suspende
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
-def test_the_vehicle_stands_within_the_limits_of_the_design(drive: Drive, server: Record, outage: str) -> None:
+def test_the_vehicle_stands_within_the_limits_of_the_design(
+    drive: Drive, server: Record, stalls: Stalls, outage: str
+) -> None:
     """500 ms after the last fresh command comes the safe stop, and with 4 m/s2 standstill: 2.6 s from 30 km/h."""
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     truth = server.table("truth")
@@ -215,7 +233,9 @@ def test_the_vehicle_stands_within_the_limits_of_the_design(drive: Drive, server
     stands = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
     stopping_s = (at_ns[stands][0] - stop.mono_ns) / NS_PER_S
 
-    assert STOP_AFTER_NS <= silence_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
+    assert silence_ns >= STOP_AFTER_NS
+    with stalls.judging(stop.mono_ns - silence_ns, stop.mono_ns):
+        assert silence_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
     assert stopping_s <= speed_at_stop_mps / STOP_MPS2 + MARGIN_S
 
 
@@ -255,17 +275,19 @@ def test_a_server_that_obeys_everything_would_obey_what_is_stale(
     assert stale(unguarded_server, stop) > 0
 
 
-def test_what_was_recorded_before_a_process_died_can_be_read(drive: Drive, server: Record) -> None:
+def test_what_was_recorded_before_a_process_died_can_be_read(drive: Drive, server: Record, stalls: Stalls) -> None:
     """The record of a side that was killed is not complete, and reaches to within half a second of its end."""
     first_client = read_record(drive.work / "client" / "client.mcap")
 
     for record, died in ((server, "server killed"), (first_client, "client killed")):
         last_ns = max(int(table.mono_ns.max()) for table in record.tables.values())
+        died_ns = drive.broken[died].mono_ns
         assert not record.complete
-        assert abs(last_ns - drive.broken[died].mono_ns) < NS_PER_S // 2
+        with stalls.judging(died_ns - NS_PER_S, died_ns):
+            assert abs(last_ns - died_ns) < NS_PER_S // 2
 
 
-def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive) -> None:
+def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive, stalls: Stalls) -> None:
     """When the server is gone the client brakes after 300 ms, asks for a stop after 2.5 s, and ends on Ctrl-C."""
     record = read_record(drive.work / "client-2" / "client.mcap")
     last_ns = int(record.table("lane").mono_ns.max())
@@ -277,12 +299,13 @@ def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive)
 
     assert drive.codes["client"] == 0
     assert record.complete
-    assert len(braking) > 50
-    assert np.all(braking.floats("brake") >= 0.6)
-    assert np.all(braking.floats("throttle") == 0)
-    assert set(braking.texts("mode")) == {"drive"}
-    assert len(stopping) > 20
-    assert set(stopping.texts("mode")) == {"stop"}
+    with stalls.judging(last_ns, last_ns + ASK_FOR_STOP_AFTER_NS + NS_PER_S):
+        assert len(braking) > 50
+        assert np.all(braking.floats("brake") >= 0.6)
+        assert np.all(braking.floats("throttle") == 0)
+        assert set(braking.texts("mode")) == {"drive"}
+        assert len(stopping) > 20
+        assert set(stopping.texts("mode")) == {"stop"}
 
 
 def test_ctrl_c_leaves_complete_records(unguarded: Drive, unguarded_server: Record) -> None:

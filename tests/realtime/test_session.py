@@ -7,12 +7,15 @@ import signal
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from pydantic import BaseModel
+from tests.realtime.conftest import LONG_STALL_MS
+from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
@@ -24,7 +27,7 @@ from lavt.experiment.sides import client_config, server_config
 
 Wait = Callable[[str, Callable[[], bool], float], None]
 
-BEGINS_S = 40.0
+BEGINS_S = 90.0
 """Programs start, routers find each other, a client asks, arms and speeds up: about 10 s on a quiet machine."""
 HELD = "held by operator-1, and the vehicle is not disarmed at standstill"
 ASKS = "operator-2 asks for the vehicle; SIGUSR2 hands it over"
@@ -40,6 +43,12 @@ def free_port(kind: socket.SocketKind) -> int:
 def status(process: Process) -> dict[str, Any]:
     told: dict[str, Any] = process.latest.get("status", {})
     return told
+
+
+def says(process: Process, text: str) -> bool:
+    """Return whether one of the lines that were not looked at yet says it."""
+    lines = [process._first.get() for _ in range(process._first.qsize())]
+    return any(text in (line or {}).get("said", []) for line in lines)
 
 
 @dataclass
@@ -100,42 +109,58 @@ class Session:
         self.codes[process.name] = process.popen.returncode
         self.seen[f"last of {process.name}"] = process.last_line()
 
+    @cached_property
+    def record(self) -> Record:
+        """Return what the server recorded, once it has ended."""
+        return read_record(self.work / "server" / "server.mcap")
+
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Callable[..., PlannedRun]) -> Session:
+def sessions(
+    tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Callable[..., PlannedRun], stalls: Stalls
+) -> Shared[Session]:
     """One vehicle that goes from client to client."""
-    work = tmp_path_factory.mktemp("session")
-    with Processes(work) as processes:
-        drive = Session(processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed"))
-        first = drive.client("first", "operator-1")
-        drive.seen["first without a router"] = first.said()
-        server = drive.server()
-        drive.routers()
-        drive.reach(server, first, 2.0)
 
-        waiting = drive.client("waiting", "operator-2")
-        wait_until("it is told", lambda: status(waiting).get("session") == HELD, BEGINS_S)
-        drive.seen["waiting"], drive.seen["server while it waits"] = status(waiting), status(server)
-        drive.end(waiting)
+    def pass_on() -> Session:
+        work = tmp_path_factory.mktemp("session")
+        with Processes(work) as processes:
+            drive = Session(processes, work, wait_until, planned("vehicle.scenery=none", "controller.preset=designed"))
+            first = drive.client("first", "operator-1")
+            drive.seen["first without a router"] = first.said()
+            server = drive.server()
+            drive.routers()
+            drive.reach(server, first, 2.0)
 
-        second = drive.client("second", "operator-2", "--take-over")
-        wait_until("the holder is told", lambda: ASKS in first.latest.get("said", []), BEGINS_S)
-        wait_until("the server tells it", lambda: status(server).get("asked_by") == "operator-2", 2.0)
-        drive.seen["asked"] = status(server)
-        first.popen.send_signal(signal.SIGUSR2)
-        drive.reach(server, second, 1.0)
-        drive.seen["handed over"], drive.seen["first, then"] = status(server), status(first)
+            waiting = drive.client("waiting", "operator-2")
+            wait_until("it is told", lambda: status(waiting).get("session") == HELD, BEGINS_S)
+            drive.seen["waiting"], drive.seen["server while it waits"] = status(waiting), status(server)
+            drive.end(waiting)
 
-        drive.end(second)
-        wait_until("nobody holds it", lambda: status(server).get("holder") == "", 5.0)
-        drive.end(server)
-        drive.end(first)
-    return drive
+            second = drive.client("second", "operator-2", "--take-over")
+            wait_until("the holder is told", lambda: says(first, ASKS), BEGINS_S)
+            wait_until("the server tells it", lambda: status(server).get("asked_by") == "operator-2", BEGINS_S)
+            drive.seen["asked"] = status(server)
+            first.popen.send_signal(signal.SIGUSR2)
+            drive.reach(server, second, 1.0)
+            drive.seen["handed over"], drive.seen["first, then"] = status(server), status(first)
+
+            drive.end(second)
+            wait_until("nobody holds it", lambda: status(server).get("holder") == "", BEGINS_S)
+            drive.end(server)
+            drive.end(first)
+        return drive
+
+    return Shared(stalls, pass_on)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
+def session(sessions: Shared[Session]) -> Session:
+    return sessions.get()
+
+
+@pytest.fixture
 def server(session: Session) -> Record:
-    return read_record(session.work / "server" / "server.mcap")
+    return session.record
 
 
 def event_ns(record: Record, detail: str) -> int:
@@ -161,20 +186,26 @@ def test_a_second_client_is_told_who_holds_the_vehicle(session: Session) -> None
     assert session.codes["waiting"] == 0
 
 
-def test_the_holder_hands_over_to_who_asks(session: Session, server: Record) -> None:
+def test_the_holder_hands_over_to_who_asks(session: Session, server: Record, stalls: Stalls) -> None:
     """Asked and then told by SIGUSR2, the holder releases; the vehicle stops, and who asked arms and drives it."""
     assert (session.seen["asked"]["holder"], session.seen["asked"]["asked_by"]) == ("operator-1", "operator-2")
     assert session.seen["handed over"]["holder"] == "operator-2"
     assert (session.seen["first, then"]["phase"], session.seen["first, then"]["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release by operator-1 granted")
     assert event_ns(server, "driving -> safe_stop: the client released the vehicle") >= released_ns
-    assert 0 <= event_ns(server, "hold by operator-2 granted") - released_ns < 2 * NS_PER_S
+    held_ns = event_ns(server, "hold by operator-2 granted")
+    assert held_ns >= released_ns
+    with stalls.judging(released_ns, held_ns, stall_ms=LONG_STALL_MS):
+        assert held_ns - released_ns < 2 * NS_PER_S
 
 
-def test_ctrl_c_of_the_holder_frees_the_vehicle(session: Session, server: Record) -> None:
+def test_ctrl_c_of_the_holder_frees_the_vehicle(session: Session, server: Record, stalls: Stalls) -> None:
     """Within a second after Ctrl-C the vehicle is released and stopping; the client says so and has ended with 0."""
     released_ns = event_ns(server, "release by operator-2 granted")
-    assert 0 < released_ns - session.at_ns["second told to end"] < NS_PER_S
+    told_ns = session.at_ns["second told to end"]
+    assert told_ns < released_ns
+    with stalls.judging(told_ns, released_ns, stall_ms=LONG_STALL_MS):
+        assert released_ns - told_ns < NS_PER_S
     assert session.seen["last of second"]["said"][-1] == "the client ends; the vehicle is released"
     assert session.codes["second"] == 0
 
@@ -187,7 +218,9 @@ def test_a_server_ends_with_its_vehicle_stopped(session: Session, server: Record
     assert server.complete
 
 
-def test_a_client_whose_server_is_gone_ends_soon(session: Session) -> None:
+def test_a_client_whose_server_is_gone_ends_soon(session: Session, stalls: Stalls) -> None:
     """Ctrl-C ends a client that holds nothing, and whose server has ended, with 0 and without waiting for anybody."""
     assert session.codes["first"] == 0
-    assert session.at_ns["first ended"] - session.at_ns["first told to end"] < 3 * NS_PER_S
+    told_ns, ended_ns = session.at_ns["first told to end"], session.at_ns["first ended"]
+    with stalls.judging(told_ns, ended_ns, stall_ms=LONG_STALL_MS):
+        assert ended_ns - told_ns < 3 * NS_PER_S

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import Any
 
 import pytest
 from tests.support.stalls import TRIES, HostStalled, ProbeEnded, Stalls, inconclusive_too_often
@@ -58,12 +57,8 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Note in the report whether the host stalled; a report of another process has no exception any more."""
     report = yield
-    noted: dict[str, Any] = {
-        "host_stalled": call.excinfo is not None and isinstance(call.excinfo.value, HostStalled),
-        "uses_stalls": "stalls" in getattr(item, "fixturenames", ()),
-    }
-    vars(report).update(noted)
-    if report.uses_stalls and report.when == "call":
+    vars(report)["host_stalled"] = call.excinfo is not None and isinstance(call.excinfo.value, HostStalled)
+    if report.when == "call":
         item.config.stash[SESSION].tests.add(item.nodeid)
     return report
 

@@ -16,10 +16,11 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -181,6 +182,8 @@ class Stalls:
     processor_times: Callable[[], str] = read_processor_times
     recorded: list[Stall] = field(default_factory=list)
     clock: MachineClock = field(default_factory=MachineClock)
+    excused: int = 0
+    """How many failures the record has excused so far."""
 
     def __post_init__(self) -> None:
         self._before = self.processor_times()
@@ -221,20 +224,40 @@ class Stalls:
         stalls = self.during(since_ns, until_ns, at_least_ms=stall_ms)
         if not stalls:
             return AssertionError(said)
+        self.excused += 1
         return HostStalled(f"{described(stalls, since_ns)}; {said}")
 
-    def require_share(self, ok: object, said: str, since_ns: int, until_ns: int, *, share: float) -> None:
-        """Raise AssertionError unless `ok`; `HostStalled` where a processor was stalled for this share of the time.
+    def share_verdict(self, said: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
+        """Return what to raise for a rate or a median, which one stall does not explain but a share of the time does.
 
-        For rates and medians, which one stall does not explain.
+        It is the share of the processor that was stalled longest.
         """
-        if ok:
-            return
         stalls = self.during(since_ns, until_ns)
         stalled = stalled_share(stalls, since_ns, until_ns)
         if stalled < share:
-            raise AssertionError(said)
-        raise HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {said}")
+            return AssertionError(said)
+        self.excused += 1
+        return HostStalled(f"{stalled:.1%} of the time, {described(stalls, since_ns)}; {said}")
+
+    @contextmanager
+    def judging(
+        self, since_ns: int, until_ns: int | None = None, *, stall_ms: float = STALL_MS, share: float | None = None
+    ) -> Iterator[None]:
+        """Excuse an assertion on times that fails inside, by one stall or, with `share`, by a share of the time.
+
+        The time that counts ends now where no end is given. Assertions on safety stay outside.
+        """
+        try:
+            yield
+        except AssertionError as failed:
+            end_ns = self.clock.now().mono_ns if until_ns is None else until_ns
+            if share is None:
+                verdict = self.verdict(str(failed), since_ns, end_ns, stall_ms=stall_ms)
+            else:
+                verdict = self.share_verdict(str(failed), since_ns, end_ns, share=share)
+            if isinstance(verdict, AssertionError):
+                raise
+            raise verdict from None
 
     def idle_share(self) -> float:
         """Return which share of the time since the start the processors were idle."""
@@ -261,15 +284,20 @@ class Stalls:
             probe.end()
 
 
-def again_where_stalled(attempt: Callable[[], Result]) -> Result:
-    """Return what an attempt returns; make it again, at most twice, where the host stalled.
+class Shared(Generic[Result]):
+    """What several tests judge, such as a drive: made again, at most twice, after the host stalled one of them."""
 
-    For fixtures that many tests share: raises `HostStalledEachTime`, which makes all of them inconclusive at once.
-    """
-    said: list[str] = []
-    for _ in range(TRIES):
-        try:
-            return attempt()
-        except HostStalled as stalled:
-            said.append(str(stalled))
-    raise HostStalledEachTime(" | ".join(said))
+    def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
+        self._stalls, self._make = stalls, make
+        self._made: list[Result] = []
+        self._left, self._excused = TRIES, 0
+
+    def get(self) -> Result:
+        """Return what was made last, made anew where the record has excused a failure since."""
+        if self._left and not (self._made and self._excused == self._stalls.excused):
+            self._left -= 1
+            self._made[:] = [self._make()]
+            self._excused = self._stalls.excused
+        if not self._made:
+            raise HostStalledEachTime("the host stalled each attempt to make what this test judges")
+        return self._made[0]
