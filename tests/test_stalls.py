@@ -201,10 +201,14 @@ from tests.test_stalls import {probe}
 
 pytest_plugins = ["tests.support.inconclusive"]
 
+def pytest_configure(config):
+    config.addinivalue_line("markers", "judges_times: of the project")
+
 @pytest.fixture(scope="session")
 def stalls(request):
     times = iter([{before!r}, {after!r}])
-    request.config.stash[SESSION].stalls = Stalls([{probe}()], lambda: next(times))
+    stalls = request.config.stash[SESSION].stalls = Stalls([{probe}()], lambda: next(times))
+    return stalls
 
 @pytest.fixture
 def stalled_fixture(stalls):
@@ -237,6 +241,30 @@ def test_stalled_in_setup(stalled_fixture):
 
 def test_without_the_fixture():
     assert tries == [1, 1, 2, 2, 2, 3]
+"""
+JUDGED = """
+import pytest
+from tests.support.stalls import Stall
+
+late = []
+
+@pytest.mark.judges_times(stall_ms=40)
+def test_stalled_once(request):
+    stalls = request.getfixturevalue("stalls")
+    if not late:
+        now_ns = stalls.clock.now().mono_ns
+        stalls.recorded.append(Stall(0, now_ns, now_ns + 41_000_000))
+        late.append(1)
+        assert False, "late"
+    stalls.recorded.clear()
+
+@pytest.mark.judges_times(stall_ms=40)
+def test_fault():
+    late.append(2)
+    assert False, "broken"
+
+def test_tries():
+    assert late == [1, 2]
 """
 FAULTS = """
 from tests.support.stalls import HostStalled
@@ -294,6 +322,12 @@ def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytes
         "INCONCLUSIVE *::test_stalled_in_setup: *HostStalled: in its setup",
         "HOST *; the machine was 10% idle; 3 of 6 tests inconclusive",
     ])  # fmt: skip
+
+
+def test_a_test_that_judges_times_is_excused_by_a_stall_while_it_ran(pytester: pytest.Pytester) -> None:
+    """A marked test is run again where a stall overlaps it, and fails at once where none does."""
+    result = run_inner(pytester, JUDGED)
+    assert result.parseoutcomes() == {"passed": 2, "failed": 1, "rerun": 1}
 
 
 def test_a_fault_fails_at_once_whatever_else_was_stalled(pytester: pytest.Pytester) -> None:

@@ -496,6 +496,7 @@ def test_certificates(tmp_path: Path) -> None:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_a_kit_on_its_bus(tmp_path: Path) -> None:
     """With a by-wire kit the doctor listens to its bus, sends nothing, and says what hinders driving."""
     pytest.importorskip("can")

@@ -125,6 +125,7 @@ def start() -> Iterator[Start]:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_it_reports_and_tells_the_truth(start: Start) -> None:
     """Ready, it sends the kit's reports at their periods, tells the truth, and ends with 0 and its counts on Ctrl-C."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
@@ -181,6 +182,8 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
+@pytest.mark.timeout(60)
 @pytest.mark.parametrize("generation", [1, 2])
 def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
     """It obeys commands of another process, tells what it does, and brakes when the commands stop."""

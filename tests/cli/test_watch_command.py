@@ -23,7 +23,7 @@ from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp, write_stamp
 from lavt.transport.stamp_check import LEARNED_AFTER
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.judges_times]
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 128, 96, 30
 ENDS_S = 60.0

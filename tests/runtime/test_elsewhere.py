@@ -125,6 +125,7 @@ def rig() -> Iterator[Rig]:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_a_node_elsewhere_hears_and_is_heard() -> None:
     """Messages reach the node with their time of arrival; what it tells reaches neighbours, links and the record."""
     with rig() as both:
@@ -177,6 +178,7 @@ def test_the_end_of_the_other_process_is_noticed() -> None:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_a_node_that_fails_elsewhere_ends_the_run_here() -> None:
     """What broke in the node's process is why the server's runtime failed."""
     with rig() as both:

@@ -78,6 +78,7 @@ def start() -> tuple[RealRuntime, Ticker, Kept]:
     return runtime, node, kept
 
 
+@pytest.mark.judges_times
 def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
     """A node wakes within 20 ms in the median, hears what is delivered, sends over its link; stop ends its thread."""
     runtime, node, kept = start()

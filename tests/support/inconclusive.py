@@ -1,9 +1,10 @@
 """Hooks of pytest: a test that the host stalled is run again, at most twice, and then it is inconclusive.
 
-`tests/conftest.py` loads this as a plugin. Every test that uses the fixture
-`stalls`, directly or through another fixture, is run again after `HostStalled` and after nothing else: any other
-exception fails it, also one that was raised while a `HostStalled` was handled. A session in which too many tests were
-inconclusive on an idle machine fails, and so does one whose probes did not last.
+`tests/conftest.py` loads this as a plugin. A test may use the fixture `stalls`, directly or through another fixture; one
+whose assertions are all on times has the marker `judges_times` instead, with the arguments of `Stalls.judging`. Both are
+run again after `HostStalled` and after nothing else: any other exception fails the test, also one that was raised while a
+`HostStalled` was handled. A session in which too many tests were inconclusive on an idle machine fails, and so does one
+whose probes did not last.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from tests.support.stalls import TRIES, HostStalled, ProbeEnded, Stalls, inconcl
 AGAIN = pytest.mark.flaky(reruns=TRIES - 1, rerun_except="^(?!HostStalled:)")
 """pytest-rerunfailures searches "type: message" of the exception itself, not of those it was raised from."""
 INCONCLUSIVE = "inconclusive"
+JUDGES_TIMES = "judges_times"
 
 
 @dataclass
@@ -45,10 +47,25 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let tests that use the fixture be run again."""
+    """Let tests that use the fixture be run again; those that judge times use it."""
     for item in items:
-        if "stalls" in getattr(item, "fixturenames", ()):
+        names: list[str] = getattr(item, "fixturenames", [])
+        if item.get_closest_marker(JUDGES_TIMES) and "stalls" not in names:
+            names.append("stalls")
+        if "stalls" in names:
             item.add_marker(AGAIN)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    """Excuse an assertion of a test that judges times where the host stalled while it ran."""
+    marker = item.get_closest_marker(JUDGES_TIMES)
+    if marker is None:
+        return (yield)
+    measured = item.config.stash[SESSION].stalls
+    assert measured is not None
+    with measured.judging(measured.clock.now().mono_ns, **marker.kwargs):
+        return (yield)
 
 
 @pytest.hookimpl(wrapper=True)

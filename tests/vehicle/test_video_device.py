@@ -74,6 +74,7 @@ def test_a_picture_is_given_once(tmp_path: Path, opens: Opens) -> None:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_a_picture_that_is_late_by_a_little_is_waited_for(tmp_path: Path, opens: Opens) -> None:
     """Who asks waits for a quarter of the period: some questions, one right after the other, see the next picture."""
     camera = opens(write_video(tmp_path / "slow.avi", rate_hz=2.0), rate_hz=2.0)
@@ -85,6 +86,7 @@ def test_a_picture_that_is_late_by_a_little_is_waited_for(tmp_path: Path, opens:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_pictures_that_come_just_when_they_are_asked_for_are_not_missed(tmp_path: Path, opens: Opens) -> None:
     """Asked at its own rate, at the very moment when its pictures come, a camera gives one for nearly each question."""
     camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
@@ -100,6 +102,7 @@ def test_pictures_that_come_just_when_they_are_asked_for_are_not_missed(tmp_path
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_pictures_come_in_order_and_the_newest_is_given(tmp_path: Path, opens: Opens) -> None:
     """Who asks after a while gets the last picture that came; those between are counted as replaced."""
     camera = opens(write_video(tmp_path / "fast.avi", rate_hz=60.0), rate_hz=60.0)
@@ -116,6 +119,7 @@ def test_pictures_come_in_order_and_the_newest_is_given(tmp_path: Path, opens: O
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times
 def test_a_file_is_played_at_its_own_pace_over_and_over(tmp_path: Path, opens: Opens) -> None:
     """From picture to picture of a file goes its period (median), the first follows the last, and nothing is lost."""
     camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
