@@ -2,14 +2,15 @@
 
 A test belongs to the lane of its folder (`tests/field`, `tests/interop`, `tests/kernel`, `tests/realtime`); elsewhere
 to `full` or `realtime` where it is marked so, and to `quick` otherwise. `python -m pytest` runs `quick`;
-`python -m tests.lanes` runs all of them.
+`python -m tests.lanes` runs all of them, `python -m tests.lanes NAME...` some.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 TESTS = Path(__file__).resolve().parent
@@ -74,11 +75,23 @@ def say(text: str) -> None:
     sys.stdout.flush()
 
 
+def chosen(names: Sequence[str]) -> list[Lane]:
+    """Return the lanes of some names, to run one after the other in this order; all lanes where none is named."""
+    alone = {lane.name: replace(lane, meanwhile=None) for lane in (*LANES, FULL)}
+    return [alone[name] for name in names] if names else list(LANES)
+
+
 def main() -> int:
-    """Run all lanes."""
+    """Run all lanes, or those named."""
     from tests.support.lane_runner import run_lanes
 
-    return run_lanes(LANES, tell=say)
+    parser = argparse.ArgumentParser(prog="python -m tests.lanes", description="Run the lanes of tests.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="linters, quick, full, ...; all where none is given")
+    names = parser.parse_args().names
+    known = [lane.name for lane in (*LANES, FULL)]
+    if unknown := [name for name in names if name not in known]:
+        parser.error(f"there is no lane {unknown[0]!r}: name some of {', '.join(known)}")
+    return run_lanes(chosen(names), tell=say)
 
 
 if __name__ == "__main__":

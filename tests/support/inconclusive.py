@@ -1,10 +1,10 @@
 """Hooks of pytest: a test that the host stalled is run again, at most twice, and then it is inconclusive.
 
-`tests/conftest.py` loads this as a plugin. A test may use the fixture `stalls`, directly or through another fixture; one
-whose assertions are all on times has the marker `judges_times` instead, with the arguments of `Stalls.judging`. Both are
-run again after `HostStalled` and after nothing else: any other exception fails the test, also one that was raised while a
-`HostStalled` was handled. A session in which too many tests were inconclusive on an idle machine fails, and so does one
-whose probes did not last.
+`tests/conftest.py` loads this as a plugin. A test may use the fixture `stalls`, directly or through another one; a test
+whose assertions are all on times has the marker `judges_times`, with the arguments of `Stalls.judging`. Both are run
+again after `HostStalled` and after nothing else: any other exception fails the test, also one that was raised while a
+`HostStalled` was handled. A session in which too many tests were inconclusive on an idle machine fails, and so does
+one whose probes did not last.
 """
 
 from __future__ import annotations
