@@ -22,7 +22,7 @@ CLIENT = ("configs/client.yaml", f"video.server={VEHICLE}", "controller.rearm=tr
 BOTH = ("record.video=false",)
 OUTSIDE = Path(__file__).with_name("outside.py")
 POLL_NS = 20 * NS_PER_MS
-AGAIN_S = 30.0
+AGAIN_S = 90.0
 """Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
 
 

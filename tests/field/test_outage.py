@@ -17,6 +17,7 @@ import pytest
 from tests.field.counting import Measured, measure, table
 from tests.field.driving import TCP, Drive, driven
 from tests.field.namespaces import Field, Way, plain_field
+from tests.support.stalls import Stalls
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_S
@@ -37,15 +38,19 @@ LONG_S = (1.0, 3.0, 10.0)
 AWAY_S = 3.0
 SPEED_MPS = 5.0
 HELD_UP_S = 0.15
-"""What a busy machine adds to one time; the median is to be nearer."""
+"""What other programs add to one time; the median is to be nearer."""
 NEARLY_S = 0.03
 UNHEARD = 0.05
-"""So much of what the server obeyed may have been dropped on its way to the process outside, on a busy machine."""
+"""So much of what the server obeyed may have been dropped on its way to the process outside."""
 MARGIN_S = 0.5
-"""For brakes that build up and a machine that is busy."""
+"""For brakes that build up."""
+LONG_STALL_MS = 100
 AGAIN_S = 10.0
 """From the end of an outage until the vehicle is driven again; 1.0 s of it is arming."""
+AGAIN_NS = round(AGAIN_S * NS_PER_S)
 USUALLY_AGAIN_S = 3.0
+BUSY_SHARE = 0.05
+"""A host that takes this share of a drive moves the medians of its times."""
 
 SHORT = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in WAYS)
 LONG = tuple(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in WAYS)
@@ -68,6 +73,11 @@ class Driven:
 
     work: Path
     rows: dict[str, Measured]
+
+
+def begin_ns(row: Measured, after_s: float = 0.0) -> int:
+    """Return the time of an outage's begin, or some seconds later."""
+    return row.outage.begin.mono_ns + round(after_s * NS_PER_S)
 
 
 @pytest.fixture(scope="module")
@@ -129,22 +139,26 @@ def kept_and_unguarded(field: Field, tmp_path_factory: pytest.TempPathFactory, t
 
 
 @pytest.mark.parametrize("outage", STOPPING)
-def test_silence_leads_to_degraded_and_to_a_safe_stop_in_time(all_outages: Driven, outage: str) -> None:
+def test_silence_leads_to_degraded_and_to_a_safe_stop_in_time(all_outages: Driven, stalls: Stalls, outage: str) -> None:
     """300 ms after the last command from a newer picture the vehicle is degraded, 200 ms later it stops for safety."""
     row = all_outages.rows[outage]
     degraded_s, stop_s = row.silence_s
 
-    assert DEGRADED_AFTER_S <= degraded_s <= DEGRADED_AFTER_S + HELD_UP_S
-    assert STOP_AFTER_S <= stop_s <= STOP_AFTER_S + HELD_UP_S
+    assert degraded_s >= DEGRADED_AFTER_S
+    assert stop_s >= STOP_AFTER_S
+    with stalls.judging(begin_ns(row), begin_ns(row, STOP_AFTER_S + HELD_UP_S)):
+        assert degraded_s <= DEGRADED_AFTER_S + HELD_UP_S
+        assert stop_s <= STOP_AFTER_S + HELD_UP_S
 
 
-def test_the_stop_counts_from_the_outage_whatever_is_broken(all_outages: Driven) -> None:
+def test_the_stop_counts_from_the_outage_whatever_is_broken(all_outages: Driven, stalls: Stalls) -> None:
     """Whatever breaks, the vehicle is degraded 0.3 s and in its safe stop 0.5 s after that, in the median."""
     rows = [all_outages.rows[outage] for outage in STOPPING]
 
-    assert median(row.to_degraded_s or 0.0 for row in rows) <= DEGRADED_AFTER_S + NEARLY_S
-    assert median(row.to_safe_stop_s or 0.0 for row in rows) <= STOP_AFTER_S + NEARLY_S
-    assert median(row.silence_s[1] for row in rows) <= STOP_AFTER_S + NEARLY_S
+    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], AGAIN_S), share=BUSY_SHARE):
+        assert median(row.to_degraded_s or 0.0 for row in rows) <= DEGRADED_AFTER_S + NEARLY_S
+        assert median(row.to_safe_stop_s or 0.0 for row in rows) <= STOP_AFTER_S + NEARLY_S
+        assert median(row.silence_s[1] for row in rows) <= STOP_AFTER_S + NEARLY_S
 
 
 @pytest.mark.parametrize("outage", STOPPING)
@@ -157,48 +171,57 @@ def test_the_vehicle_stands_in_time(all_outages: Driven, outage: str) -> None:
     assert row.stopping_s <= row.stopped_from_mps / STOP_MPS2 + MARGIN_S
 
 
-def test_an_outage_of_300_ms_is_driven_through(all_outages: Driven) -> None:
+def test_an_outage_of_300_ms_is_driven_through(all_outages: Driven, stalls: Stalls) -> None:
     """What is away for 0.3 s brings degraded at most, mostly, and then the drive goes on at once.
 
     Where commands were lost, QUIC, which is beneath the routers' link, may hold the next ones back until it has probed.
     """
-    through = [row for name in SHORT if (row := all_outages.rows[name]).to_safe_stop_s is None]
+    rows = [all_outages.rows[name] for name in SHORT]
+    through = [row for row in rows if row.to_safe_stop_s is None]
 
-    assert len(through) >= len(SHORT) / 2
-    assert all((row.to_driving_s or 0.0) < MARGIN_S for row in through)
+    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], AGAIN_S)):
+        assert len(through) >= len(SHORT) / 2
+        assert all((row.to_driving_s or 0.0) < MARGIN_S for row in through)
 
 
 @pytest.mark.parametrize("outage", [*STOPPING, SERVER])
-def test_the_drive_goes_on_by_itself(all_outages: Driven, outage: str) -> None:
+def test_the_drive_goes_on_by_itself(all_outages: Driven, stalls: Stalls, outage: str) -> None:
     """When the outage is over, a client that may arm again drives again: video, session, state and control are back."""
-    assert 0 < (all_outages.rows[outage].to_driving_s or 0.0) <= AGAIN_S
+    row = all_outages.rows[outage]
+
+    assert row.to_driving_s is not None
+    with stalls.judging(row.outage.end.mono_ns, row.outage.end.later(AGAIN_NS).mono_ns, stall_ms=LONG_STALL_MS):
+        assert 0 < row.to_driving_s <= AGAIN_S
 
 
-def test_the_drive_goes_on_soon(all_outages: Driven) -> None:
+def test_the_drive_goes_on_soon(all_outages: Driven, stalls: Stalls) -> None:
     """In the median the vehicle is driven again within 3 s of the outage's end, a second of arming among them."""
-    again_s = [all_outages.rows[outage].to_driving_s or 0.0 for outage in (*STOPPING, SERVER)]
+    rows = [all_outages.rows[outage] for outage in (*STOPPING, SERVER)]
 
-    assert median(again_s) <= USUALLY_AGAIN_S
+    with stalls.judging(begin_ns(rows[0]), begin_ns(rows[-1], AGAIN_S), share=BUSY_SHARE):
+        assert median(row.to_driving_s or 0.0 for row in rows) <= USUALLY_AGAIN_S
 
 
 @pytest.mark.parametrize("outage", ALL)
-def test_nothing_stale_is_obeyed(all_outages: Driven, outage: str) -> None:
+def test_nothing_stale_is_obeyed(all_outages: Driven, stalls: Stalls, outage: str) -> None:
     """Of what the process outside heard as stale, nothing is obeyed; and it has heard what was obeyed."""
     row = all_outages.rows[outage]
 
     assert row.stale_obeyed == 0
-    assert row.obeyed_unheard <= row.obeyed * UNHEARD
     assert row.obeyed > 20
+    with stalls.judging(begin_ns(row), row.outage.end.later(AGAIN_NS).mono_ns):
+        assert row.obeyed_unheard <= row.obeyed * UNHEARD
 
 
 @pytest.mark.parametrize("outage", KEEPING)
-def test_nothing_stale_is_obeyed_where_the_link_kept_it(kept: Driven, outage: str) -> None:
+def test_nothing_stale_is_obeyed_where_the_link_kept_it(kept: Driven, stalls: Stalls, outage: str) -> None:
     """Commands that a link kept through an outage come to the vehicle stale, and none of them is obeyed."""
     row = kept.rows[outage]
 
     assert row.stale_heard > 0
     assert row.stale_obeyed == 0
-    assert row.obeyed_unheard <= row.obeyed * UNHEARD
+    with stalls.judging(begin_ns(row), row.outage.end.later(AGAIN_NS).mono_ns):
+        assert row.obeyed_unheard <= row.obeyed * UNHEARD
 
 
 @pytest.mark.parametrize("outage", KEEPING)
@@ -207,14 +230,16 @@ def test_a_server_without_its_checks_obeys_what_is_stale(kept_and_unguarded: Dri
     assert kept_and_unguarded.rows[outage].stale_obeyed > 0
 
 
-def test_all_this_is_at_full_rate(all_outages: Driven) -> None:
+def test_all_this_is_at_full_rate(all_outages: Driven, stalls: Stalls) -> None:
     """The client sends a command at least every 20 ms, and the server a picture 30 times a second, in the median."""
     client = read_record(all_outages.work / "client-1" / "client.mcap")
     server = read_record(all_outages.work / "server-1" / "server.mcap")
-    between_commands_s = np.diff(client.table("control").mono_ns) / NS_PER_S
+    commands_ns = client.table("control").mono_ns
+    between_commands_s = np.diff(commands_ns) / NS_PER_S
     between_frames_s = np.diff(server.table("frame").ints("stamped_mono_ns")) / NS_PER_S
     between_pictures_s = np.diff(client.table("picture").mono_ns) / NS_PER_S
 
-    assert np.median(between_commands_s) <= 0.021
-    assert np.median(between_frames_s) == pytest.approx(1 / 30, abs=0.003)
-    assert np.median(between_pictures_s) == pytest.approx(1 / 30, abs=0.005)
+    with stalls.judging(int(commands_ns[0]), int(commands_ns[-1]), share=BUSY_SHARE):
+        assert np.median(between_commands_s) <= 0.021
+        assert np.median(between_frames_s) == pytest.approx(1 / 30, abs=0.003)
+        assert np.median(between_pictures_s) == pytest.approx(1 / 30, abs=0.005)

@@ -19,6 +19,7 @@ from tests.field.counting import transitions
 from tests.field.driving import CLOUD, Links, driven, through_rendezvous
 from tests.field.namespaces import INTERNET, NEXT_OPERATOR, OPERATOR, VEHICLE, Field, nat_field
 from tests.field.secured import make_keys
+from tests.support.stalls import Stalls
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_S, Now
@@ -36,8 +37,10 @@ UNINVITED_S = 1.0
 """Within one kernel a datagram that gets through is there at once."""
 SPEED_MPS = 5.0
 WHILE_S = 3.0
+WHILE_NS = round(WHILE_S * NS_PER_S)
 ANEW_S = 3.0
 """From a change of the address to video on the new one: the client asks 0.15 s after its last packet."""
+STALL_MS = 100
 AGAIN_S = 10.0
 """From there until the vehicle is driven again, where it has stopped meanwhile."""
 
@@ -170,27 +173,29 @@ def test_behind_nat_nobody_is_reached_uninvited(field: Field, way: str) -> None:
             closed.recvfrom(100)
 
 
-def test_everything_passes_two_nats_and_a_cloud(routed: Routed) -> None:
+def test_everything_passes_two_nats_and_a_cloud(routed: Routed, stalls: Stalls) -> None:
     """Video, commands, state, clock probe and session all work, and at their rates."""
     admissions = routed.before(routed.server, "admission")
 
-    assert per_second(routed.before(routed.client, "picture")) >= 25
-    assert admissions.texts("verdict").count("obeyed") / WHILE_S >= 45
-    assert per_second(routed.before(routed.client, "state")) >= 45
-    assert per_second(routed.before(routed.client, "clock_probe")) >= 1.5
+    with stalls.judging(routed.changed.later(-WHILE_NS).mono_ns, routed.changed.mono_ns, stall_ms=STALL_MS):
+        assert per_second(routed.before(routed.client, "picture")) >= 25
+        assert admissions.texts("verdict").count("obeyed") / WHILE_S >= 45
+        assert per_second(routed.before(routed.client, "state")) >= 45
+        assert per_second(routed.before(routed.client, "clock_probe")) >= 1.5
     assert len(routed.client.table("session_reply")) > 0
     states = [each.after for each in transitions(routed.server) if each.at.mono_ns < routed.changed.mono_ns]
     assert states[-2:] == ["arming", "driving"]
-    assert set(states[:-2]) <= {"arming", "disarmed"}  # a machine that is held up while arming begins anew
+    assert set(states[:-2]) <= {"arming", "disarmed"}  # arming begins anew where the host stalled
 
 
-def test_a_client_whose_address_changes_keeps_its_video(routed: Routed) -> None:
+def test_a_client_whose_address_changes_keeps_its_video(routed: Routed, stalls: Stalls) -> None:
     """Within 3 s the video comes to the new address and no more to the old one, at its full rate."""
     pictures = routed.after(routed.client, "picture")
     last = pictures.where(pictures.mono_ns > routed.ended.mono_ns - WHILE_S * NS_PER_S)
 
-    assert longest_gap_s(routed, "picture") <= ANEW_S
-    assert per_second(last) >= 25
+    with stalls.judging(routed.changed.mono_ns, routed.ended.mono_ns, stall_ms=STALL_MS):
+        assert longest_gap_s(routed, "picture") <= ANEW_S
+        assert per_second(last) >= 25
     assert routed.to_old_before > 0
     assert routed.to_old == routed.to_old_soon
     assert routed.to_new > 100
@@ -199,7 +204,7 @@ def test_a_client_whose_address_changes_keeps_its_video(routed: Routed) -> None:
 def test_only_a_new_proof_moves_the_video(routed: Routed) -> None:
     """Pictures come to the new address after the client has said hello and answered a challenge from there.
 
-    Before, it does so only where a machine that was held up left it without pictures.
+    Before, it does so only where a stall of the host left it without pictures.
     """
     heard, said = routed.after(routed.server, "feedback"), routed.after(routed.server, "rtp")
     hello_ns = first_ns(heard, HELLO_BYTES)
@@ -215,22 +220,23 @@ def test_only_a_new_proof_moves_the_video(routed: Routed) -> None:
     assert np.sum(pictures_ns > answer_ns) > 100
 
 
-def test_a_drive_goes_on_after_a_change_of_address(routed: Routed) -> None:
+def test_a_drive_goes_on_after_a_change_of_address(routed: Routed, stalls: Stalls) -> None:
     """State, clock probe and commands go on too, and a vehicle that has stopped meanwhile is armed again and driven."""
     changes = [
         each for each in transitions(routed.server) if routed.changed.mono_ns < each.at.mono_ns < routed.ended.mono_ns
     ]
 
-    assert longest_gap_s(routed, "state") <= AGAIN_S
-    assert longest_gap_s(routed, "clock_probe") <= AGAIN_S
-    assert not changes or changes[-1].after == "driving"
-    assert not changes or changes[-1].at.mono_ns - routed.changed.mono_ns <= AGAIN_S * NS_PER_S
+    with stalls.judging(routed.changed.mono_ns, routed.ended.mono_ns, stall_ms=STALL_MS):
+        assert longest_gap_s(routed, "state") <= AGAIN_S
+        assert longest_gap_s(routed, "clock_probe") <= AGAIN_S
+        assert not changes or changes[-1].after == "driving"
+        assert not changes or changes[-1].at.mono_ns - routed.changed.mono_ns <= AGAIN_S * NS_PER_S
     assert "obeyed" in routed.after(routed.server, "admission").texts("verdict")[-20:]
 
 
 @pytest.mark.parametrize("way", ["rendezvous"], indirect=True)
 def test_a_vehicle_whose_address_changes_keeps_its_video(
-    field: Field, links: Links, tmp_path: Path, tell: Callable[[str], None]
+    field: Field, links: Links, tmp_path: Path, tell: Callable[[str], None], stalls: Stalls
 ) -> None:
     """The rendezvous finds the vehicle at its new address, and pictures come again within 3 s, at their full rate."""
     with driven(field, tmp_path, links) as drive:
@@ -245,5 +251,6 @@ def test_a_vehicle_whose_address_changes_keeps_its_video(
     tell(f"the vehicle's address changed: {gap:.2f} s without pictures")
 
     last = (pictures.mono_ns > ended.mono_ns - WHILE_S * NS_PER_S) & (pictures.mono_ns < ended.mono_ns)
-    assert gap <= ANEW_S
-    assert per_second(pictures.where(last)) >= 25
+    with stalls.judging(changed.mono_ns, ended.mono_ns, stall_ms=STALL_MS):
+        assert gap <= ANEW_S
+        assert per_second(pictures.where(last)) >= 25
