@@ -23,6 +23,7 @@ from lavt.transport.zenoh_link import CONTROL
 
 PHASE_NS = 5 * NS_PER_S
 FLOOD_PER_S = 10_000
+LONGEST_S = 90.0
 BURST = 50
 SIGNATURE_BYTES = 64
 
@@ -105,8 +106,8 @@ def drive(work: Path, keys: Path) -> Drive:
     clock = MachineClock()
     with Processes(work) as processes:
         insider, server, client = start_secure_loop(processes, work, keys)
-        wait(clock, lambda: server.latest.get("status", {}).get("safety") == "driving", 30.0)
-        wait(clock, lambda: len(insider.commands) > 50 and len(insider.states) > 50, 10.0)
+        wait(clock, lambda: server.latest.get("status", {}).get("safety") == "driving", LONGEST_S)
+        wait(clock, lambda: len(insider.commands) > 50 and len(insider.states) > 50, LONGEST_S)
         attacks: dict[str, tuple[Callable[[], None], int]] = {
             "quiet": (lambda: None, 20 * NS_PER_MS),
             "repeated": (insider.repeat, 100 * NS_PER_MS),

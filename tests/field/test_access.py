@@ -31,6 +31,7 @@ from tests.field.secured import (
     tls_changes,
 )
 from tests.require import need
+from tests.support.stalls import Shared, Stalls
 
 from lavt.control.limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -58,6 +59,9 @@ MAY = [("operator-1", DRIVES), ("operator-2", set()), ("monitor-1", WATCHES)]
 OPEN_SITES = 3
 """So many sites without the lists are attacked at most."""
 NOBODY = 65534
+LONG_STALL_MS = 100
+BUSY_SHARE = 0.05
+"""A host that takes this share of a drive moves the medians of its times."""
 CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
     "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
 )
@@ -280,10 +284,20 @@ def test_local_process_with_rights(direct_site: Site) -> None:
 
 
 @pytest.fixture(scope="module")
-def attacked_drive(keys: Path, tmp_path_factory: pytest.TempPathFactory) -> attacked.Drive:
+def attacked_drives(keys: Path, tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[attacked.Drive]:
     """A drive with the secure configs, quiet at first, and then under one attack after the other."""
     pytest.importorskip("pylibsrtp")
-    return attacked.drive(tmp_path_factory.mktemp("attacked"), keys)
+    return Shared(stalls, lambda: attacked.drive(tmp_path_factory.mktemp("attacked"), keys))
+
+
+@pytest.fixture
+def attacked_drive(attacked_drives: Shared[attacked.Drive]) -> attacked.Drive:
+    return attacked_drives.get()
+
+
+def whole(drive: attacked.Drive) -> tuple[int, int]:
+    """Return when the quiet phase began and the last attack ended."""
+    return drive.phases["quiet"][0], drive.phases["flood"][1]
 
 
 def counted(record: Record, name: str) -> int:
@@ -309,7 +323,7 @@ def said(table: Table, *names: str) -> list[tuple[Any, ...]]:
     return list(zip(*(table.objects(name) for name in ("epoch", *names)), strict=True))
 
 
-def test_only_what_the_operator_said_is_obeyed(attacked_drive: attacked.Drive) -> None:
+def test_only_what_the_operator_said_is_obeyed(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """Every command obeyed is one that the client sent, as it sent it, and none is obeyed twice, in any attack."""
     commands = obeyed(attacked_drive)
     by_the_client = set(said(attacked_drive.client.table("control"), *SAID))
@@ -317,22 +331,24 @@ def test_only_what_the_operator_said_is_obeyed(attacked_drive: attacked.Drive) -
 
     assert set(done) <= by_the_client
     assert len(set(said(commands, "sequence"))) == len(commands)
-    for name in attacked_drive.phases:
-        assert np.sum(during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
+    for name, phase in attacked_drive.phases.items():
+        with stalls.judging(*phase, stall_ms=LONG_STALL_MS):
+            assert np.sum(during(attacked_drive, name, commands.ints("received_mono_ns"))) > 150
 
 
-def test_what_was_forged_is_counted(attacked_drive: attacked.Drive) -> None:
+def test_what_was_forged_is_counted(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """Repeated, altered and forged commands came in their thousands, and were refused and counted."""
     server = attacked_drive.server
-    assert attacked_drive.sent["repeated"] > 1000
-    assert attacked_drive.sent["flood"] > 0.5 * attacked.FLOOD_PER_S * attacked.PHASE_NS / NS_PER_S
-    assert counted(server, "commands_forged") > 500
-    assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent["flood"]
-    assert counted(server, "session_requests_of_another_time") > 10
-    assert counted(server, "refused: not newer than the last command") > 100
+    with stalls.judging(*whole(attacked_drive), stall_ms=LONG_STALL_MS):
+        assert attacked_drive.sent["repeated"] > 1000
+        assert attacked_drive.sent["flood"] > 0.5 * attacked.FLOOD_PER_S * attacked.PHASE_NS / NS_PER_S
+        assert counted(server, "commands_forged") > 500
+        assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent["flood"]
+        assert counted(server, "session_requests_of_another_time") > 10
+        assert counted(server, "refused: not newer than the last command") > 100
 
 
-def test_only_what_the_vehicle_said_is_shown(attacked_drive: attacked.Drive) -> None:
+def test_only_what_the_vehicle_said_is_shown(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """Every state that reached the client's driver is one that the server told; what else came was counted."""
     names = ("sent_wall_ns", "state_mono_ns", "speed_mps", "safety", "applied_sequence")
     told, shown = (
@@ -342,22 +358,24 @@ def test_only_what_the_vehicle_said_is_shown(attacked_drive: attacked.Drive) -> 
 
     assert set(shown) <= set(told)
     assert len(set(shown)) == len(shown)
-    assert len(shown) > 0.9 * len(told) - 100
-    assert counted(attacked_drive.client, "states_replayed") > 100
-    assert counted(attacked_drive.client, "states_forged") > 100
+    with stalls.judging(*whole(attacked_drive), stall_ms=LONG_STALL_MS):
+        assert len(shown) > 0.9 * len(told) - 100
+        assert counted(attacked_drive.client, "states_replayed") > 100
+        assert counted(attacked_drive.client, "states_forged") > 100
 
 
-def test_the_drive_goes_on_under_every_attack(attacked_drive: attacked.Drive) -> None:
+def test_the_drive_goes_on_under_every_attack(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """From the first second of the attacks to the last the vehicle is driven, and never stopped."""
     events = attacked_drive.server.table("event")
-    began_ns, ended_ns = attacked_drive.phases["quiet"][0], attacked_drive.phases["flood"][1]
+    began_ns, ended_ns = whole(attacked_drive)
     meanwhile = events.where((events.ints("mono_ns") > began_ns) & (events.ints("mono_ns") < ended_ns))
 
-    assert attacked_drive.last_status["safety"] == "driving"
-    assert not [detail for detail in meanwhile.texts("detail") if "stop" in detail]
+    with stalls.judging(began_ns, ended_ns, stall_ms=LONG_STALL_MS):
+        assert attacked_drive.last_status["safety"] == "driving"
+        assert not [detail for detail in meanwhile.texts("detail") if "stop" in detail]
 
 
-def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive) -> None:
+def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """Ten thousand commands a second, known by their codes alone, cost a period in the median at most."""
     sent_ns = dict(
         zip(
@@ -373,4 +391,5 @@ def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive) -> 
     )
     quiet, flood = (np.median(delays_ms[during(attacked_drive, name, received_ns)]) for name in ("quiet", "flood"))
 
-    assert flood - quiet < COMMAND_PERIOD_MS, f"{quiet:.2f} ms, and under the flood {flood:.2f} ms"
+    with stalls.judging(*attacked_drive.phases["flood"], share=BUSY_SHARE):
+        assert flood - quiet < COMMAND_PERIOD_MS, f"{quiet:.2f} ms, and under the flood {flood:.2f} ms"
