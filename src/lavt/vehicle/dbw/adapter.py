@@ -64,8 +64,6 @@ class Adapter:
         self._asked_ns: int | None = None
         self._plan: Plan | None = None
         """What the last set said; None: nothing is being said."""
-        self._sent_asked: Asked | None = None
-        """What was asked when the last set was made."""
         self._is_late = False
         self._told: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
@@ -184,7 +182,7 @@ class Adapter:
         is_new = plan != self._plan
         if not is_new and now_ns < self._due_ns(asked):
             return []
-        self._plan, self._sent_asked = plan, asked
+        self._plan = plan
         self._is_shifting |= plan.gear == "drive"
         frames = self._sender.frames(plan, asked, self._reports.wheel_deg, now_ns)
         self._expect_echo(plan)
@@ -197,8 +195,7 @@ class Adapter:
         """Tell when the next set is due: soon where it brings something new."""
         if self._state == "clearing":
             return self._sender.sent_ns + CLEARING_PERIOD_NS
-        is_behind = asked != self._sent_asked or asked != self._sender.sent
-        return self._sender.sent_ns + (LEAST_GAP_NS if is_behind else PERIOD_NS)
+        return self._sender.sent_ns + (PERIOD_NS if asked == self._sender.sent else LEAST_GAP_NS)
 
     def _planned(self) -> Plan | None:
         """Give what each state says to the kit."""
