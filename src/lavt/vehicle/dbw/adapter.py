@@ -69,6 +69,8 @@ class Adapter:
         self._events: list[VehicleEvent] = []
         self._echoes: deque[tuple[int, int]] = deque()
         """Steering commands sent and not yet seen in a report: in its steps, and when they were asked for."""
+        self._expected: int | None = None
+        """The steering command of the last set, in its steps; None: it had none."""
         self._reached: list[Reached] = []
         self._counts: Counter[str] = Counter()
         self._seen = self._situation(start_ns)
@@ -239,12 +241,14 @@ class Adapter:
     def _expect_echo(self, plan: Plan) -> None:
         if "steering" not in plan.enabled or self._asked_ns is None:
             self._echoes.clear()
+            self._expected = None
             return
         while self._echoes and self._asked_ns - self._echoes[0][1] > ECHO_LIMIT_NS:
             self._echoes.popleft()
         number = round(self._sender.sent.wheel_deg / self._profile.command_step_deg)
-        if number != (self._echoes[-1][0] if self._echoes else self._reports.command):
+        if number != (self._reports.command if self._expected is None else self._expected):
             self._echoes.append((number, self._asked_ns))
+        self._expected = number
 
     def _echo(self, now_ns: int) -> None:
         """Find the newest report's command among those sent; those before it were overtaken."""
