@@ -11,8 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.offset import DRIFT_ALLOWANCE, Exchanges, Offset, by_probe, by_sources, exchanges
-from lavt.experiment.table import Table, table_of
+from lavt.experiment.offset import (
+    DRIFT_ALLOWANCE,
+    NO_OFFSET,
+    Exchanges,
+    Offset,
+    by_probe,
+    by_sources,
+    exchanges,
+    follows,
+    known_samples,
+)
+from lavt.experiment.table import MISSING, Table, table_of
 
 TRUE_NS = 1_790_000_000 * NS_PER_S
 Ahead = Callable[[int], int]
@@ -46,6 +56,33 @@ def slewed(offset_ms: float, ppm: float, from_s: float, until_s: float) -> Ahead
     return lambda at_ns: round(
         offset_ms * NS_PER_MS + (np.clip(at_ns / NS_PER_S, from_s, until_s) - from_s) * ppm * 1000
     )
+
+
+def rows_of(rows: list[dict[str, Any]]) -> Table:
+    return table_of(rows, [0] * len(rows), [0] * len(rows))
+
+
+def test_an_offset_by_hand() -> None:
+    """Delta is linear between moments and constant outside of them; its bound is linear too, and grows outside."""
+    times_ns = np.array([0, 100, 200])
+    offset = Offset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
+    at_ns = TRUE_NS + np.array([-20, 0, 3, 50, 99, 100, 200, 260])
+    assert offset.at(at_ns).tolist() == [10, 10, 11, 20, 30, 30, 20, 20]
+    assert offset.bound_at(at_ns).tolist() == pytest.approx([14.0, 4.0, 4.12, 6.0, 7.96, 8.0, 6.0, 36.0])
+
+
+def test_a_missing_time_stays_missing() -> None:
+    """Times of the client become times of the server by Delta at their own moments; a missing one stays missing."""
+    offset = Offset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
+    client_ns = np.array([TRUE_NS, MISSING, TRUE_NS + 100])
+    assert offset.on_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
+
+
+def test_one_clock_has_no_offset() -> None:
+    """Hosts that share a clock have a Delta of 0 with a bound of 0 at every time."""
+    at_ns = np.array([0, TRUE_NS])
+    assert NO_OFFSET.at(at_ns).tolist() == [0, 0]
+    assert NO_OFFSET.bound_at(at_ns).tolist() == [0.0, 0.0]
 
 
 def test_drifting_clocks() -> None:
@@ -108,6 +145,121 @@ def test_one_source_is_not_enough(lacking: str) -> None:
     assert by_sources(of["server"], of["client"]) is None
 
 
+@pytest.mark.parametrize("follower", ["client", "server"])
+@pytest.mark.parametrize(
+    ("path", "bound_ms"),
+    [
+        ({"peer_delay_s": 0.4, "peer_dispersion_s": 0.1}, 2.0),
+        ({}, 2.0),
+        ({"peer_delay_s": 0.001, "peer_dispersion_s": 0.0, "skew_ppm": 0.0, "age_s": 0.0}, 0.5),
+        ({"follows": "10.0.0.9", "peer_delay_s": 0.001, "peer_dispersion_s": 0.0}, 5.0),
+    ],
+)
+def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[str, Any], bound_ms: float) -> None:
+    """The bound is the follower's: of the path, or its own where that is less or the only one; else it is the sum."""
+    own = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
+    tables = {
+        "client": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
+        "server": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
+        follower: samples(drifting(0, 0), addresses=None, **own),
+    }
+    offset = by_sources(tables["server"], tables["client"])
+    assert offset is not None
+    assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([bound_ms] * 30)
+
+
+def test_following_is_by_any_address_of_the_other() -> None:
+    """A host follows the other where its source has an address of the other, in whichever sample that was recorded."""
+    other = rows_of([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
+    sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
+    assert follows(rows_of([{"follows": each} for each in sources]), other).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
+    """A clock steered by 1 % for a second has a bound of 10 ms in that second and beside it, and more by asking."""
+    server = samples(slewed(0, 10_000, 10, 11), asking_s=0.1)
+    offset = by_sources(server, samples(drifting(0, 0)))
+    assert offset is not None
+    expected_ms = [0.002, 10.002, 10.502, 10.502, 0.002]
+    assert (offset.bound_ns[8:13] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
+    assert offset.bound_ns[[0, -1]].max() / NS_PER_MS == pytest.approx(0.002)
+
+
+def test_steering_in_the_last_interval_is_in_the_bound() -> None:
+    """A clock steered by 1 % in the last second has a bound of 10 ms there, and in the second before."""
+    offset = by_sources(samples(slewed(0, 10_000, 28, 40)), samples(drifting(0, 0)))
+    assert offset is not None
+    expected_ms = [0.002, 10.002, 10.002, 10.002]
+    assert (offset.bound_ns[-4:] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
+
+
+def test_three_samples_show_steering_and_two_do_not() -> None:
+    """Where a clock has two samples only nothing shows that it was steered; the third shows it."""
+    for seconds, bound_ms in ((2, 0.002), (3, 10.002)):
+        server = samples(slewed(0, 10_000, 1, 2), seconds=seconds)
+        offset = by_sources(server, samples(drifting(0, 0), seconds=seconds))
+        assert offset is not None
+        assert offset.bound_ns.max() / NS_PER_MS == pytest.approx(bound_ms, abs=1e-3)
+
+
+def test_only_what_both_hosts_know_counts() -> None:
+    """Delta has the moments of both hosts' samples from the later beginning to the earlier end, these included."""
+    offset = by_sources(samples(drifting(0, 0), seconds=20), samples(drifting(0, 0), begin_ms=5500))
+    assert offset is not None
+    times_ms = ((offset.client_wall_ns - TRUE_NS) // NS_PER_MS).tolist()
+    assert times_ms == list(range(5500, 19001, 500))
+    apart = by_sources(samples(drifting(0, 0), seconds=5), samples(drifting(0, 0), begin_ms=10_000))
+    assert apart is None
+
+
+@pytest.mark.parametrize(
+    ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
+)
+def test_outside_of_the_samples_delta_changes_twice_as_fast(
+    first_ppm: float, middle_ppm: float, last_ppm: float
+) -> None:
+    """Outside of its moments the bound grows twice as fast as Delta changed at the faster of its two ends."""
+    values_ns = [0.0, *np.cumsum([first_ppm, middle_ppm, middle_ppm, last_ppm]) * 1000]
+    rows = [
+        {"wall_ns": TRUE_NS + second * NS_PER_S - round(at_ns), "correction_s": at_ns / NS_PER_S, "bound_s": 0.0}
+        for second, at_ns in enumerate(values_ns)
+    ]
+    for table in (rows, rows[::-1]):
+        offset = by_sources(rows_of(table), samples(drifting(0, 0), seconds=5))
+        assert offset is not None
+        assert offset.delta_ns.tolist() == pytest.approx([-each for each in values_ns], abs=1)
+        assert offset.outside == pytest.approx(20e-6, rel=0.01)
+
+
+def test_outside_of_one_sample_clocks_may_drift_as_any() -> None:
+    """One moment does not say how fast Delta changes: any drift is allowed for; two say it."""
+    server = drifting(0, 10)
+    for seconds, expected in ((1, DRIFT_ALLOWANCE), (2, 20e-6)):
+        offset = by_sources(samples(server, seconds=seconds), samples(drifting(0, 0), seconds=seconds))
+        assert offset is not None
+        assert offset.outside == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("known", "first"),
+    [("11", 0), ("01", 1), ("0011", 2), ("10", None), ("101", None), ("0101", None), ("00", None), ("", None)],
+)
+@pytest.mark.parametrize("lacking", [{"correction_s": None}, {"wall_ns": None}])
+def test_samples_count_from_the_first_that_is_known(known: str, first: int | None, lacking: dict[str, Any]) -> None:
+    """Samples count from the first on that has its correction and its time; where one is lacking later none counts."""
+    rows = [
+        {"wall_ns": index, "correction_s": 0.5, **({} if each == "1" else lacking)} for index, each in enumerate(known)
+    ]
+    found = known_samples(rows_of(rows)).ints("wall_ns").tolist()
+    assert found == ([] if first is None else list(range(first, len(known))))
+
+
 def probed(
     client: Ahead, server: Ahead, ways_ms: Callable[[int], tuple[float, float]], *, seconds: int = 30
 ) -> Exchanges:
@@ -149,6 +301,78 @@ def test_the_exchange_that_says_most_counts() -> None:
     between_ns = DRIFT_ALLOWANCE * NS_PER_S / 4
     expected = [100_000 + between_ns, 100_000 + DRIFT_ALLOWANCE * 2 * NS_PER_S + between_ns]
     assert offset.bound_at(at_ns).tolist() == pytest.approx(expected, rel=0.01)
+
+
+def exchange(client_ns: int, half_ns: int, delta_ns: int) -> dict[str, Any]:
+    """Make an exchange around a time of the client's that says a Delta; the server takes 100 ns."""
+    received_ns = client_ns + delta_ns - 50
+    return {
+        "sent_wall_ns": client_ns - 50 - half_ns,
+        "received_wall_ns": received_ns,
+        "answered_wall_ns": received_ns + 100,
+        "arrived_wall_ns": client_ns + 50 + half_ns,
+    }
+
+
+NAMES = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
+
+
+def test_an_exchange_by_hand() -> None:
+    """An exchange is in the middle of its times on either clock; its round trip is without the server's part."""
+    row = dict(zip(NAMES, (TRUE_NS, TRUE_NS + 4300, TRUE_NS + 4400, TRUE_NS + 301), strict=True))
+    found = exchanges(rows_of([row]))
+    assert (found.client_wall_ns - TRUE_NS).tolist() == [150]
+    assert (found.server_wall_ns - TRUE_NS).tolist() == [4350]
+    assert (found.delta_ns.tolist(), found.round_trip_ns.tolist()) == ([4199.5], [201])
+
+
+def test_exchanges_are_put_in_order_and_whole_ones_count() -> None:
+    """Exchanges are ordered by the client's clock; one that lacks a time, or took less than none, does not count."""
+    good = [exchange(TRUE_NS + second * NS_PER_S, half_ns, 7) for second, half_ns in ((3, 10), (1, 0), (2, 10))]
+    bad = [{**good[0], name: None} for name in NAMES]
+    found = exchanges(rows_of([*good, *bad, exchange(TRUE_NS, -1, 7)]))
+    assert ((found.client_wall_ns - TRUE_NS) // NS_PER_S).tolist() == [1, 2, 3]
+    assert found.round_trip_ns.tolist() == [0, 20, 20]
+    assert found.delta_ns.tolist() == [7.0, 7.0, 7.0]
+
+
+def test_exchanges_of_an_interval() -> None:
+    """An interval of the server's clock has the exchanges from its first nanosecond to its last."""
+    found = exchanges(rows_of([exchange(1000 * number, 10, 50_000) for number in range(1, 6)]))
+    within = found.within(52_000, 54_000)
+    assert within.client_wall_ns.tolist() == [2000, 3000, 4000]
+    assert len(within) == 3
+    assert len(found.within(52_001, 53_999)) == 1
+
+
+def test_delta_by_the_probe_by_hand() -> None:
+    """The shortest exchange counts before and after its time, with 500 ppm of drift up to there and half of the gap."""
+    rows = [
+        exchange(TRUE_NS + at_ms * NS_PER_MS, half_us * 1000, delta_us * 1000)
+        for at_ms, half_us, delta_us in ((0, 200, 1), (100, 50, 2), (300, 400, 3), (10_300, 400, 4))
+    ]
+    offset = by_probe(exchanges(rows_of(rows)))
+    assert offset is not None
+    assert (offset.client_wall_ns - TRUE_NS).tolist() == [each * NS_PER_MS for each in (0, 100, 300, 10_300)]
+    assert (offset.delta_ns / 1000).tolist() == [2.0, 2.0, 2.0, 4.0]
+    assert (offset.bound_ns / 1000).tolist() == pytest.approx([100 + 25, 50 + 50, 150 + 2500, 400 + 2500])
+    assert offset.outside == DRIFT_ALLOWANCE
+
+
+def test_one_exchange_says_delta_to_half_its_round_trip() -> None:
+    """Where there is one exchange its Delta counts, and half its round trip."""
+    offset = by_probe(exchanges(rows_of([exchange(TRUE_NS, 300, 9000)])))
+    assert offset is not None
+    assert (offset.delta_ns.tolist(), offset.bound_ns.tolist()) == ([9000.0], [300.0])
+
+
+def test_of_two_exchanges_that_say_as_much_the_earlier_counts() -> None:
+    """Between two exchanges that bound Delta alike the one before counts."""
+    gap_ns, half_ns = 100 * NS_PER_MS, 1000
+    rows = [exchange(TRUE_NS + gap_ns * index, half, index) for index, half in enumerate((half_ns, 900_000, half_ns))]
+    offset = by_probe(exchanges(rows_of(rows)))
+    assert offset is not None
+    assert offset.delta_ns.tolist() == [0.0, 0.0, 2.0]
 
 
 def test_a_time_far_from_any_exchange_is_known_less() -> None:
