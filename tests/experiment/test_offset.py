@@ -199,6 +199,33 @@ def test_steering_in_the_last_interval_is_in_the_bound() -> None:
     assert (offset.bound_ns[-4:] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
 
 
+def stepwise(ppm: list[float]) -> list[dict[str, Any]]:
+    """Make the samples of a host whose correction changes at another rate in each second."""
+    values_ns = [0.0, *np.cumsum(ppm) * 1000]
+    return [
+        {"wall_ns": TRUE_NS + second * NS_PER_S - round(at_ns), "correction_s": at_ns / NS_PER_S, "bound_s": 0.0}
+        for second, at_ns in enumerate(values_ns)
+    ]
+
+
+def test_each_second_has_the_bound_of_its_own_steering() -> None:
+    """The bound at a time is that of the second which begins there, in the first and the last second too."""
+    server = rows_of(stepwise([15_000, 20_000, 0, 20_000, 15_000]))
+    offset = by_sources(server, samples(drifting(0, 0), seconds=6, bound_s=0.0))
+    assert offset is not None
+    assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([5, 20, 20, 20, 5, 5], abs=1e-3)
+
+
+def test_two_samples_of_one_time() -> None:
+    """A sample that is there twice changes nothing."""
+    rows = stepwise([10.0, 20.0])
+    offsets = [by_sources(rows_of(each), samples(drifting(0, 0), seconds=3)) for each in (rows, rows + rows[1:2])]
+    assert offsets[0] is not None
+    assert offsets[1] is not None
+    assert offsets[1].delta_ns.tolist() == offsets[0].delta_ns.tolist()
+    assert np.isfinite(offsets[1].bound_ns).all()
+
+
 def test_three_samples_show_steering_and_two_do_not() -> None:
     """Where a clock has two samples only nothing shows that it was steered; the third shows it."""
     for seconds, bound_ms in ((2, 0.002), (3, 10.002)):
@@ -218,6 +245,24 @@ def test_only_what_both_hosts_know_counts() -> None:
     assert apart is None
 
 
+def test_moments_are_on_the_clients_wall_clock() -> None:
+    """Where both hosts sampled at the same times the moments of Delta are the client's wall times, to a nanosecond."""
+    client = samples(lambda at_ns: 250 * NS_PER_MS + at_ns // 3_000_001)
+    offset = by_sources(samples(drifting(0, 0)), client)
+    assert offset is not None
+    assert offset.client_wall_ns.tolist() == client.ints("wall_ns").tolist()
+
+
+def test_samples_that_know_nothing_do_not_count() -> None:
+    """Delta begins with the first samples that know their correction; of a host that loses it no Delta is known."""
+    rows = [{"wall_ns": TRUE_NS + at * NS_PER_S, "correction_s": 0.0, "bound_s": 0.0} for at in range(5)]
+    unknown = [{**row, "correction_s": None} for row in rows]
+    offset = by_sources(rows_of(unknown[:2] + rows[2:]), rows_of(rows))
+    assert offset is not None
+    assert offset.client_wall_ns.tolist() == [row["wall_ns"] for row in rows[2:]]
+    assert by_sources(rows_of(rows[:2] + unknown[2:3] + rows[3:]), rows_of(rows)) is None
+
+
 @pytest.mark.parametrize(
     ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
 )
@@ -225,11 +270,8 @@ def test_outside_of_the_samples_delta_changes_twice_as_fast(
     first_ppm: float, middle_ppm: float, last_ppm: float
 ) -> None:
     """Outside of its moments the bound grows twice as fast as Delta changed at the faster of its two ends."""
-    values_ns = [0.0, *np.cumsum([first_ppm, middle_ppm, middle_ppm, last_ppm]) * 1000]
-    rows = [
-        {"wall_ns": TRUE_NS + second * NS_PER_S - round(at_ns), "correction_s": at_ns / NS_PER_S, "bound_s": 0.0}
-        for second, at_ns in enumerate(values_ns)
-    ]
+    rows = stepwise([first_ppm, middle_ppm, middle_ppm, last_ppm])
+    values_ns = [row["correction_s"] * NS_PER_S for row in rows]
     for table in (rows, rows[::-1]):
         offset = by_sources(rows_of(table), samples(drifting(0, 0), seconds=5))
         assert offset is not None
@@ -301,78 +343,6 @@ def test_the_exchange_that_says_most_counts() -> None:
     between_ns = DRIFT_ALLOWANCE * NS_PER_S / 4
     expected = [100_000 + between_ns, 100_000 + DRIFT_ALLOWANCE * 2 * NS_PER_S + between_ns]
     assert offset.bound_at(at_ns).tolist() == pytest.approx(expected, rel=0.01)
-
-
-def exchange(client_ns: int, half_ns: int, delta_ns: int) -> dict[str, Any]:
-    """Make an exchange around a time of the client's that says a Delta; the server takes 100 ns."""
-    received_ns = client_ns + delta_ns - 50
-    return {
-        "sent_wall_ns": client_ns - 50 - half_ns,
-        "received_wall_ns": received_ns,
-        "answered_wall_ns": received_ns + 100,
-        "arrived_wall_ns": client_ns + 50 + half_ns,
-    }
-
-
-NAMES = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
-
-
-def test_an_exchange_by_hand() -> None:
-    """An exchange is in the middle of its times on either clock; its round trip is without the server's part."""
-    row = dict(zip(NAMES, (TRUE_NS, TRUE_NS + 4300, TRUE_NS + 4400, TRUE_NS + 301), strict=True))
-    found = exchanges(rows_of([row]))
-    assert (found.client_wall_ns - TRUE_NS).tolist() == [150]
-    assert (found.server_wall_ns - TRUE_NS).tolist() == [4350]
-    assert (found.delta_ns.tolist(), found.round_trip_ns.tolist()) == ([4199.5], [201])
-
-
-def test_exchanges_are_put_in_order_and_whole_ones_count() -> None:
-    """Exchanges are ordered by the client's clock; one that lacks a time, or took less than none, does not count."""
-    good = [exchange(TRUE_NS + second * NS_PER_S, half_ns, 7) for second, half_ns in ((3, 10), (1, 0), (2, 10))]
-    bad = [{**good[0], name: None} for name in NAMES]
-    found = exchanges(rows_of([*good, *bad, exchange(TRUE_NS, -1, 7)]))
-    assert ((found.client_wall_ns - TRUE_NS) // NS_PER_S).tolist() == [1, 2, 3]
-    assert found.round_trip_ns.tolist() == [0, 20, 20]
-    assert found.delta_ns.tolist() == [7.0, 7.0, 7.0]
-
-
-def test_exchanges_of_an_interval() -> None:
-    """An interval of the server's clock has the exchanges from its first nanosecond to its last."""
-    found = exchanges(rows_of([exchange(1000 * number, 10, 50_000) for number in range(1, 6)]))
-    within = found.within(52_000, 54_000)
-    assert within.client_wall_ns.tolist() == [2000, 3000, 4000]
-    assert len(within) == 3
-    assert len(found.within(52_001, 53_999)) == 1
-
-
-def test_delta_by_the_probe_by_hand() -> None:
-    """The shortest exchange counts before and after its time, with 500 ppm of drift up to there and half of the gap."""
-    rows = [
-        exchange(TRUE_NS + at_ms * NS_PER_MS, half_us * 1000, delta_us * 1000)
-        for at_ms, half_us, delta_us in ((0, 200, 1), (100, 50, 2), (300, 400, 3), (10_300, 400, 4))
-    ]
-    offset = by_probe(exchanges(rows_of(rows)))
-    assert offset is not None
-    assert (offset.client_wall_ns - TRUE_NS).tolist() == [each * NS_PER_MS for each in (0, 100, 300, 10_300)]
-    assert (offset.delta_ns / 1000).tolist() == [2.0, 2.0, 2.0, 4.0]
-    assert (offset.bound_ns / 1000).tolist() == pytest.approx([100 + 25, 50 + 50, 150 + 2500, 400 + 2500])
-    assert offset.outside == DRIFT_ALLOWANCE
-
-
-def test_one_exchange_says_delta_to_half_its_round_trip() -> None:
-    """Where there is one exchange its Delta counts, and half its round trip."""
-    offset = by_probe(exchanges(rows_of([exchange(TRUE_NS, 300, 9000)])))
-    assert offset is not None
-    assert (offset.delta_ns.tolist(), offset.bound_ns.tolist()) == ([9000.0], [300.0])
-
-
-def test_of_two_exchanges_that_say_as_much_the_earlier_counts() -> None:
-    """Between two exchanges that bound Delta alike the one before counts."""
-    gap_ns, half_ns = 100 * NS_PER_MS, 1000
-    rows = [exchange(TRUE_NS + gap_ns * index, half, index) for index, half in enumerate((half_ns, 900_000, half_ns))]
-    offset = by_probe(exchanges(rows_of(rows)))
-    assert offset is not None
-    assert offset.delta_ns.tolist() == [0.0, 0.0, 2.0]
 
 
 def test_a_time_far_from_any_exchange_is_known_less() -> None:
