@@ -71,6 +71,21 @@ def test_what_is_behind_follows_soon(generation: int) -> None:
         assert {later - earlier for earlier, later in pairwise(times)} == {period_ns}
 
 
+@both
+def test_without_a_tick_nothing_leaves(generation: int) -> None:
+    """Before the first tick nothing leaves, also where driving is wanted; that there was none is counted once."""
+    rig = Rig(generation, start_frames=False)
+    rig.is_ticking = False
+    rig.run_ms(400, step_ms=COARSE_MS)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(300, step_ms=COARSE_MS)
+    assert (rig.sent, rig.adapter.tick_ns) == ([], None)
+    assert rig.adapter.counts["ticks_missed"] == 1
+    rig.is_ticking = True
+    rig.run_ms(COARSE_MS, step_ms=COARSE_MS)
+    assert rig.sent
+
+
 def test_rate_of_the_kit() -> None:
     """The kit is told the greatest rate in its own steps: 452 deg/s are 113 of 4 deg/s, in both generations."""
     for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
