@@ -564,6 +564,19 @@ def test_drive_refused(generation: int) -> None:
     assert rig.kit.state.watchdog == 0
 
 
+def test_a_shift_that_was_begun_is_waited_for() -> None:
+    """Where DRIVE was asked for and is not reported the car is held for 1 s, and then let go of in PARK."""
+    known = profile("dataspeed_gen1")
+    rig = Rig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(999)
+    assert (rig.state, rig.enabled()) == ("parking", set(AXES))
+    rig.run_ms(1)
+    assert (rig.state, rig.enabled()) == ("parking", set())
+
+
 def test_park_refused() -> None:
     """Where PARK is refused the car is held by its brake, and it is said so."""
     rig = driving(1)
