@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lavt.experiment.latency import picture_age, rtp_timestamp
-from lavt.experiment.metrics import Measured, measure
-from lavt.experiment.record import read_record
+from lavt.experiment.metrics import Measured, count, driving_interval, measure
+from lavt.experiment.record import Record, read_record
 from lavt.experiment.steering import steering_reversals
 from lavt.experiment.table import Table, table_of
 from lavt.experiment.tracking import cross_track, heading, p95_by_10m, per_km, route_length_m, sampled_by_distance
@@ -27,6 +27,67 @@ def table(rows: list[dict[str, Any]]) -> Table:
     return table_of(rows, [0] * len(rows), [0] * len(rows))
 
 
+def recorded(*events: tuple[str, int, str], last_ns: int = 0, **channels: list[dict[str, Any]]) -> Record:
+    """Make a record in memory of events and further channels."""
+    named = [{"kind": kind, "mono_ns": mono_ns, "detail": detail} for kind, mono_ns, detail in events]
+    tables = {name: table(rows) for name, rows in {"event": named, **channels}.items()}
+    return Record(Path("in memory"), True, tables, {}, last_ns)
+
+
+BEGAN, ENDED = ("drive_began", 100, ""), ("ending", 200, "completed")
+
+
+@pytest.mark.parametrize(
+    ("events", "interval"),
+    [
+        ([BEGAN, ENDED], (100, 200, "completed")),
+        ([BEGAN, ENDED, ("late", 300, "60 ms")], (100, 200, "completed")),
+        ([BEGAN, ("collision", 150, "a tree"), ENDED], (100, 200, "completed")),
+        ([BEGAN, ("drive_began", 120, ""), ENDED], (100, 200, "completed")),
+        ([BEGAN, ENDED, ("ending", 210, "aborted")], (100, 200, "completed")),
+        ([("ending", 90, "aborted"), BEGAN, ENDED], (100, 200, "completed")),
+        ([BEGAN], (100, 500, None)),
+        ([("ending", 90, "aborted"), BEGAN], (100, 500, None)),
+        ([ENDED], (501, 500, None)),
+        ([("late", 300, "60 ms")], (501, 500, None)),
+        ([], (501, 500, None)),
+    ],
+)
+def test_the_drive_is_from_its_first_event_to_its_ending(
+    events: list[tuple[str, int, str]], interval: tuple[int, int, str | None]
+) -> None:
+    """The drive is from the first `drive_began` to the first `ending` after it; without these it is open or empty."""
+    assert driving_interval(recorded(*events, last_ns=500)) == interval
+
+
+def test_what_happens_at_the_edges_of_the_drive_counts() -> None:
+    """A collision that ends the drive counts, as does what happens when it begins; what is outside does not."""
+    collisions = [("collision", at_ns, "a tree") for at_ns in (99, 100, 150, 200, 201)]
+    invasions = [("lane_invasion", at_ns, "left") for at_ns in (99, 100, 200, 201, 202)]
+    truth = [{"mono_ns": at_ns, "progress_m": progress_m, "cross_track_m": 1.0 if 100 <= at_ns <= 200 else 9.0}
+        for at_ns, progress_m in ((99, 0.0), (100, 10.0), (150, 20.0), (200, 30.0), (201, 90.0))]  # fmt: skip
+    server = recorded(BEGAN, *collisions, *invasions, ENDED, truth=truth)
+    entry = measure(server, recorded()).entry
+    assert (entry["collisions"], entry["lane_invasions"]) == (3, 2)
+    assert (entry["distance_m"], entry["max_m"]) == (20.0, 1.0)
+    assert entry["collisions_per_km"] == pytest.approx(3 / 0.02)
+    assert entry["lane_invasions_per_km"] == pytest.approx(2 / 0.02)
+    assert entry["ending"] == "completed"
+
+
+def test_a_drive_of_no_time_is_a_drive() -> None:
+    """A drive that ended in the moment in which it began took 0 s; where nothing was driven there is no duration."""
+    assert measure(recorded(BEGAN, ("ending", 100, "aborted")), recorded()).entry["duration_s"] == 0.0
+    assert measure(recorded(last_ns=100), recorded()).entry["duration_s"] is None
+
+
+def test_the_last_known_count_is_given() -> None:
+    """Of a counter the last value that was recorded is given, None where none ever was."""
+    record = recorded(counts=[{"late": 1}, {"late": 5}, {"other": 9}])
+    assert (count(record, "late"), count(record, "other"), count(record, "neither")) == (5, 9, None)
+    assert count(recorded(), "late") is None
+
+
 def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Path) -> None:
     """With clocks 250 ms apart and drifting by 20 ppm, tau_v, tau_c and the loop come out as they were made."""
     entry = measured(make_run, tmp_path).entry
@@ -34,6 +95,7 @@ def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Pat
         assert entry[name]["p50"] == pytest.approx(p50_ms, abs=MICROSECOND_MS)
         assert entry[name]["p5"] == pytest.approx(p50_ms - spread_ms, abs=MICROSECOND_MS)
         assert entry[name]["p95"] == pytest.approx(p50_ms + spread_ms, abs=MICROSECOND_MS)
+    assert entry["delta"]["ms"] == pytest.approx(250.0, abs=0.2)
 
 
 def test_the_offset_between_the_clocks_matters(make_run: MakeRun, tmp_path: Path) -> None:
@@ -72,6 +134,32 @@ def test_the_parts_of_the_loop_make_the_whole(make_run: MakeRun, tmp_path: Path)
     closure_ms = measured(make_run, tmp_path).closure_p95_ms
     assert closure_ms is not None
     assert closure_ms < MICROSECOND_MS
+
+
+def test_what_is_missing_between_the_parts_and_the_whole_has_no_sign(make_run: MakeRun, tmp_path: Path) -> None:
+    """A client whose clock loses 1 % finds 30 of its 3000 us missing, which is how far the parts are from the whole."""
+    closure_ms = measured(make_run, tmp_path, drift=0.01, spread_ms=0.0).closure_p95_ms
+    assert closure_ms == pytest.approx(0.03, abs=0.002)
+
+
+def test_the_parts_are_compared_with_the_whole_by_the_95th_percentile(
+    make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the parts are 0, 1, .. 100 ms from the whole the value given is 95 ms, whatever their sign."""
+    missing_ns = np.arange(101) * 1_000_000 * np.resize([1, -1], 101)
+    monkeypatch.setattr("lavt.experiment.metrics.closure_ns", lambda *_: missing_ns)
+    assert measured(make_run, tmp_path, seconds=0.1).closure_p95_ms == pytest.approx(95.0)
+
+
+def test_where_no_picture_was_read_there_is_no_bound(make_run: MakeRun, tmp_path: Path) -> None:
+    """Without pictures neither tau_v, nor its bound, nor a sum of parts is known; tau_c and its bound are."""
+    make_run(tmp_path, server_host="one", client_host="one")
+    server = read_record(tmp_path / "server.mcap")
+    run = measure(server, read_record(tmp_path / "client.mcap", channels=("clock",)))
+    assert (run.entry["tau_v_ms"]["n"], run.entry["tau_v_ms"]["bound"]) == (0, None)
+    assert run.entry["tau_c_ms"]["n"] > 0
+    assert run.entry["tau_c_ms"]["bound"] == 0.0
+    assert run.closure_p95_ms is None
 
 
 def test_a_step_of_the_clock_does_not_touch_the_loop(make_run: MakeRun, tmp_path: Path) -> None:

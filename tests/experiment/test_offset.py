@@ -11,8 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.offset import DRIFT_ALLOWANCE, Exchanges, Offset, by_probe, by_sources, exchanges
-from lavt.experiment.table import Table, table_of
+from lavt.experiment.offset import (
+    DRIFT_ALLOWANCE,
+    NO_OFFSET,
+    Exchanges,
+    Offset,
+    by_probe,
+    by_sources,
+    exchanges,
+    follows,
+    known_samples,
+)
+from lavt.experiment.table import MISSING, Table, table_of
 
 TRUE_NS = 1_790_000_000 * NS_PER_S
 Ahead = Callable[[int], int]
@@ -46,6 +56,33 @@ def slewed(offset_ms: float, ppm: float, from_s: float, until_s: float) -> Ahead
     return lambda at_ns: round(
         offset_ms * NS_PER_MS + (np.clip(at_ns / NS_PER_S, from_s, until_s) - from_s) * ppm * 1000
     )
+
+
+def rows_of(rows: list[dict[str, Any]]) -> Table:
+    return table_of(rows, [0] * len(rows), [0] * len(rows))
+
+
+def test_an_offset_by_hand() -> None:
+    """Delta is linear between moments and constant outside of them; its bound is linear too, and grows outside."""
+    times_ns = np.array([0, 100, 200])
+    offset = Offset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
+    at_ns = TRUE_NS + np.array([-20, 0, 3, 50, 99, 100, 200, 260])
+    assert offset.at(at_ns).tolist() == [10, 10, 11, 20, 30, 30, 20, 20]
+    assert offset.bound_at(at_ns).tolist() == pytest.approx([14.0, 4.0, 4.12, 6.0, 7.96, 8.0, 6.0, 36.0])
+
+
+def test_a_missing_time_stays_missing() -> None:
+    """Times of the client become times of the server by Delta at their own moments; a missing one stays missing."""
+    offset = Offset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
+    client_ns = np.array([TRUE_NS, MISSING, TRUE_NS + 100])
+    assert offset.on_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
+
+
+def test_one_clock_has_no_offset() -> None:
+    """Hosts that share a clock have a Delta of 0 with a bound of 0 at every time."""
+    at_ns = np.array([0, TRUE_NS])
+    assert NO_OFFSET.at(at_ns).tolist() == [0, 0]
+    assert NO_OFFSET.bound_at(at_ns).tolist() == [0.0, 0.0]
 
 
 def test_drifting_clocks() -> None:
@@ -106,6 +143,163 @@ def test_one_source_is_not_enough(lacking: str) -> None:
     """Where one host has no sample that knows its correction nobody knows Delta."""
     of = {"client": samples(drifting(0, 0)), "server": samples(drifting(0, 0)), lacking: table_of([], [], [])}
     assert by_sources(of["server"], of["client"]) is None
+
+
+@pytest.mark.parametrize("follower", ["client", "server"])
+@pytest.mark.parametrize(
+    ("path", "bound_ms"),
+    [
+        ({"peer_delay_s": 0.4, "peer_dispersion_s": 0.1}, 2.0),
+        ({}, 2.0),
+        ({"peer_delay_s": 0.001, "peer_dispersion_s": 0.0, "skew_ppm": 0.0, "age_s": 0.0}, 0.5),
+        ({"follows": "10.0.0.9", "peer_delay_s": 0.001, "peer_dispersion_s": 0.0}, 5.0),
+    ],
+)
+def test_the_bound_of_a_host_that_follows_the_other(follower: str, path: dict[str, Any], bound_ms: float) -> None:
+    """The bound is the follower's: of the path, or its own where that is less or the only one; else it is the sum."""
+    own = {"follows": "10.9.0.1", "skew_ppm": 0.0, "age_s": 0.0, "bound_s": 0.002, **path}
+    tables = {
+        "client": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
+        "server": samples(drifting(0, 0), bound_s=0.003, addresses=["10.9.0.1"]),
+        follower: samples(drifting(0, 0), addresses=None, **own),
+    }
+    offset = by_sources(tables["server"], tables["client"])
+    assert offset is not None
+    assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([bound_ms] * 30)
+
+
+def test_following_is_by_any_address_of_the_other() -> None:
+    """A host follows the other where its source has an address of the other, in whichever sample that was recorded."""
+    other = rows_of([{"addresses": None}, {"addresses": ["10.0.0.1", "10.0.0.2"]}, {"addresses": ["fe80::1"]}])
+    sources = ["10.0.0.2", "10.0.0.3", "fe80::1", "", None]
+    assert follows(rows_of([{"follows": each} for each in sources]), other).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_steering_for_a_second_is_in_the_bound_around_it() -> None:
+    """A clock steered by 1 % for a second has a bound of 10 ms in that second and beside it, and more by asking."""
+    server = samples(slewed(0, 10_000, 10, 11), asking_s=0.1)
+    offset = by_sources(server, samples(drifting(0, 0)))
+    assert offset is not None
+    expected_ms = [0.002, 10.002, 10.502, 10.502, 0.002]
+    assert (offset.bound_ns[8:13] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
+    assert offset.bound_ns[[0, -1]].max() / NS_PER_MS == pytest.approx(0.002)
+
+
+def test_steering_in_the_last_interval_is_in_the_bound() -> None:
+    """A clock steered by 1 % in the last second has a bound of 10 ms there, and in the second before."""
+    offset = by_sources(samples(slewed(0, 10_000, 28, 40)), samples(drifting(0, 0)))
+    assert offset is not None
+    expected_ms = [0.002, 10.002, 10.002, 10.002]
+    assert (offset.bound_ns[-4:] / NS_PER_MS).tolist() == pytest.approx(expected_ms, abs=1e-3)
+
+
+def stepwise(ppm: list[float]) -> list[dict[str, Any]]:
+    """Make the samples of a host whose correction changes at another rate in each second."""
+    values_ns = [0.0, *np.cumsum(ppm) * 1000]
+    return [
+        {"wall_ns": TRUE_NS + second * NS_PER_S - round(at_ns), "correction_s": at_ns / NS_PER_S, "bound_s": 0.0}
+        for second, at_ns in enumerate(values_ns)
+    ]
+
+
+def test_each_second_has_the_bound_of_its_own_steering() -> None:
+    """The bound at a time is that of the second which begins there, in the first and the last second too."""
+    server = rows_of(stepwise([15_000, 20_000, 0, 20_000, 15_000]))
+    offset = by_sources(server, samples(drifting(0, 0), seconds=6, bound_s=0.0))
+    assert offset is not None
+    assert (offset.bound_ns / NS_PER_MS).tolist() == pytest.approx([5, 20, 20, 20, 5, 5], abs=1e-3)
+
+
+def test_two_samples_of_one_time() -> None:
+    """A sample that is there twice changes nothing."""
+    rows = stepwise([10.0, 20.0])
+    offsets = [by_sources(rows_of(each), samples(drifting(0, 0), seconds=3)) for each in (rows, rows + rows[1:2])]
+    assert offsets[0] is not None
+    assert offsets[1] is not None
+    assert offsets[1].delta_ns.tolist() == offsets[0].delta_ns.tolist()
+    assert np.isfinite(offsets[1].bound_ns).all()
+
+
+def test_three_samples_show_steering_and_two_do_not() -> None:
+    """Where a clock has two samples only nothing shows that it was steered; the third shows it."""
+    for seconds, bound_ms in ((2, 0.002), (3, 10.002)):
+        server = samples(slewed(0, 10_000, 1, 2), seconds=seconds)
+        offset = by_sources(server, samples(drifting(0, 0), seconds=seconds))
+        assert offset is not None
+        assert offset.bound_ns.max() / NS_PER_MS == pytest.approx(bound_ms, abs=1e-3)
+
+
+def test_only_what_both_hosts_know_counts() -> None:
+    """Delta has the moments of both hosts' samples from the later beginning to the earlier end, these included."""
+    offset = by_sources(samples(drifting(0, 0), seconds=20), samples(drifting(0, 0), begin_ms=5500))
+    assert offset is not None
+    times_ms = ((offset.client_wall_ns - TRUE_NS) // NS_PER_MS).tolist()
+    assert times_ms == list(range(5500, 19001, 500))
+    apart = by_sources(samples(drifting(0, 0), seconds=5), samples(drifting(0, 0), begin_ms=10_000))
+    assert apart is None
+
+
+def test_moments_are_on_the_clients_wall_clock() -> None:
+    """Where both hosts sampled at the same times the moments of Delta are the client's wall times, to a nanosecond."""
+    client = samples(lambda at_ns: 250 * NS_PER_MS + at_ns // 3_000_001)
+    offset = by_sources(samples(drifting(0, 0)), client)
+    assert offset is not None
+    assert offset.client_wall_ns.tolist() == client.ints("wall_ns").tolist()
+
+
+def test_samples_that_know_nothing_do_not_count() -> None:
+    """Delta begins with the first samples that know their correction; of a host that loses it no Delta is known."""
+    rows = [{"wall_ns": TRUE_NS + at * NS_PER_S, "correction_s": 0.0, "bound_s": 0.0} for at in range(5)]
+    unknown = [{**row, "correction_s": None} for row in rows]
+    offset = by_sources(rows_of(unknown[:2] + rows[2:]), rows_of(rows))
+    assert offset is not None
+    assert offset.client_wall_ns.tolist() == [row["wall_ns"] for row in rows[2:]]
+    assert by_sources(rows_of(rows[:2] + unknown[2:3] + rows[3:]), rows_of(rows)) is None
+
+
+@pytest.mark.parametrize(
+    ("first_ppm", "middle_ppm", "last_ppm"), [(10.0, 50.0, 0.0), (0.0, 50.0, 10.0), (-10.0, 0.0, 5.0), (5.0, 0.0, -10)]
+)
+def test_outside_of_the_samples_delta_changes_twice_as_fast(
+    first_ppm: float, middle_ppm: float, last_ppm: float
+) -> None:
+    """Outside of its moments the bound grows twice as fast as Delta changed at the faster of its two ends."""
+    rows = stepwise([first_ppm, middle_ppm, middle_ppm, last_ppm])
+    values_ns = [row["correction_s"] * NS_PER_S for row in rows]
+    for table in (rows, rows[::-1]):
+        offset = by_sources(rows_of(table), samples(drifting(0, 0), seconds=5))
+        assert offset is not None
+        assert offset.delta_ns.tolist() == pytest.approx([-each for each in values_ns], abs=1)
+        assert offset.outside == pytest.approx(20e-6, rel=0.01)
+
+
+def test_outside_of_one_sample_clocks_may_drift_as_any() -> None:
+    """One moment does not say how fast Delta changes: any drift is allowed for; two say it."""
+    server = drifting(0, 10)
+    for seconds, expected in ((1, DRIFT_ALLOWANCE), (2, 20e-6)):
+        offset = by_sources(samples(server, seconds=seconds), samples(drifting(0, 0), seconds=seconds))
+        assert offset is not None
+        assert offset.outside == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("known", "first"),
+    [("11", 0), ("01", 1), ("0011", 2), ("10", None), ("101", None), ("0101", None), ("00", None), ("", None)],
+)
+@pytest.mark.parametrize("lacking", [{"correction_s": None}, {"wall_ns": None}])
+def test_samples_count_from_the_first_that_is_known(known: str, first: int | None, lacking: dict[str, Any]) -> None:
+    """Samples count from the first on that has its correction and its time; where one is lacking later none counts."""
+    rows = [
+        {"wall_ns": index, "correction_s": 0.5, **({} if each == "1" else lacking)} for index, each in enumerate(known)
+    ]
+    found = known_samples(rows_of(rows)).ints("wall_ns").tolist()
+    assert found == ([] if first is None else list(range(first, len(known))))
 
 
 def probed(

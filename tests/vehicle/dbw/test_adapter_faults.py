@@ -15,6 +15,7 @@ from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, starte
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw.adapter import SEPARATOR
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 from lavt.vehicle.software_car.state import AXES, Gear
 
@@ -563,6 +564,19 @@ def test_drive_refused(generation: int) -> None:
     assert rig.kit.state.watchdog == 0
 
 
+def test_a_shift_that_was_begun_is_waited_for() -> None:
+    """Where DRIVE was asked for and is not reported the car is held for 1 s, and then let go of in PARK."""
+    known = profile("dataspeed_gen1")
+    rig = Rig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(999)
+    assert (rig.state, rig.enabled()) == ("parking", set(AXES))
+    rig.run_ms(1)
+    assert (rig.state, rig.enabled()) == ("parking", set())
+
+
 def test_park_refused() -> None:
     """Where PARK is refused the car is held by its brake, and it is said so."""
     rig = driving(1)
@@ -578,6 +592,59 @@ def test_park_refused() -> None:
     said = rig.adapter.state().hindrance
     assert "the car stands and is not parked" in said
     assert "GearReport says fault" in said
+
+
+def without_park() -> Rig:
+    """A car at rest whose kit takes what is sent for PARK for no gear."""
+    known = profile("dataspeed_gen1")
+    rig = Rig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "park": 5})))
+    rig.engage()
+    return rig
+
+
+def test_park_is_missed_after_3_s() -> None:
+    """A car that stands and is not in PARK 3 s after driving ended is a hindrance, and none before."""
+    rig = without_park()
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(2999)
+    assert (rig.state, rig.adapter.state().hindrance) == ("parking", "")
+    rig.run_ms(1)
+    assert "unsupported" in rig.adapter.state().hindrance
+    assert len(rig.adapter.state().hindrance.split(SEPARATOR)) == 2
+
+
+def test_park_is_not_missed_while_the_car_moves() -> None:
+    """A car that still moves 3 s after driving ended is no hindrance, and is not put into PARK."""
+    rig = without_park()
+
+    def move(frame: Frame) -> bool:
+        if frame.identifier == 0x065:
+            rig.adapter.receive(Frame(0x065, frame.data[:4] + b"\0\4" + frame.data[6:]), rig.now_ns)
+        return frame.identifier == 0x065
+
+    rig.lose_report = move
+    rig.run_ms(20)
+    rig.adapter.engage(False, rig.now_ns)
+    rig.run_ms(4000, step_ms=COARSE_MS)
+    assert rig.adapter.state().speed_mps > 1.0
+    assert (rig.state, rig.adapter.state().hindrance) == ("parking", "")
+
+
+@pytest.mark.parametrize("state", ["idle", "engaged", "lost", "overridden"])
+def test_park_is_missed_only_after_driving(state: str) -> None:
+    """A car that stands for long in a state in which it is not to be parked is not missed in PARK."""
+    rig = started(1)
+    if state != "idle":
+        rig.engage()
+    if state == "lost":
+        rig.adapter.bus_gone("can0 is down", rig.now_ns)
+    if state == "overridden":
+        rig.kit.driver_brakes(0.3, rig.now_ns)
+    rig.run_ms(500, step_ms=COARSE_MS)
+    assert rig.state == state
+    before = rig.adapter.state().hindrance
+    rig.run_ms(3500, step_ms=COARSE_MS)
+    assert (rig.state, rig.adapter.state().hindrance) == (state, before)
 
 
 @both

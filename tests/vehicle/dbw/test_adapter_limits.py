@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started, with_limits
 
-from lavt.domain import NS_PER_S, Actuation
-from lavt.vehicle.dbw.profile import TICK_LIMIT_NS, Limits
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, Limits
 from lavt.vehicle.dbw.sending import Asked, limited
 from lavt.vehicle.sim.cars import LINCOLN_MKZ
 
@@ -53,6 +53,37 @@ def test_rate(generation: int) -> None:
     for (before_ns, before_deg), (after_ns, after_deg) in pairwise(asked):
         assert abs(after_deg - before_deg) <= 100.0 * (after_ns - before_ns) / NS_PER_S + 0.1
     assert asked[-1][1] > 30
+
+
+@both
+def test_what_is_behind_follows_soon(generation: int) -> None:
+    """While a limit keeps the wheel from where it is asked to be a set leaves every 5 ms, and then every 20 ms."""
+    rig = Rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
+    rig.engage()
+    rig.run_ms(300, step_ms=COARSE_MS)
+    rig.tick_ns = 50 * NS_PER_MS
+    rig.actuation = Actuation(0.03, 0.0, 0.5)
+    for wait_ms, period_ns in ((60, LEAST_GAP_NS), (700, PERIOD_NS)):
+        rig.run_ms(wait_ms)
+        rig.sent.clear()
+        rig.run_ms(150)
+        times = sorted({at_ns for at_ns, _ in rig.sent})
+        assert {later - earlier for earlier, later in pairwise(times)} == {period_ns}
+
+
+@both
+def test_without_a_tick_nothing_leaves(generation: int) -> None:
+    """Before the first tick nothing leaves, also where driving is wanted; that there was none is counted once."""
+    rig = Rig(generation, start_frames=False)
+    rig.is_ticking = False
+    rig.run_ms(400, step_ms=COARSE_MS)
+    rig.adapter.engage(True, rig.now_ns)
+    rig.run_ms(300, step_ms=COARSE_MS)
+    assert (rig.sent, rig.adapter.tick_ns) == ([], None)
+    assert rig.adapter.counts["ticks_missed"] == 1
+    rig.is_ticking = True
+    rig.run_ms(COARSE_MS, step_ms=COARSE_MS)
+    assert rig.sent
 
 
 def test_rate_of_the_kit() -> None:

@@ -64,13 +64,13 @@ class Adapter:
         self._asked_ns: int | None = None
         self._plan: Plan | None = None
         """What the last set said; None: nothing is being said."""
-        self._sent_asked: Asked | None = None
-        """What was asked when the last set was made."""
         self._is_late = False
         self._told: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
         self._echoes: deque[tuple[int, int]] = deque()
         """Steering commands sent and not yet seen in a report: in its steps, and when they were asked for."""
+        self._expected: int | None = None
+        """The steering command of the last set, in its steps; None: it had none."""
         self._reached: list[Reached] = []
         self._counts: Counter[str] = Counter()
         self._seen = self._situation(start_ns)
@@ -184,7 +184,7 @@ class Adapter:
         is_new = plan != self._plan
         if not is_new and now_ns < self._due_ns(asked):
             return []
-        self._plan, self._sent_asked = plan, asked
+        self._plan = plan
         self._is_shifting |= plan.gear == "drive"
         frames = self._sender.frames(plan, asked, self._reports.wheel_deg, now_ns)
         self._expect_echo(plan)
@@ -197,8 +197,7 @@ class Adapter:
         """Tell when the next set is due: soon where it brings something new."""
         if self._state == "clearing":
             return self._sender.sent_ns + CLEARING_PERIOD_NS
-        is_behind = asked != self._sent_asked or asked != self._sender.sent
-        return self._sender.sent_ns + (LEAST_GAP_NS if is_behind else PERIOD_NS)
+        return self._sender.sent_ns + (PERIOD_NS if asked == self._sender.sent else LEAST_GAP_NS)
 
     def _planned(self) -> Plan | None:
         """Give what each state says to the kit."""
@@ -242,12 +241,14 @@ class Adapter:
     def _expect_echo(self, plan: Plan) -> None:
         if "steering" not in plan.enabled or self._asked_ns is None:
             self._echoes.clear()
+            self._expected = None
             return
         while self._echoes and self._asked_ns - self._echoes[0][1] > ECHO_LIMIT_NS:
             self._echoes.popleft()
         number = round(self._sender.sent.wheel_deg / self._profile.command_step_deg)
-        if number != (self._echoes[-1][0] if self._echoes else self._reports.command):
+        if number != (self._reports.command if self._expected is None else self._expected):
             self._echoes.append((number, self._asked_ns))
+        self._expected = number
 
     def _echo(self, now_ns: int) -> None:
         """Find the newest report's command among those sent; those before it were overtaken."""
