@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest
-from lavt.transport.messages import decode, encode
+from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from lavt.transport.sealing import NoSeal, OperatorSeal, VehicleSeal
+from lavt.transport.sealing import KEPT, LONGEST_BYTES, TRAILER_BYTES, NoSeal, OperatorSeal, Reply, VehicleSeal
 from lavt.transport.signing import PrivateKey
 
 COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
@@ -96,6 +98,15 @@ def test_any_operator_stops_the_vehicle(pair: Pair) -> None:
     stop = replace(COMMAND, emergency_stop=9)
     assert pair.vehicle.open_command(Pair("bob", BOB).command(stop)) == encode(stop)
     assert pair.vehicle.open_command(Pair("bob", MALLORY).command(stop)) is None
+    assert pair.vehicle.open_command(Pair("bob", BOB).operator.seal_command(b"garbage")) is None
+
+
+def test_before_a_session_no_command_has_a_valid_code(pair: Pair) -> None:
+    """Before there is a session its codes are zeros, and the vehicle accepts no zeros as a code."""
+    assert pair.command()[-TRAILER_BYTES:-64] == bytes(16)
+    assert not pair.vehicle.is_from_holder(pair.command())
+    assert not pair.vehicle.is_next_of_holder("session", pair.request())
+    assert not pair.operator.is_next_state(pair.vehicle.seal_state(b"state"))
 
 
 def test_after_a_release_nobody_commands(pair: Pair) -> None:
@@ -207,6 +218,18 @@ def test_a_reply_counts_once(pair: Pair) -> None:
     assert pair.operator.open_reply("session", sealed).body == encode(GRANTED)
 
 
+@pytest.mark.parametrize("changes", [{"secret": bytes(32)}, {"public": bytes(32)}], ids=["secret", "key"])
+def test_a_reply_that_cannot_be_decrypted_is_a_forgery(pair: Pair, changes: dict[str, Any]) -> None:
+    """A signed reply that the operator cannot decrypt is counted, and the request goes on waiting for its reply."""
+    pair.hold()
+    request = pair.vehicle.open_request("session", pair.request())
+    assert request is not None
+    unreadable = pair.vehicle.seal_reply(replace(request, **changes), encode(GRANTED))
+    assert pair.operator.open_reply("session", unreadable) == Reply(None, None)
+    assert pair.operator.counts["session_replies_forged"] == 1
+    assert pair.operator.open_reply("session", pair.vehicle.seal_reply(request, encode(GRANTED))).body is not None
+
+
 def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
     """A reply that comes after that to a later query says what is no longer so: it is dropped."""
     pair.hold()
@@ -241,6 +264,7 @@ def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pa
     opened = pair.operator.open_state(anew.seal_state(b"new"))
     assert opened.body is None
     assert opened.ask
+    assert pair.operator.counts["states_of_another_time"] == 1
     pair.vehicle = anew
     pair.ask(pair.operator.seal_request("session", b""))
     assert pair.operator.open_state(anew.seal_state(b"newer")).body == b"newer"
@@ -264,13 +288,72 @@ def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
     assert not request.is_stale
 
 
-def test_what_waits_is_bounded(pair: Pair) -> None:
-    """Neither requests without replies nor clients that come and go take more and more memory."""
-    for _ in range(50):
-        pair.request()
-        pair.vehicle.open_request("session", Pair().request())
-    assert len(pair.operator._asked) <= 8
-    assert len(pair.vehicle._agreements) <= 8
+def test_requests_without_replies_are_bounded(pair: Pair) -> None:
+    """Of requests that wait for a reply only the newest are kept: their replies are accepted, those before are not."""
+    pair.hold()
+    requests = [pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))]
+    requests += [pair.vehicle.open_request("session", pair.request("hold", number)) for number in range(3 * KEPT)]
+    assert len(pair.operator._asked) == KEPT
+    replies = [pair.vehicle.seal_reply(request, encode(GRANTED)) for request in requests if request is not None]
+    assert pair.operator.open_reply("netem", replies[0]) == Reply(None, None)
+    assert pair.operator.open_reply("session", replies[-KEPT - 1]) == Reply(None, None)
+    assert len(pair.operator._asked) == KEPT
+    assert pair.operator.open_reply("session", replies[-KEPT]) != Reply(None, None)
+
+
+def test_agreements_with_clients_are_bounded(pair: Pair) -> None:
+    """Of clients that come and go the vehicle remembers the newest, and what it has agreed on with them."""
+    requests = [Pair().request() for _ in range(3 * KEPT)]
+    publics = [request.public for each in requests if (request := pair.vehicle.open_request("session", each))]
+    assert len(set(publics)) == 3 * KEPT
+    assert len(pair.vehicle._agreements) == KEPT
+    remembered = pair.vehicle.open_request("session", requests[-KEPT])
+    assert remembered is not None
+    assert remembered.public == publics[-KEPT]
+    forgotten = pair.vehicle.open_request("session", requests[0])
+    assert forgotten is not None
+    assert forgotten.public != publics[0]
+
+
+@pytest.mark.parametrize(("more_bytes", "accepted"), [(0, True), (1, False)])
+def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted: bool) -> None:
+    """An envelope of the largest size is opened; one that is a byte longer is a forgery, whoever has signed it."""
+    pair.hold()
+    command = bytes(LONGEST_BYTES - TRAILER_BYTES + more_bytes)
+    sealed = pair.operator.seal_command(command)
+    assert len(sealed) == LONGEST_BYTES + more_bytes
+    assert pair.vehicle.body(sealed) == (command if accepted else b"")
+    assert pair.vehicle.is_from_holder(sealed) == accepted
+    assert pair.vehicle.open_command(sealed) == (command if accepted else None)
+    state = bytes(LONGEST_BYTES - TRAILER_BYTES - 16 + more_bytes)
+    sealed = pair.vehicle.seal_state(state)
+    assert pair.operator.is_next_state(sealed) == accepted
+    assert pair.operator.open_state(sealed).body == (state if accepted else None)
+    request = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))
+    assert request is not None
+    reply = bytes(LONGEST_BYTES - len(pair.vehicle.seal_reply(request, b"")) + more_bytes)
+    fresh = replace(request, is_stale=False)
+    assert pair.operator.open_reply("netem", pair.vehicle.seal_reply(fresh, reply)).body == (
+        reply if accepted else None
+    )
+    refused = 0 if accepted else 1
+    assert pair.vehicle.counts["commands_forged"] == refused
+    assert pair.operator.counts == Counter(states_forged=refused, netem_replies_forged=refused)
+
+
+def test_the_largest_message_fits_into_every_envelope(pair: Pair) -> None:
+    """What an envelope adds to the largest message leaves it within the largest size of an envelope."""
+    pair.hold()
+    largest = bytes(MAX_MESSAGE_BYTES)
+    request = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))
+    assert request is not None
+    sealed = [
+        pair.operator.seal_command(largest),
+        pair.operator.seal_request("session", largest),
+        pair.vehicle.seal_state(largest),
+        pair.vehicle.seal_reply(request, largest),
+    ]
+    assert max(map(len, sealed)) <= LONGEST_BYTES
 
 
 @given(st.binary(max_size=1400))
