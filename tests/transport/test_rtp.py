@@ -249,6 +249,8 @@ def test_sender_without_markers() -> None:
 MALFORMED = {
     "empty": b"",
     "forbidden bit": b"\xc1abc",
+    "forbidden bit of a STAP-A": b"\xf8\x00\x01A",
+    "forbidden bit of an FU-A": b"\xfc\x05abc",
     "type 0": b"\x60abc",
     "type 31": b"\x7fabc",
     "STAP-B": b"\x79abc",
@@ -305,6 +307,17 @@ def test_a_peer_that_never_ends() -> None:
     (unit,) = depacketizer.push(packet(SLICE, marker=True), False)
     assert not unit.complete
     assert len(unit.data) <= MAX_ACCESS_UNIT_BYTES + 4
+
+
+@pytest.mark.parametrize(("more_bytes", "malformed"), [(0, 0), (1, 1)])
+def test_the_largest_access_unit(more_bytes: int, malformed: int) -> None:
+    """An access unit of the largest size is complete; a packet that would make it longer is malformed."""
+    depacketizer = Depacketizer()
+    depacketizer.push(packet(SLICE + bytes(999)), False)
+    # What is there already has a start code before its 1000 bytes.
+    last = SLICE + bytes(MAX_ACCESS_UNIT_BYTES - 1004 - 1 + more_bytes)
+    (unit,) = depacketizer.push(packet(last, marker=True), False)
+    assert (depacketizer.malformed, unit.complete) == (malformed, not malformed)
 
 
 HEADS = st.sampled_from(
