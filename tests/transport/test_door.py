@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import queue
+import threading
 from typing import Any
 
 import pytest
 
 from lavt.domain import NS_PER_S, PATH_POINTS, Command, Now, SessionReply, SessionRequest
 from lavt.node import Send
+from lavt.transport import zenoh_link
 from lavt.transport.door import QUERIES_KEPT, STATES_PER_S, ClientDoor, OpenDoor, ServerDoor
 from lavt.transport.messages import encode
 from lavt.transport.screen import OTHERS_PER_S, QUERIES_PER_S
@@ -177,6 +180,21 @@ def test_nobody_waits_at_the_door_for_the_link(both: Both) -> None:
     assert (len(free), all(free)) == (4, True)
 
 
+def test_a_delivered_message_is_answered_in_another_thread() -> None:
+    """A query that a reply asks for again is sent in a thread of its own, since Zenoh sends none while it delivers."""
+    both = Both()
+    del both.desk._send_soon
+    both.desk.send(Send("session", HOLD))
+    both.car.let_in("session", both.outside.pop().payload, Now(0, 0), "query")
+    sent: queue.SimpleQueue[tuple[threading.Thread, tuple[Send, ...]]] = queue.SimpleQueue()
+    both.desk._carry = lambda *sends: sent.put((threading.current_thread(), sends))
+    both.desk.let_in("session_reply", both.outside.pop().payload, Now(0, 0), None)
+    thread, sends = sent.get(timeout=10)
+    assert thread is not threading.current_thread()
+    assert thread.daemon
+    assert [each.channel for each in sends] == ["session"]
+
+
 def test_a_flood_of_states_is_screened(both: Both) -> None:
     """Of a flood of states no more signatures are verified than a few vehicles could make."""
     for _ in range(10_000):
@@ -219,6 +237,7 @@ def test_requests_that_are_never_answered_are_forgotten() -> None:
         door.let_in("session", b"request", Now(number * NS_PER_S, 0), number)
     for _ in range(2):
         door.send(*(Send("session_reply", b"reply", number) for number in range(1000)))
+    assert QUERIES_KEPT == zenoh_link.QUERIES_KEPT
     assert carried == [Send("session_reply", b"reply", number) for number in range(1000 - QUERIES_KEPT, 1000)]
 
 
