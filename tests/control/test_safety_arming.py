@@ -152,6 +152,19 @@ def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
     assert rig.state == "safe_stop"
 
 
+def test_armed_anew_the_last_drives_command_is_forgotten() -> None:
+    """Armed again after a stop, the vehicle keeps its brake on and its wheel where it is until a new drive command."""
+    rig = Rig().driving(steering_rad=0.05)
+    rig.go(LIMITS.stop_after_ns)
+    assert rig.state == "safe_stop"
+    rig.ask("hold")
+    rig.arm_for(NS_PER_S)
+    assert rig.state == "driving"
+    actuation = rig.actuation()
+    assert (actuation.steering_rad, actuation.throttle) == (0.0, 0.0)
+    assert actuation.brake >= LIMITS.arming_brake
+
+
 def test_the_first_steering_target_is_where_the_wheel_is() -> None:
     """From the moment of arming the wheel is turned from where it stands, at most at the rate allowed."""
     rig = Rig()
