@@ -47,14 +47,14 @@ def test_an_angle_at_a_limit_is_not_changed(sign: int) -> None:
         assert limited(asked, speed_mps) == (asked, ())
 
 
-def test_the_wheel_turns_no_faster_than_the_rate() -> None:
-    """In 10 ms the target moves by 8 mrad at most, and the rest follows as time goes on."""
-    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=10 * NS_PER_MS)
-    assert actuation.steering_rad == pytest.approx(0.008)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_wheel_turns_no_faster_than_the_rate(sign: int) -> None:
+    """In 10 ms the target moves by 8 mrad at most, and the rest follows as time goes on; to either side."""
+    asked = Actuation(sign * 0.1, 0.0, 0.0)
+    actuation, changed = limited(asked, SPEED_MPS, after_ns=10 * NS_PER_MS)
+    assert actuation.steering_rad == pytest.approx(sign * 0.008)
     assert changed == ("steering rate",)
-    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=125 * NS_PER_MS)
-    assert actuation.steering_rad == pytest.approx(0.1)
-    assert changed == ()
+    assert limited(asked, SPEED_MPS, after_ns=125 * NS_PER_MS) == (asked, ())
 
 
 def test_what_is_reached_within_a_command_period_is_not_called_limited() -> None:

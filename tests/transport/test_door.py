@@ -151,6 +151,14 @@ def test_a_server_started_anew_is_asked_once_a_second(both: Both) -> None:
     assert both.at_the_desk[-1] == ("state", b"state")
 
 
+def test_states_of_a_known_server_cause_no_query(both: Both) -> None:
+    """A state of the server's process that has answered is delivered, and nothing is asked because of it."""
+    both.car.send(Send("state", b"state"))
+    both.desk.let_in("state", both.outside.pop().payload, Now(0, 0), None)
+    assert both.at_the_desk[-1] == ("state", b"state")
+    assert both.outside == []
+
+
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
     """Of ten thousand queries in a second as many are looked at as one client could ever ask."""
