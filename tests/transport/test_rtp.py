@@ -71,6 +71,8 @@ def test_header_as_in_the_rfc() -> None:
     """The header has the bytes that RFC 3550 gives it."""
     sent = RtpPacket(96, 0x0102, 0x03040506, 0x0708090A, marker=True, payload=b"x")
     assert sent.to_bytes() == bytes.fromhex("80 e0 0102 03040506 0708090a") + b"x"
+    of_type_0 = parse_packet(bytes.fromhex("80 80 0102 03040506 0708090a"))
+    assert (of_type_0.payload_type, of_type_0.marker) == (0, True)
 
 
 def test_what_others_put_into_a_header() -> None:
