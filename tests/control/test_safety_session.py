@@ -253,7 +253,9 @@ def test_asking_is_for_what_somebody_else_holds() -> None:
     rig = Rig()
     assert rig.ask("ask").because == "nobody holds the vehicle"
     rig.hold()
-    assert rig.ask("ask").because == "you hold the vehicle"
+    refused = rig.ask("ask")
+    assert refused.because == "you hold the vehicle"
+    assert (refused.granted, refused.epoch, refused.token) == (False, 0, b"")
     assert asked_by(rig) == ""
 
 

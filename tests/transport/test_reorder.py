@@ -310,6 +310,23 @@ def test_the_hold_follows_repairs() -> None:
     assert hold_of(buffer, 3, STARTED_NS + 20 * NS_PER_MS) == 25 * NS_PER_MS
 
 
+def test_the_hold_of_an_open_gap_grows_with_what_closes_another() -> None:
+    """While a gap is open, a packet behind it that was overtaken by 9 ms lengthens the hold of that gap too."""
+    buffer = started(hold_ns=None)
+    for number, after_ns in ((2, 0), (4, 0), (3, 9 * NS_PER_MS)):
+        assert buffer.push(packet(number), STARTED_NS + after_ns) == []
+    assert buffer.next_wake_ns() == STARTED_NS + 11_250_000
+
+
+def test_what_was_not_given_up_changes_no_hold() -> None:
+    """A packet from before the start, or one made again that had left already, is dropped and changes no hold."""
+    buffer = started(10, hold_ns=None)
+    assert buffer.push(packet(9), STARTED_NS + 50 * NS_PER_MS) == []
+    assert buffer.push_recovered(packet(10), STARTED_NS + 50 * NS_PER_MS) == []
+    assert (buffer.late, buffer.recovered) == (1, 0)
+    assert hold_of(buffer, 11, STARTED_NS + 50 * NS_PER_MS) == LEAST_HOLD_NS
+
+
 def test_nobody_waits_for_ever() -> None:
     """What is overtaken by more than makes sense to wait for changes nothing."""
     buffer = started(hold_ns=None)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import PATH_POINTS, Command, NetemReply, NetemRequest, SessionReply, SessionRequest
-from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
+from lavt.transport.messages import decode, encode
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
@@ -178,6 +178,31 @@ def test_an_emergency_stop_is_not_asked_twice(pair: Pair) -> None:
     assert not request.is_stale
 
 
+def test_a_request_without_a_body_only_asks_for_the_place(pair: Pair) -> None:
+    """An empty request is never decided on, though its place is the next, and is not counted as a replay."""
+    pair.hold()
+    before = pair.vehicle.counts["session_requests_of_another_time"]
+    request = pair.vehicle.open_request("session", pair.operator.seal_request("session", b""))
+    assert request is not None
+    assert request.is_stale
+    assert pair.vehicle.counts["session_requests_of_another_time"] == before
+
+
+def test_a_request_with_an_impossible_key_is_refused(pair: Pair) -> None:
+    """A request whose X25519 key gives no secret is counted as a forgery, whoever has signed it."""
+    pair.operator._agreement.public = bytes(32)
+    assert pair.vehicle.open_request("session", pair.request()) is None
+    assert pair.vehicle.counts["session_requests_forged"] == 1
+
+
+def test_a_reply_without_a_token_leaves_the_codes_as_they_are(pair: Pair) -> None:
+    """A request that is granted without a token, as an emergency stop is, does not end the holder's session."""
+    pair.hold()
+    pair.ask(pair.request("emergency_stop", 7), SessionReply(True, "", 0, b"", 5600, "kernel", 7))
+    assert pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
+
+
 def test_a_request_in_another_name_is_refused(pair: Pair) -> None:
     """Nobody asks in the name of another operator, nor without a name that is known."""
     for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
@@ -234,12 +259,13 @@ def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
     """A reply that comes after that to a later query says what is no longer so: it is dropped."""
     pair.hold()
     replies = []
-    for _ in range(2):
-        request = pair.vehicle.open_request("session", pair.request())
+    for number in range(2):
+        request = pair.vehicle.open_request("session", pair.request("hold", number))
         assert request is not None
         replies.append(pair.vehicle.seal_reply(request, b"" if request.is_stale else encode(GRANTED)))
     assert pair.operator.open_reply("session", replies[1]).again is not None
-    assert pair.operator.open_reply("session", replies[0]).body is None
+    assert pair.operator.open_reply("session", replies[0]) == Reply(None, None)
+    assert pair.operator.open_reply("session", replies[1]) == Reply(None, None)
 
 
 def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
@@ -339,21 +365,6 @@ def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted:
     refused = 0 if accepted else 1
     assert pair.vehicle.counts["commands_forged"] == refused
     assert pair.operator.counts == Counter(states_forged=refused, netem_replies_forged=refused)
-
-
-def test_the_largest_message_fits_into_every_envelope(pair: Pair) -> None:
-    """What an envelope adds to the largest message leaves it within the largest size of an envelope."""
-    pair.hold()
-    largest = bytes(MAX_MESSAGE_BYTES)
-    request = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))
-    assert request is not None
-    sealed = [
-        pair.operator.seal_command(largest),
-        pair.operator.seal_request("session", largest),
-        pair.vehicle.seal_state(largest),
-        pair.vehicle.seal_reply(request, largest),
-    ]
-    assert max(map(len, sealed)) <= LONGEST_BYTES
 
 
 @given(st.binary(max_size=1400))

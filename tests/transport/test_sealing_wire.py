@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from lavt.domain import SessionReply, SessionRequest
-from lavt.transport.messages import encode
-from lavt.transport.sealing import OperatorSeal, VehicleSeal
+from lavt.transport.messages import MAX_MESSAGE_BYTES, encode
+from lavt.transport.sealing import LONGEST_BYTES, OperatorSeal, VehicleSeal
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
@@ -88,3 +88,17 @@ def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     secret = client.secret(server, b"LAVT 1 secret car\0" + client.public + server)
     assert secret is not None
     assert decrypt(secret, signed[65:], digest) == GRANTED
+
+
+def test_the_largest_message_fits_into_every_envelope(session: Session) -> None:
+    """What an envelope adds to the largest message leaves it within the largest size of an envelope."""
+    largest = bytes(MAX_MESSAGE_BYTES)
+    request = session.vehicle.open_request("netem", session.operator.seal_request("netem", b""))
+    assert request is not None
+    sealed = [
+        session.operator.seal_command(largest),
+        session.operator.seal_request("session", largest),
+        session.vehicle.seal_state(largest),
+        session.vehicle.seal_reply(request, largest),
+    ]
+    assert max(map(len, sealed)) <= LONGEST_BYTES
