@@ -80,6 +80,7 @@ def test_what_others_put_into_a_header() -> None:
     fixed = bytes.fromhex("b2 60 0102 03040506 0708090a")
     sources, extension = b"c" * 8, bytes.fromhex("bede 0002") + b"e" * 8
     assert parse_packet(fixed + sources + extension + b"payload" + b"\x00\x00\x03").payload == b"payload"
+    assert parse_packet(bytes.fromhex("90 60 0102 03040506 0708090a bede 0000")).payload == b""
 
 
 @pytest.mark.parametrize(
@@ -120,6 +121,7 @@ def test_split() -> None:
         PPS,
         IDR,
     ]
+    assert split_nal_units(b"\x00\x00\x01" + SPS) == [SPS]
     assert split_nal_units(b"no start code") == []
     assert split_nal_units(b"") == []
 
