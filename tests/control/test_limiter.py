@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.control.rig import MAX_STEERING_RAD, WHEELBASE_M, new_limiter, vehicle_at
 
-from lavt.control.limiter import sight_limit_mps
+from lavt.control.limiter import COMMAND_PERIOD_S, sight_limit_mps
 from lavt.control.limits import LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 
@@ -32,28 +32,44 @@ def test_lateral_acceleration_is_limited(sign: int) -> None:
     assert changed == ("lateral acceleration",)
 
 
-def test_the_wheel_turns_no_further_than_the_cars() -> None:
-    """At standstill the limit is the vehicle's own largest angle."""
-    actuation, changed = limited(Actuation(1.0, 0.0, 0.0), 0.0)
-    assert (actuation.steering_rad, changed) == (MAX_STEERING_RAD, ("steering angle",))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_wheel_turns_no_further_than_the_cars(sign: int) -> None:
+    """At standstill the limit is the vehicle's own largest angle, to either side."""
+    actuation, changed = limited(Actuation(sign * 1.0, 0.0, 0.0), 0.0)
+    assert (actuation.steering_rad, changed) == (sign * MAX_STEERING_RAD, ("steering angle",))
 
 
-def test_the_wheel_turns_no_faster_than_the_rate() -> None:
-    """In 10 ms the target moves by 8 mrad at most, and the rest follows as time goes on."""
-    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=10 * NS_PER_MS)
-    assert actuation.steering_rad == pytest.approx(0.008)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_angle_at_a_limit_is_not_changed(sign: int) -> None:
+    """The largest angle at standstill and that of the lateral acceleration at 30 km/h get through as they are."""
+    for bound_rad, speed_mps in ((MAX_STEERING_RAD, 0.0), (LATERAL_RAD, SPEED_MPS)):
+        asked = Actuation(sign * bound_rad, 0.0, 0.0)
+        assert limited(asked, speed_mps) == (asked, ())
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_wheel_turns_no_faster_than_the_rate(sign: int) -> None:
+    """In 10 ms the target moves by 8 mrad at most, and the rest follows as time goes on; to either side."""
+    asked = Actuation(sign * 0.1, 0.0, 0.0)
+    actuation, changed = limited(asked, SPEED_MPS, after_ns=10 * NS_PER_MS)
+    assert actuation.steering_rad == pytest.approx(sign * 0.008)
     assert changed == ("steering rate",)
-    actuation, changed = limited(Actuation(0.1, 0.0, 0.0), SPEED_MPS, after_ns=125 * NS_PER_MS)
-    assert actuation.steering_rad == pytest.approx(0.1)
-    assert changed == ()
+    assert limited(asked, SPEED_MPS, after_ns=125 * NS_PER_MS) == (asked, ())
 
 
 def test_what_is_reached_within_a_command_period_is_not_called_limited() -> None:
     """A target that the wheel reaches within 20 ms was not changed by the limit, only spread over ticks of 4 ms."""
-    for asked_rad, named in ((0.0159, ()), (0.0161, ("steering rate",))):
-        actuation, changed = limited(Actuation(asked_rad, 0.0, 0.0), SPEED_MPS, after_ns=4 * NS_PER_MS)
-        assert actuation.steering_rad == pytest.approx(0.0032)
-        assert changed == named
+    period_rad = LIMITS.steering_rate_radps * COMMAND_PERIOD_S
+    for from_rad in (0.0, 0.1, -0.1):
+        for turn_rad, named in ((0.0159, ()), (0.0161, ("steering rate",))):
+            for sign in (1, -1):
+                limiter = new_limiter()
+                limiter.start(from_rad, 0)
+                asked = Actuation(from_rad + sign * turn_rad, 0.0, 0.0)
+                actuation = limiter.limit(asked, vehicle_at(0.0), 4 * NS_PER_MS)
+                assert actuation.steering_rad == pytest.approx(from_rad + sign * 0.0032)
+                assert limiter.changed == named
+    assert limited(Actuation(period_rad, 0.0, 0.0), 0.0, after_ns=4 * NS_PER_MS)[1] == ()
 
 
 def test_a_time_that_goes_back_gives_no_extra_turn() -> None:
@@ -126,10 +142,20 @@ def test_faster_than_sight_allows_it_brakes() -> None:
         assert actuation.brake == pytest.approx(brake)
 
 
+def test_faster_than_sight_allows_either_pedal_is_changed_alone() -> None:
+    """Above the limit a throttle is taken away from under a harder brake, and a brake is pressed without a throttle."""
+    full = LIMITS.stop_deceleration_mps2 / 6.0
+    assert by_sight(Actuation(0.0, 0.8, 0.9), 1.0) == (Actuation(0.0, 0.0, 0.9), ("sight",))
+    actuation, changed = by_sight(Actuation(0.0, 0.0, 0.1), 1.0)
+    assert (actuation.throttle, changed) == (0.0, ("sight",))
+    assert actuation.brake == pytest.approx(full)
+
+
 def test_sight_eases_no_brake_and_names_what_it_changes_only() -> None:
     """Who brakes harder than that is left alone, and so is who stays below the limit or drives by no picture."""
     assert by_sight(Actuation(0.0, 0.0, 0.9), 5.0) == (Actuation(0.0, 0.0, 0.9), ())
     assert by_sight(Actuation(0.0, 0.8, 0.0), -0.01) == (Actuation(0.0, 0.8, 0.0), ())
+    assert by_sight(Actuation(0.0, 0.8, 0.0), 0.0) == (Actuation(0.0, 0.8, 0.0), ())
     assert limited(Actuation(0.0, 0.8, 0.0), 11.0) == (Actuation(0.0, 0.8, 0.0), ())
     limiter = new_limiter()
     assert limiter.limit(Actuation(0.0, 0.0, 0.2), vehicle_at(math.nan), 0, 2 * NS_PER_S).brake == 0.2

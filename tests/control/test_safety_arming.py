@@ -9,6 +9,7 @@ import pytest
 from tests.control.rig import TICK_NS, Rig, vehicle_at
 
 from lavt.control.limits import LIMITS
+from lavt.control.safety import LARGEST_STORED_NUMBER
 from lavt.domain import NS_PER_MS, NS_PER_S
 
 
@@ -96,6 +97,33 @@ def test_arming_does_not_even_begin_without_its_conditions(name: str) -> None:
     assert rig.state == "disarmed"
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"brake": LIMITS.arming_brake},
+        {"steering_rad": LIMITS.arming_steering_rad},
+        {"steering_rad": -LIMITS.arming_steering_rad},
+        {"sequence": 0},
+    ],
+    ids=str,
+)
+def test_arming_begins_at_the_bounds_of_its_conditions(changes: dict[str, Any]) -> None:
+    """The lightest brake, the largest steering input to either side and the first sequence number are enough."""
+    rig = Rig().hold()
+    rig.picture()
+    assert rig.send(**changes).obeyed
+    assert rig.state == "arming"
+
+
+def test_arming_begins_from_the_first_picture_of_all() -> None:
+    """A picture with frame number 0 is newer than none."""
+    rig = Rig().hold()
+    rig.frame = -1
+    rig.picture()
+    rig.send()
+    assert rig.state == "arming"
+
+
 def test_arming_does_not_begin_with_a_picture_already_used() -> None:
     """Pictures must be fresh when arming begins: one that was used 300 ms ago is not, though young enough to obey."""
     rig = Rig().hold()
@@ -122,6 +150,19 @@ def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
     assert (rig.actuation().throttle, rig.actuation().brake) == (0.0, LIMITS.arming_brake)
     rig.go(200 * NS_PER_MS)
     assert rig.state == "safe_stop"
+
+
+def test_armed_anew_the_last_drives_command_is_forgotten() -> None:
+    """Armed again after a stop, the vehicle keeps its brake on and its wheel where it is until a new drive command."""
+    rig = Rig().driving(steering_rad=0.05)
+    rig.go(LIMITS.stop_after_ns)
+    assert rig.state == "safe_stop"
+    rig.ask("hold")
+    rig.arm_for(NS_PER_S)
+    assert rig.state == "driving"
+    actuation = rig.actuation()
+    assert (actuation.steering_rad, actuation.throttle) == (0.0, 0.0)
+    assert actuation.brake >= LIMITS.arming_brake
 
 
 def test_the_first_steering_target_is_where_the_wheel_is() -> None:
@@ -196,6 +237,19 @@ def test_the_number_of_an_emergency_stop_only_grows() -> None:
     assert rig.gate.counts["emergency stop with an old number"] == 5
     assert rig.ask("emergency_stop", "bob", 2, number=41).granted
     assert rig.state == "emergency_stop"
+
+
+@pytest.mark.parametrize("beyond", [0, 1])
+def test_a_number_too_large_to_be_followed_stops_and_is_forgotten(beyond: int) -> None:
+    """An emergency stop with any higher number stops the vehicle; one that leaves no room for a next is not kept."""
+    rig = Rig().armed()
+    rig.ask("emergency_stop", "bob", 2, number=40)
+    rig.clear()
+    reply = rig.ask("emergency_stop", "bob", 2, number=LARGEST_STORED_NUMBER + beyond)
+    assert (reply.granted, rig.state) == (True, "emergency_stop")
+    assert reply.emergency_stop == (40 if beyond else LARGEST_STORED_NUMBER)
+    assert rig.clear().granted
+    assert rig.state == "disarmed"
 
 
 def test_a_command_that_carries_an_emergency_stop_never_moves_the_vehicle() -> None:

@@ -170,6 +170,14 @@ def test_degraded_takes_the_throttle_away_and_brakes_gently() -> None:
     assert rig.actuation().throttle == 0.75
 
 
+def test_a_stop_harder_than_the_brakes_is_full_brake() -> None:
+    """A stop that asks for more deceleration than the vehicle has presses the pedal fully and no further."""
+    rig = Rig(replace(LIMITS, stop_deceleration_mps2=MAX_BRAKING_MPS2 + 1)).driving()
+    rig.vehicle = vehicle_at(8.0)
+    rig.go(STOP_NS)
+    assert (rig.state, rig.actuation().brake) == ("safe_stop", 1.0)
+
+
 def test_silence_never_eases_a_brake() -> None:
     """A client that was braking hard when it fell silent goes on braking as hard."""
     rig = Rig().driving(throttle=0.0, brake=0.9)

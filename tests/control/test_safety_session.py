@@ -19,6 +19,22 @@ def test_nobody_is_obeyed_before_somebody_holds_the_vehicle() -> None:
     assert rig.state == "disarmed"
 
 
+def test_what_is_in_force_is_known_from_the_start() -> None:
+    """Epoch and last accepted sequence can be read before the first session; a new epoch has no sequence yet."""
+    rig = Rig()
+    before, sequence = rig.gate.in_force
+    assert sequence == -1
+    rig.hold()
+    assert rig.gate.in_force == (rig.epoch, -1)
+    assert rig.epoch != before
+    rig.picture()
+    assert rig.send().obeyed
+    assert rig.gate.in_force == (rig.epoch, rig.sequence)
+    rig.ask("release")
+    assert rig.gate.in_force[0] not in (before, rig.epoch)
+    assert rig.gate.in_force[1] == -1
+
+
 def test_the_holder_gets_an_epoch_and_a_token() -> None:
     """Holding hands out the epoch to command under and the token that opens the path of the video."""
     reply = Rig().ask("hold")
@@ -237,7 +253,9 @@ def test_asking_is_for_what_somebody_else_holds() -> None:
     rig = Rig()
     assert rig.ask("ask").because == "nobody holds the vehicle"
     rig.hold()
-    assert rig.ask("ask").because == "you hold the vehicle"
+    refused = rig.ask("ask")
+    assert refused.because == "you hold the vehicle"
+    assert (refused.granted, refused.epoch, refused.token) == (False, 0, b"")
     assert asked_by(rig) == ""
 
 

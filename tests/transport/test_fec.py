@@ -411,6 +411,7 @@ def test_access_unit() -> None:
         # Packets that came after all, counted as lost in the report before.
         ([(25, 1000, 0), (-25, 0, 1)], 1, 1),
         ([(0, 0, 0)], 0, 0),
+        ([(1, 40, 0)], 0, 2),
     ],
 )
 def test_chooser(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:

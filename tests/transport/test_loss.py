@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, Picture
@@ -16,6 +18,7 @@ from lavt.transport.rtp import Depacketizer, Packetizer, parse_packet
 from lavt.transport.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
 
 FRAMES = 30
+GOP_FRAMES = 10
 START_NS = 1_790_000_000_000_000_000
 FRAME_NS = 33_333_333
 
@@ -28,7 +31,7 @@ class Sent:
     """30 frames with a keyframe every 10: the datagrams of each, and what a decoder makes of them without loss."""
 
     def __init__(self) -> None:
-        encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=10)
+        encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=GOP_FRAMES)
         packetizer = Packetizer(ssrc=7, first_sequence=65_500)
         decoder = Decoder()
         texture = stream(1, "texture").integers(0, 256, (128, 160 + FRAMES, 3), dtype=np.uint8)
@@ -75,12 +78,15 @@ def test_reordered(sent: Sent) -> None:
 
 @settings(max_examples=60)
 @given(st.sets(st.integers(0, 500), max_size=12))
+@example(set())
 def test_lost(sent: Sent, lost: set[int]) -> None:
-    """Whatever is lost, a picture with nothing incomplete since the last complete keyframe is exactly the one sent."""
+    """Pictures up to the first loss after a keyframe are trusted, no others, and each is exactly the one sent."""
     packets = [parse_packet(datagram) for datagrams in sent.datagrams for datagram in datagrams]
     lost = {number % len(packets) for number in lost}
+    damaged = {packets[number].timestamp for number in lost}
     depacketizer, decoder = Depacketizer(), Decoder()
-    in_doubt, trusted, before_lost = True, 0, False
+    in_doubt, before_lost = True, False
+    trusted: list[int] = []
     for number, packet in enumerate(packets):
         if number in lost:
             before_lost = True
@@ -92,7 +98,11 @@ def test_lost(sent: Sent, lost: set[int]) -> None:
                 assert decoded is not None
                 assert np.array_equal(decoded.picture, sent.pictures[unit.timestamp])
                 assert not decoded.corrupt
-                trusted += 1
+                trusted.append(unit.timestamp)
         before_lost = False
     assert depacketizer.malformed == 0
-    assert lost or trusted == FRAMES
+    timestamps = [rtp_timestamp(stamp_of(number)) for number in range(FRAMES)]
+    groups = [timestamps[begin : begin + GOP_FRAMES] for begin in range(0, FRAMES, GOP_FRAMES)]
+    assert trusted == [
+        timestamp for group in groups for timestamp in itertools.takewhile(lambda each: each not in damaged, group)
+    ]

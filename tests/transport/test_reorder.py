@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -38,6 +39,7 @@ def test_start() -> None:
     """The first packets wait one hold, so that the stream begins with the first sent and not the first to arrive."""
     buffer = ReorderBuffer(HOLD_NS)
     assert buffer.next_wake_ns() is None
+    assert buffer.highest_sequence == 0
     assert buffer.push(packet(11), 100) == []
     assert buffer.push(packet(12), 100 + NS_PER_MS) == []
     assert buffer.push(packet(10), 100 + 2 * NS_PER_MS) == []
@@ -119,9 +121,9 @@ def test_late_and_duplicate() -> None:
 
 def test_new_sender() -> None:
     """A new SSRC lets go all that is held and begins a new stream, which the old one's packets are missing before."""
-    buffer = started()
-    buffer.push(packet(2), STARTED_NS)
-    assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [2]
+    buffer = started(50_000)
+    buffer.push(packet(50_002), STARTED_NS)
+    assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [50_002]
     ordered = buffer.expire(STARTED_NS + HOLD_NS)
     assert [(one.ssrc, one.sequence, lost) for one, lost in ordered] == [(8, 40_000, True)]
     assert buffer.highest_sequence == 40_000
@@ -145,14 +147,15 @@ def test_stray_packets_apart() -> None:
     assert buffer.stray == 3
 
 
-def test_jump() -> None:
+@pytest.mark.parametrize(("first", "second"), [(20_000, 20_001), (65_535, 0)])
+def test_jump(first: int, second: int) -> None:
     """Two packets in a row in another range move the stream there, and neither of them is dropped."""
-    buffer = started()
-    assert buffer.push(packet(20_000), STARTED_NS) == []
-    assert buffer.push(packet(20_001), STARTED_NS) == []
+    buffer = started(10_000)
+    assert buffer.push(packet(first), STARTED_NS) == []
+    assert buffer.push(packet(second), STARTED_NS) == []
     ordered = buffer.expire(STARTED_NS + HOLD_NS)
-    assert numbers(ordered) == [20_000, 20_001]
-    assert gaps(ordered) == [20_000]
+    assert numbers(ordered) == [first, second]
+    assert gaps(ordered) == [first]
     assert (buffer.stray, buffer.lost) == (0, 0)
 
 
@@ -181,6 +184,17 @@ def test_bounded_memory() -> None:
     buffer = ReorderBuffer(hold_ns=10**15)
     released = [buffer.push(packet(2 * number), number) for number in range(CAPACITY + 50)]
     assert sum(len(ordered) for ordered in released) == 50
+
+
+def test_bounded_memory_of_losses() -> None:
+    """However many packets are given up, a fixed number is remembered, and the newest of them still count as late."""
+    buffer = started()
+    for number in range(2, 5 * MAX_JUMP):
+        buffer.push(packet(2 * number), STARTED_NS)
+        buffer.expire(STARTED_NS + HOLD_NS)
+        assert len(buffer._given_up) <= 2 * MAX_JUMP
+    assert buffer.push(packet(2 * number - MAX_JUMP + 1), STARTED_NS) == []
+    assert (buffer.late, buffer.duplicate) == (1, 0)
 
 
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
@@ -232,16 +246,17 @@ def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
     assert numbers(buffer.push(packet(1, ssrc=9), now_ns + HOLD_NS)) == [1]
 
 
-def test_recovered() -> None:
+@pytest.mark.parametrize("first", [0, 40_000])
+def test_recovered(first: int) -> None:
     """A packet made again closes its gap like one that came, and counts as recovered only."""
-    buffer = started()
-    assert buffer.push(packet(2), STARTED_NS) == []
-    ordered = buffer.push_recovered(packet(1), STARTED_NS + 1)
-    assert (numbers(ordered), gaps(ordered)) == ([1, 2], [])
-    assert numbers(buffer.push_recovered(packet(3), STARTED_NS + 2)) == [3]
-    assert buffer.highest_sequence == 3
+    buffer = started(first)
+    assert buffer.push(packet(first + 2), STARTED_NS) == []
+    ordered = buffer.push_recovered(packet(first + 1), STARTED_NS + 1)
+    assert (numbers(ordered), gaps(ordered)) == ([first + 1, first + 2], [])
+    assert numbers(buffer.push_recovered(packet(first + 3), STARTED_NS + 2)) == [first + 3]
+    assert buffer.highest_sequence == first + 3
     assert (buffer.recovered, buffer.reordered, buffer.lost, buffer.late, buffer.duplicate) == (2, 0, 0, 0, 0)
-    assert buffer.push(packet(1), STARTED_NS + 3) == []
+    assert buffer.push(packet(first + 1), STARTED_NS + 3) == []
     assert buffer.duplicate == 1
 
 
@@ -293,6 +308,23 @@ def test_the_hold_follows_repairs() -> None:
     hold_of(buffer, 1, STARTED_NS)
     assert buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS) == []
     assert hold_of(buffer, 3, STARTED_NS + 20 * NS_PER_MS) == 25 * NS_PER_MS
+
+
+def test_the_hold_of_an_open_gap_grows_with_what_closes_another() -> None:
+    """While a gap is open, a packet behind it that was overtaken by 9 ms lengthens the hold of that gap too."""
+    buffer = started(hold_ns=None)
+    for number, after_ns in ((2, 0), (4, 0), (3, 9 * NS_PER_MS)):
+        assert buffer.push(packet(number), STARTED_NS + after_ns) == []
+    assert buffer.next_wake_ns() == STARTED_NS + 11_250_000
+
+
+def test_what_was_not_given_up_changes_no_hold() -> None:
+    """A packet from before the start, or one made again that had left already, is dropped and changes no hold."""
+    buffer = started(10, hold_ns=None)
+    assert buffer.push(packet(9), STARTED_NS + 50 * NS_PER_MS) == []
+    assert buffer.push_recovered(packet(10), STARTED_NS + 50 * NS_PER_MS) == []
+    assert (buffer.late, buffer.recovered) == (1, 0)
+    assert hold_of(buffer, 11, STARTED_NS + 50 * NS_PER_MS) == LEAST_HOLD_NS
 
 
 def test_nobody_waits_for_ever() -> None:

@@ -71,6 +71,8 @@ def test_header_as_in_the_rfc() -> None:
     """The header has the bytes that RFC 3550 gives it."""
     sent = RtpPacket(96, 0x0102, 0x03040506, 0x0708090A, marker=True, payload=b"x")
     assert sent.to_bytes() == bytes.fromhex("80 e0 0102 03040506 0708090a") + b"x"
+    of_type_0 = parse_packet(bytes.fromhex("80 80 0102 03040506 0708090a"))
+    assert (of_type_0.payload_type, of_type_0.marker) == (0, True)
 
 
 def test_what_others_put_into_a_header() -> None:
@@ -78,6 +80,7 @@ def test_what_others_put_into_a_header() -> None:
     fixed = bytes.fromhex("b2 60 0102 03040506 0708090a")
     sources, extension = b"c" * 8, bytes.fromhex("bede 0002") + b"e" * 8
     assert parse_packet(fixed + sources + extension + b"payload" + b"\x00\x00\x03").payload == b"payload"
+    assert parse_packet(bytes.fromhex("90 60 0102 03040506 0708090a bede 0000")).payload == b""
 
 
 @pytest.mark.parametrize(
@@ -118,6 +121,7 @@ def test_split() -> None:
         PPS,
         IDR,
     ]
+    assert split_nal_units(b"\x00\x00\x01" + SPS) == [SPS]
     assert split_nal_units(b"no start code") == []
     assert split_nal_units(b"") == []
 
@@ -249,6 +253,8 @@ def test_sender_without_markers() -> None:
 MALFORMED = {
     "empty": b"",
     "forbidden bit": b"\xc1abc",
+    "forbidden bit of a STAP-A": b"\xf8\x00\x01A",
+    "forbidden bit of an FU-A": b"\xfc\x05abc",
     "type 0": b"\x60abc",
     "type 31": b"\x7fabc",
     "STAP-B": b"\x79abc",
@@ -305,6 +311,17 @@ def test_a_peer_that_never_ends() -> None:
     (unit,) = depacketizer.push(packet(SLICE, marker=True), False)
     assert not unit.complete
     assert len(unit.data) <= MAX_ACCESS_UNIT_BYTES + 4
+
+
+@pytest.mark.parametrize(("more_bytes", "malformed"), [(0, 0), (1, 1)])
+def test_the_largest_access_unit(more_bytes: int, malformed: int) -> None:
+    """An access unit of the largest size is complete; a packet that would make it longer is malformed."""
+    depacketizer = Depacketizer()
+    depacketizer.push(packet(SLICE + bytes(999)), False)
+    # What is there already has a start code before its 1000 bytes.
+    last = SLICE + bytes(MAX_ACCESS_UNIT_BYTES - 1004 - 1 + more_bytes)
+    (unit,) = depacketizer.push(packet(last, marker=True), False)
+    assert (depacketizer.malformed, unit.complete) == (malformed, not malformed)
 
 
 HEADS = st.sampled_from(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -15,7 +17,7 @@ pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from lavt.transport.sealing import NoSeal, OperatorSeal, VehicleSeal
+from lavt.transport.sealing import KEPT, LONGEST_BYTES, TRAILER_BYTES, NoSeal, OperatorSeal, Reply, VehicleSeal
 from lavt.transport.signing import PrivateKey
 
 COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
@@ -96,6 +98,15 @@ def test_any_operator_stops_the_vehicle(pair: Pair) -> None:
     stop = replace(COMMAND, emergency_stop=9)
     assert pair.vehicle.open_command(Pair("bob", BOB).command(stop)) == encode(stop)
     assert pair.vehicle.open_command(Pair("bob", MALLORY).command(stop)) is None
+    assert pair.vehicle.open_command(Pair("bob", BOB).operator.seal_command(b"garbage")) is None
+
+
+def test_before_a_session_no_command_has_a_valid_code(pair: Pair) -> None:
+    """Before there is a session its codes are zeros, and the vehicle accepts no zeros as a code."""
+    assert pair.command()[-TRAILER_BYTES:-64] == bytes(16)
+    assert not pair.vehicle.is_from_holder(pair.command())
+    assert not pair.vehicle.is_next_of_holder("session", pair.request())
+    assert not pair.operator.is_next_state(pair.vehicle.seal_state(b"state"))
 
 
 def test_after_a_release_nobody_commands(pair: Pair) -> None:
@@ -167,6 +178,31 @@ def test_an_emergency_stop_is_not_asked_twice(pair: Pair) -> None:
     assert not request.is_stale
 
 
+def test_a_request_without_a_body_only_asks_for_the_place(pair: Pair) -> None:
+    """An empty request is never decided on, though its place is the next, and is not counted as a replay."""
+    pair.hold()
+    before = pair.vehicle.counts["session_requests_of_another_time"]
+    request = pair.vehicle.open_request("session", pair.operator.seal_request("session", b""))
+    assert request is not None
+    assert request.is_stale
+    assert pair.vehicle.counts["session_requests_of_another_time"] == before
+
+
+def test_a_request_with_an_impossible_key_is_refused(pair: Pair) -> None:
+    """A request whose X25519 key gives no secret is counted as a forgery, whoever has signed it."""
+    pair.operator._agreement.public = bytes(32)
+    assert pair.vehicle.open_request("session", pair.request()) is None
+    assert pair.vehicle.counts["session_requests_forged"] == 1
+
+
+def test_a_reply_without_a_token_leaves_the_codes_as_they_are(pair: Pair) -> None:
+    """A request that is granted without a token, as an emergency stop is, does not end the holder's session."""
+    pair.hold()
+    pair.ask(pair.request("emergency_stop", 7), SessionReply(True, "", 0, b"", 5600, "kernel", 7))
+    assert pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
+
+
 def test_a_request_in_another_name_is_refused(pair: Pair) -> None:
     """Nobody asks in the name of another operator, nor without a name that is known."""
     for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
@@ -207,16 +243,29 @@ def test_a_reply_counts_once(pair: Pair) -> None:
     assert pair.operator.open_reply("session", sealed).body == encode(GRANTED)
 
 
+@pytest.mark.parametrize("changes", [{"secret": bytes(32)}, {"public": bytes(32)}], ids=["secret", "key"])
+def test_a_reply_that_cannot_be_decrypted_is_a_forgery(pair: Pair, changes: dict[str, Any]) -> None:
+    """A signed reply that the operator cannot decrypt is counted, and the request goes on waiting for its reply."""
+    pair.hold()
+    request = pair.vehicle.open_request("session", pair.request())
+    assert request is not None
+    unreadable = pair.vehicle.seal_reply(replace(request, **changes), encode(GRANTED))
+    assert pair.operator.open_reply("session", unreadable) == Reply(None, None)
+    assert pair.operator.counts["session_replies_forged"] == 1
+    assert pair.operator.open_reply("session", pair.vehicle.seal_reply(request, encode(GRANTED))).body is not None
+
+
 def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
     """A reply that comes after that to a later query says what is no longer so: it is dropped."""
     pair.hold()
     replies = []
-    for _ in range(2):
-        request = pair.vehicle.open_request("session", pair.request())
+    for number in range(2):
+        request = pair.vehicle.open_request("session", pair.request("hold", number))
         assert request is not None
         replies.append(pair.vehicle.seal_reply(request, b"" if request.is_stale else encode(GRANTED)))
     assert pair.operator.open_reply("session", replies[1]).again is not None
-    assert pair.operator.open_reply("session", replies[0]).body is None
+    assert pair.operator.open_reply("session", replies[0]) == Reply(None, None)
+    assert pair.operator.open_reply("session", replies[1]) == Reply(None, None)
 
 
 def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
@@ -241,6 +290,7 @@ def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pa
     opened = pair.operator.open_state(anew.seal_state(b"new"))
     assert opened.body is None
     assert opened.ask
+    assert pair.operator.counts["states_of_another_time"] == 1
     pair.vehicle = anew
     pair.ask(pair.operator.seal_request("session", b""))
     assert pair.operator.open_state(anew.seal_state(b"newer")).body == b"newer"
@@ -264,13 +314,57 @@ def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
     assert not request.is_stale
 
 
-def test_what_waits_is_bounded(pair: Pair) -> None:
-    """Neither requests without replies nor clients that come and go take more and more memory."""
-    for _ in range(50):
-        pair.request()
-        pair.vehicle.open_request("session", Pair().request())
-    assert len(pair.operator._asked) <= 8
-    assert len(pair.vehicle._agreements) <= 8
+def test_requests_without_replies_are_bounded(pair: Pair) -> None:
+    """Of requests that wait for a reply only the newest are kept: their replies are accepted, those before are not."""
+    pair.hold()
+    requests = [pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))]
+    requests += [pair.vehicle.open_request("session", pair.request("hold", number)) for number in range(3 * KEPT)]
+    assert len(pair.operator._asked) == KEPT
+    replies = [pair.vehicle.seal_reply(request, encode(GRANTED)) for request in requests if request is not None]
+    assert pair.operator.open_reply("netem", replies[0]) == Reply(None, None)
+    assert pair.operator.open_reply("session", replies[-KEPT - 1]) == Reply(None, None)
+    assert len(pair.operator._asked) == KEPT
+    assert pair.operator.open_reply("session", replies[-KEPT]) != Reply(None, None)
+
+
+def test_agreements_with_clients_are_bounded(pair: Pair) -> None:
+    """Of clients that come and go the vehicle remembers the newest, and what it has agreed on with them."""
+    requests = [Pair().request() for _ in range(3 * KEPT)]
+    publics = [request.public for each in requests if (request := pair.vehicle.open_request("session", each))]
+    assert len(set(publics)) == 3 * KEPT
+    assert len(pair.vehicle._agreements) == KEPT
+    remembered = pair.vehicle.open_request("session", requests[-KEPT])
+    assert remembered is not None
+    assert remembered.public == publics[-KEPT]
+    forgotten = pair.vehicle.open_request("session", requests[0])
+    assert forgotten is not None
+    assert forgotten.public != publics[0]
+
+
+@pytest.mark.parametrize(("more_bytes", "accepted"), [(0, True), (1, False)])
+def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted: bool) -> None:
+    """An envelope of the largest size is opened; one that is a byte longer is a forgery, whoever has signed it."""
+    pair.hold()
+    command = bytes(LONGEST_BYTES - TRAILER_BYTES + more_bytes)
+    sealed = pair.operator.seal_command(command)
+    assert len(sealed) == LONGEST_BYTES + more_bytes
+    assert pair.vehicle.body(sealed) == (command if accepted else b"")
+    assert pair.vehicle.is_from_holder(sealed) == accepted
+    assert pair.vehicle.open_command(sealed) == (command if accepted else None)
+    state = bytes(LONGEST_BYTES - TRAILER_BYTES - 16 + more_bytes)
+    sealed = pair.vehicle.seal_state(state)
+    assert pair.operator.is_next_state(sealed) == accepted
+    assert pair.operator.open_state(sealed).body == (state if accepted else None)
+    request = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))
+    assert request is not None
+    reply = bytes(LONGEST_BYTES - len(pair.vehicle.seal_reply(request, b"")) + more_bytes)
+    fresh = replace(request, is_stale=False)
+    assert pair.operator.open_reply("netem", pair.vehicle.seal_reply(fresh, reply)).body == (
+        reply if accepted else None
+    )
+    refused = 0 if accepted else 1
+    assert pair.vehicle.counts["commands_forged"] == refused
+    assert pair.operator.counts == Counter(states_forged=refused, netem_replies_forged=refused)
 
 
 @given(st.binary(max_size=1400))

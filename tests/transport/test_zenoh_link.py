@@ -169,8 +169,17 @@ def test_queries(pair: Pair, channel: str, answer: str) -> None:
 
 
 def test_answer_to_nobody(pair: Pair) -> None:
-    """An answer to a question that is not open any more is dropped."""
-    pair.server.send(Send("session_reply", b"late", 10**9))
+    """An answer to a question that is not open, or was answered already, reaches nobody."""
+    question = Send("session", b"who?")
+    _, peer = pair.server_heard.next(("session", b"who?"), lambda: pair.client.send(question))
+    pair.server.send(Send("session_reply", b"to nobody", 10**9), Send("netem_reply", b"to nobody", peer))
+    pair.server.send(Send("session_reply", b"first", peer), Send("session_reply", b"second", peer))
+    pair.client_heard.next(("session_reply", b"first"))
+    _, following = pair.server_heard.next(("session", b"who?"), lambda: pair.client.send(question))
+    pair.server.send(Send("session_reply", b"following", following))
+    pair.client_heard.next(("session_reply", b"following"))
+    assert not {b"to nobody", b"second"} & set(pair.client_heard.payloads)
+    assert not [name for name in pair.server.counts if name.endswith("_reply_not_sent")]
 
 
 def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:

@@ -59,7 +59,7 @@ class Limiter:
         reached_rad = steering_rad
         if not before_rad - step_rad <= steering_rad <= before_rad + step_rad:
             reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
-            if abs(steering_rad - before_rad) > max(step_rad, self.limits.steering_rate_radps * COMMAND_PERIOD_S):
+            if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
         throttle = asked.throttle
         known = math.isfinite(vehicle.speed_mps)

@@ -168,7 +168,7 @@ class ReorderBuffer:
         first = min(self._held)
         if self._next is None:
             self._first = first
-        elif first > self._next:
+        else:
             missing = range(self._next, first)
             self.lost += len(missing)
             self._given_up.update(dict.fromkeys(missing, self._first_sign_ns()))
