@@ -4,12 +4,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 from benchmarks import mutation
 from benchmarks.mutating import results
 from benchmarks.mutating.modules import MODULES, area_of, own_tests, rest_of_area
 from benchmarks.mutating.sites import Mutation, Site, find_sites
+from benchmarks.mutating.trial import ENDLESS, Trial, WorkTree
 from tests.lanes import REPOSITORY
 
 from lavt.errors import UserError
@@ -224,3 +226,83 @@ def test_mutants_of_a_small_module_are_tried(tmp_path: Path) -> None:
     file.write_text(json.dumps({**kept[0], "caught": False, "by": ""}) + "\n")
     subprocess.run([*asked, "--rerun-survivors"], capture_output=True, text=True, check=True, timeout=250)
     assert [json.loads(line)["caught"] for line in file.read_text().splitlines()] == [False, kept[0]["caught"]]
+
+
+class PretendedTree:
+    """Passes the tests named in `passing` with a mutation, and all but those in `broken` without one."""
+
+    passing: ClassVar[set[str]] = set()
+    broken: ClassVar[set[str]] = set()
+    mutated_runs: ClassVar[list[tuple[str, ...]]] = []
+
+    def __init__(self, directory: Path, _repository: Path) -> None:
+        self.directory = directory
+
+    def run(self, tests: tuple[str, ...], _limit_s: float, *, unchanged: bool) -> Trial:
+        """Pretend to run without a mutation."""
+        assert unchanged
+        return Trial(self.broken.isdisjoint(tests), "", 1.0)
+
+    def run_mutated(self, _mutation: Mutation, tests: tuple[str, ...], limit_s: float) -> Trial:
+        """Pretend to run with one."""
+        assert limit_s >= 1.0
+        self.mutated_runs.append(tests)
+        return Trial(self.passing.issuperset(tests), "" if self.passing.issuperset(tests) else "a", 1.0)
+
+
+@pytest.fixture
+def pretended(monkeypatch: pytest.MonkeyPatch) -> type[PretendedTree]:
+    for name, empty in (("passing", set()), ("broken", set()), ("mutated_runs", [])):
+        monkeypatch.setattr(PretendedTree, name, empty)
+    monkeypatch.setattr(mutation, "WorkTree", PretendedTree)
+    return PretendedTree
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_wider_tests_follow_when_those_of_the_module_pass(
+    pretended: type[PretendedTree], tmp_path: Path, jobs: int
+) -> None:
+    """A mutant survives where its module's tests and then the rest of its area's pass."""
+    own, rest = own_tests("transport/hold.py"), rest_of_area("transport/hold.py")
+    of_one = mutation.sites_of(["transport/hold.py"])["transport/hold.py"][0][:1]
+    for passing, expected in ((set(), [own]), ({*own}, [own, rest]), ({*own, *rest}, [own, rest])):
+        pretended.passing, pretended.mutated_runs = passing, []
+        (result,) = mutation.Runner(tmp_path, jobs, 10.0).run(of_one)
+        assert pretended.mutated_runs == expected
+        assert result.caught == (passing != {*own, *rest})
+
+
+@pytest.mark.parametrize("broken", [own_tests("transport/hold.py")[0], "tests/transport"])
+def test_tests_that_fail_unmutated_end_the_run(
+    pretended: type[PretendedTree], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], broken: str,
+) -> None:  # fmt: skip
+    """Tests that fail without a mutation end the program with one line and exit code 2."""
+    pretended.broken = {broken}
+    pretended.passing = {*own_tests("transport/hold.py")}
+    monkeypatch.setattr(sys, "argv", ["mutation.py", "--only", "transport/hold.py", "--count", "1"])
+    monkeypatch.chdir(tmp_path)
+    assert mutation.main() == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.full
+def test_a_mutant_is_tried_in_a_copy(tmp_path: Path) -> None:
+    """Tests see the mutated module in a copy, which is put back after it; a loop without end is ended and caught."""
+    repository = tmp_path / "repository"
+    module = repository / "src" / "lavt" / "a.py"
+    for directory in (module.parent, repository / "tests"):
+        directory.mkdir(parents=True)
+    source = "def f(a):\n    while a > 0:\n        a -= 1\n    return a\n"
+    module.write_text(source)
+    module.with_name("__init__.py").write_text("")
+    profile = "import hypothesis\nhypothesis.settings.register_profile('mutation')\n"
+    (repository / "conftest.py").write_text(profile)
+    (repository / "tests" / "test_a.py").write_text("from lavt.a import f\n\ndef test_f():\n    assert f(3) == 0\n")
+    tree = WorkTree(tmp_path / "tree", repository)
+    assert tree.run(["tests/test_a.py"], 60.0, unchanged=True).passed
+    of_operator = {site[0].operator: site[0] for site in find_sites("a.py", source)}
+    for operator, limit_s, failed in (("return value", 60.0, "tests/test_a.py::test_f"), ("statement", 5.0, ENDLESS)):
+        trial = tree.run_mutated(of_operator[operator], ["tests/test_a.py"], limit_s)
+        assert trial.failed_test == failed
+    assert module.read_text() == tree.source("a.py").read_text() == source

@@ -30,7 +30,8 @@ LEFT_OUT: Final = (
 MEMORY_BYTES: Final = 8 * 2**30
 """Address space of a process: a mutant that allocates without end is ended by it."""
 OPTIONS: Final = (
-    "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-profile=mutation", "--basetemp=temporary",
+    "-x", "--timeout=120", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-profile=mutation",
+    "--basetemp=temporary",
 )  # fmt: skip
 ENDLESS: Final = "timeout"
 _CLOCK = MachineClock()
