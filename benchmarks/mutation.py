@@ -15,6 +15,7 @@ reasons in `mutating/accepted.toml` and counted apart. Progress is on standard e
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -181,4 +182,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the trees are removed, and the tests that run are ended
     sys.exit(main())

@@ -65,7 +65,31 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "control": ("control", "nodes", "test_life_of_a_frame.py"),
     "nodes": ("nodes", "control", "test_life_of_a_frame.py"),
     "transport": ("transport", "nodes", "test_life_of_a_frame.py"),
-    "experiment": ("experiment",),
+    "experiment": tuple(
+        f"experiment/test_{name}.py"
+        for name in (
+            "metrics",
+            "hops",
+            "validity",
+            "statistics",
+            "survival",
+            "summary",
+            "swept_summary",
+            "contrasts",
+            "compared_error",
+            "offset",
+            "clock_check",
+            "virtual_clocks",
+            "report",
+            "report_parts",
+            "report_words",
+            "figures",
+            "tabular",
+            "join",
+            "steering",
+            "plan",
+        )
+    ),  # those that make up records; the others drive
     _DBW: (_DBW, "test_build_by_wire.py"),
 }
 """Folder of a module to the wider tests: they are run for what its own tests let pass."""
