@@ -14,6 +14,11 @@ pytest_plugins = ["tests.support.inconclusive", "tests.support.progress"]
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 
 hypothesis.settings.register_profile("lavt", deadline=None)
+hypothesis.settings.register_profile(  # of benchmarks/mutation.py: the same examples each time, and none made smaller
+    "mutation", deadline=None, derandomize=True, database=None,
+    phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)  # fmt: skip
 hypothesis.settings.load_profile("lavt")
 
 
