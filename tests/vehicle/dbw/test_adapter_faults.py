@@ -281,7 +281,7 @@ def test_hands_on(generation: int) -> None:
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(lambda rig: rig.state == "overridden")
     assert 3000 <= took_ms <= 3010
-    assert any(event.detail.endswith("3 s: the driver steers") for event in rig.events)
+    assert any("3 s: the driver steers" in event.detail for event in rig.events)
     assert not any(moment.is_asked for moment in rig.moments)
     assert rig.adapter.state().is_overridden
 
