@@ -9,7 +9,7 @@ import hypothesis
 import pytest
 from tests.lanes import runs_side_by_side
 
-pytest_plugins = ["tests.support.inconclusive", "tests.support.progress"]
+pytest_plugins = ["tests.support.inconclusive", "tests.support.process_state", "tests.support.progress"]
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 

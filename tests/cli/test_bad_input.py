@@ -7,19 +7,17 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from tests.support.command_line import CommandResult, Run
 
 import lavt
-from lavt.cli import console
 from lavt.cli.main import app
 from lavt.config_file import shipped
 from lavt.experiment.results import IDENTITY
-from lavt.runtime import precedence
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))
@@ -31,43 +29,6 @@ RELAY = str(shipped("configs/relay.yaml"))
 RENDEZVOUS = str(shipped("configs/rendezvous.yaml"))
 ROUTER = str(shipped("zenoh-configs/router-server.json5"))
 ENDS_S = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """What a command left: exit code, standard output, standard error."""
-
-    code: int
-    out: str
-    err: str
-
-    def refused(self) -> str:
-        """Check that the input was refused as it must be, and give the sentence."""
-        assert self.code == 2, self
-        assert self.out == ""
-        assert self.err.startswith("lavt: ")
-        assert self.err.count("\n") == 1, self.err
-        assert "Traceback" not in self.err
-        return self.err
-
-
-Run = Callable[..., Ended]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Give a function that runs a command in this process, from an empty working directory."""
-    monkeypatch.setattr(console, "keep_stdout_for_results", lambda: None)  # it would take pytest's output away
-    monkeypatch.chdir(tmp_path)
-
-    def run_here(*arguments: str) -> Ended:
-        with pytest.raises(SystemExit) as ended:
-            console.run_command(lambda: app(list(arguments)))
-        said = capsys.readouterr()
-        code = ended.value.code
-        return Ended(code if isinstance(code, int) else 0, said.out, said.err)
-
-    return run_here
 
 
 def files(directory: Path) -> Mapping[str, bytes | None]:
@@ -83,13 +44,10 @@ BY_NETEM = [
     for part in ("--set", change)
 ]
 BAD_RUNS = {
-    "unknown key": (["--set", "vehicle.rute=a_key"], "did you mean 'route'?"),
+    "unknown key": (["--set", "vehicle.rute=a_key"], "vehicle.rute"),
     "wrong type": (["--set", "seed=one"], "'seed'"),
     "out of range": (["--set", "camera.rate_hz=0"], "'camera.rate_hz'"),
-    "exposure longer than a frame": (
-        ["--set", "camera.exposure_ms=34"],
-        "at most the time between two frames",
-    ),
+    "exposure longer than a frame": (["--set", "camera.exposure_ms=34"], "'camera.exposure_ms'"),
     "exposure of less than nothing": (["--set", "camera.exposure_ms=-1"], "'camera.exposure_ms'"),
     "endless sensor delay": (["--set", "camera.sensor_delay_ms=5000"], "'camera.sensor_delay_ms'"),
     "no such light": (["--set", "vehicle.light=moon"], "'vehicle.light'"),
@@ -101,41 +59,38 @@ BAD_RUNS = {
     "unknown preset": (["--set", "controller.preset=magic"], "designed, paper_calibrated"),
     "unknown preset in real time": (["--set", "controller.preset=magic", "--set", "time=real"], "designed"),
     "unknown controller": (["--set", "controller.kind=wizard"], "lane_keeper"),
-    "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "virtual time only"),
+    "no pixels in real time": (["--set", "fidelity=geometry", "--set", "time=real"], "fidelity geometry"),
     "unknown fidelity": (["--set", "fidelity=sketch"], "'geometry'"),
     "unknown vehicle": (["--set", "vehicle.kind=boat"], "simulator"),
     "no such trace": (["--set", "network.video.trace=nowhere.csv"], "fading.mahimahi, handover.csv"),
-    "no such trace in real time": (
-        ["--set", "network.video.trace=nowhere", "--set", "time=real"],
-        "there is no trace 'nowhere'",
-    ),
-    "a trace that is a directory": (["--set", "network.video.trace=."], "there is no trace '.'"),
-    "a trace of a long name": (["--set", f"network.video.trace={'a' * 300}"], "there is no trace 'aaa"),
+    "no such trace in real time": (["--set", "network.video.trace=nowhere", "--set", "time=real"], "'nowhere'"),
+    "a trace that is a directory": (["--set", "network.video.trace=."], "trace '.'"),
+    "a trace of a long name": (["--set", f"network.video.trace={'a' * 300}"], "trace 'aaa"),
     "a trace that the state is to follow": (
         ["--set", "network.condition=handover", "--set", "network.state_delay=with_video"],
-        "cannot follow its trace 'handover.csv': choose none",
+        "'handover.csv'",
     ),
-    "a trace that is none": (["--set", f"network.video.trace={DEMO}"], "is no time of a Mahimahi trace"),
+    "a trace that is none": (["--set", f"network.video.trace={DEMO}"], "Mahimahi"),
     "a trace and a rate": (
         ["--set", "network.condition=fading", "--set", "network.video.rate_bps=1000000"],
-        "give one of the two",
+        "rate_bps",
     ),
-    "overtaking nothing": (["--set", "network.video.reorder=0.1"], "reorder needs a delay"),
+    "overtaking nothing": (["--set", "network.video.reorder=0.1"], "reorder"),
     "a trace by netem": (
         ["--set", "network.condition=handover", *BY_NETEM],
-        "netem cannot replay the trace 'handover.csv': choose network.injection relay",
+        "'handover.csv'",
     ),
     "a short queue by netem": (
         ["--set", "network.condition=rate_short_queue", *BY_NETEM],
-        "not for queue_packets 50",
+        "queue_packets 50",
     ),
     "jitter beyond the delay by netem": (
         ["--set", "network.video.jitter_ms=5", *BY_NETEM],
-        "would need delays below zero",
+        "a jitter of 5 ms",
     ),
     "loss that nobody injects": (
         ["--set", "network.video.loss=0.1", "--set", "time=real", "--set", "network.injection=none"],
-        "network.injection is none",
+        "network.injection",
     ),
     "a profile that netem cannot do": (
         ["--set", "network.injection=netem", "--set", "time=real", "--set", "network.inherent=paper_wifi5"],
@@ -158,12 +113,12 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
 
 
 BAD_BOUNDARIES = {
-    "the delay that is searched": (["network.video.delay_ms=5"], "network.video.delay_ms is what is searched for"),
-    "unknown road": (["routes=[nowhere]"], "there is no road 'nowhere'"),
-    "unknown preset": (["presets=[swift]"], "no preset 'swift'"),
-    "a route twice": (["routes=[a, a]"], "each once"),
+    "the delay that is searched": (["network.video.delay_ms=5"], "network.video.delay_ms"),
+    "unknown road": (["routes=[nowhere]"], "'nowhere'"),
+    "unknown preset": (["presets=[swift]"], "'swift'"),
+    "a route twice": (["routes=[a, a]"], "routes"),
     "no grid": (["grid_ms=0"], "'grid_ms'"),
-    "a sweep's key": (["conditions=[L0]"], "unknown key 'conditions'"),
+    "a sweep's key": (["conditions=[L0]"], "'conditions'"),
     "real time": (["time=real"], "virtual time"),
 }
 
@@ -181,19 +136,20 @@ def test_codec_that_cannot_be(run: Run, tmp_path: Path) -> None:
     """A run that only the encoder can refuse, when the car is built already, leaves no directory behind either."""
     ended = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
     assert (ended.code, ended.out) == (2, "")
-    assert ended.err.splitlines()[-1].startswith("lavt: a decoder buffer of 0.0005 s")
+    assert ended.err.splitlines()[-1].startswith("lavt: ")
+    assert "buffer of 0.0005 s" in ended.err.splitlines()[-1]
     assert files(tmp_path) == {}
 
 
 ON_LO = ("--interface", "lo", "--role", "server")
 BAD_NETEM = {
     "unknown condition": (["apply", "L9", *ON_LO], "L0, L1, L2, L3, L4, L5"),
-    "the clock probe's port": (["apply", "L4", *ON_LO, "--video-port", "5602"], "would cover the clock probe"),
-    "the probe moved onto the video": (["apply", "L4", *ON_LO, "--probe-port", "5600"], "would cover the clock probe"),
-    "the port of NTP": (["apply", "L4", *ON_LO, "--video-port", "123"], "would cover NTP"),
-    "no interface's name": (["apply", "L4", "--role", "client", "--interface", "a/b"], "no name of an interface"),
+    "the clock probe's port": (["apply", "L4", *ON_LO, "--video-port", "5602"], "the clock probe (port "),
+    "the probe moved onto the video": (["apply", "L4", *ON_LO, "--probe-port", "5600"], "the clock probe (port "),
+    "the port of NTP": (["apply", "L4", *ON_LO, "--video-port", "123"], "NTP"),
+    "no interface's name": (["apply", "L4", "--role", "client", "--interface", "a/b"], "'a/b'"),
     "no such interface": (["show", "--interface", "nowhere0"], "nowhere0"),
-    "nothing to verify": (["verify", "--interface", "nowhere0"], "nothing was applied to nowhere0"),
+    "nothing to verify": (["verify", "--interface", "nowhere0"], "nowhere0"),
 }
 
 
@@ -275,7 +231,7 @@ def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path:
     else:
         mine.write_bytes(b"weeks of work")
     before = files(tmp_path)
-    assert "mine is not an empty directory" in run(*OUT[command], "mine").refused()
+    assert "mine" in run(*OUT[command], "mine").refused()
     assert files(tmp_path) == before
 
 
@@ -283,16 +239,16 @@ def test_out_that_cannot_be_made(run: Run, tmp_path: Path) -> None:
     """A directory that cannot be made is refused in one sentence."""
     (tmp_path / "file").write_bytes(b"")
     for arguments in (["demo"], ["sweep", SWEEP]):
-        assert "cannot be made" in run(*arguments, "--out", "file/inside").refused()
+        assert "file/inside" in run(*arguments, "--out", "file/inside").refused()
 
 
 def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     """A report of a directory without runs is refused, and nothing is written into it."""
     (tmp_path / "empty").mkdir()
-    assert "empty holds no finished run" in run("report", "empty").refused()
-    assert "empty holds no finished run" in run("report", "empty", "--out", "elsewhere").refused()
+    assert "empty" in run("report", "empty").refused()
+    assert "empty" in run("report", "empty", "--out", "elsewhere").refused()
     (tmp_path / "file").write_bytes(b"x")
-    assert "file is not a directory" in run("report", "empty", "--out", "file").refused()
+    assert "file" in run("report", "empty", "--out", "file").refused()
     assert files(tmp_path) == {"empty": None, "file": b"x"}
 
 
@@ -300,12 +256,12 @@ WHOLE = dict.fromkeys(IDENTITY)
 NO_RESULTS = {
     "nothing": ("", "cannot read"),
     "half a file": ('{"run": "a', "cannot read"),
-    "list": ("[]", "holds no JSON object"),
-    "number": ("7", "holds no JSON object"),
-    "empty object": ("{}", "it lacks run, time"),
-    "without a seed": (json.dumps({key: None for key in IDENTITY if key != "seed"}), "it lacks seed"),
-    "axes that are none": (json.dumps({**WHOLE, "axes": [1]}), "'axes' is no JSON object"),
-    "injection that is none": (json.dumps({**WHOLE, "injected_ms": 5}), "'injected_ms' is no JSON object"),
+    "list": ("[]", "JSON object"),
+    "number": ("7", "JSON object"),
+    "empty object": ("{}", "run, time"),
+    "without a seed": (json.dumps({key: None for key in IDENTITY if key != "seed"}), "seed"),
+    "axes that are none": (json.dumps({**WHOLE, "axes": [1]}), "'axes'"),
+    "injection that is none": (json.dumps({**WHOLE, "injected_ms": 5}), "'injected_ms'"),
 }
 
 
@@ -318,8 +274,8 @@ def test_report_of_what_is_no_result(case: str, run: Run, tmp_path: Path) -> Non
         (tmp_path / "sweep" / "runs" / name / "result.json").write_text(text)
     before = files(tmp_path)
     ended = run("report", "sweep")
-    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
-    assert said in ended.err
+    assert (ended.code, ended.out) == (1, "")
+    assert said in ended.sentence()
     assert "b/result.json" in ended.err
     assert files(tmp_path) == before
 
@@ -328,17 +284,17 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
     """A boundary alone is refused, and a boundary.json that is none ends the report with 1 and one sentence."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
-    assert "found holds a boundary and no runs" in run("report", "found").refused()
+    assert "found" in run("report", "found").refused()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
     ended = run("report", "found")
-    assert (ended.code, ended.out, ended.err.count("\n")) == (1, "", 1)
-    assert "boundary.json holds no boundary" in ended.err
+    assert (ended.code, ended.out) == (1, "")
+    assert "boundary.json" in ended.sentence()
     assert list(files(tmp_path / "found")) == ["boundary.json"]
 
 
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     """A sweep that was never begun cannot be resumed."""
-    assert "nothing to resume in never" in run("sweep", SWEEP, "--resume", "--out", "never").refused()
+    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").refused()
     assert files(tmp_path) == {}
 
 
@@ -346,20 +302,20 @@ SIDES = {
     "vehicle with a slash": (["server", SERVER, "--set", "vehicle_id=a/b"], "the vehicle 'a/b'"),
     "vehicle of stars": (["client", CLIENT, "--set", "vehicle_id='**'"], "the vehicle '**'"),
     "client without a name": (["client", CLIENT, "--set", "who=''"], "the client ''"),
-    "unknown key": (["server", SERVER, "--set", "vehicl_id=a"], "did you mean 'vehicle_id'?"),
+    "unknown key": (["server", SERVER, "--set", "vehicl_id=a"], "'vehicl_id'"),
     "missing session file": (["client", CLIENT, "--set", "zenoh.session=no.json5"], "no.json5"),
-    "TCP through the relay": (["relay", RELAY, "--set", "control_server=tcp/127.0.0.1:1"], "carries UDP only"),
+    "TCP through the relay": (["relay", RELAY, "--set", "control_server=tcp/127.0.0.1:1"], "control_server"),
     "rendezvous of a bad name": (
         ["rendezvous", RENDEZVOUS, "--set", "vehicle_id=a/b"],
         "the vehicle 'a/b'",
     ),
     "rendezvous without the key": (
         ["rendezvous", RENDEZVOUS, "--set", "vehicle_key=no.sign.pub"],
-        "the key no.sign.pub cannot be read",
+        "no.sign.pub",
     ),
-    "no address": (["relay", RELAY, "--set", "video_listen=here"], "write it as host:port"),
+    "no address": (["relay", RELAY, "--set", "video_listen=here"], "video_listen"),
     "router's unknown key": (["router", ROUTER, "--set", "lisen.endpoints=[]"], "lisen.endpoints"),
-    "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], "no listen endpoints"),
+    "router without endpoints": (["router", ROUTER, "--set", "listen.endpoints=[]"], ROUTER),
     "router's change without a value": (["router", ROUTER, "--set", "listen"], "a.b=value"),
     "router's change that is not YAML": (["router", ROUTER, "--set", "listen.endpoints=["], "not YAML"),
     "router's change that is a date": (["router", ROUTER, "--set", "mode=2026-01-01"], "mode"),
@@ -417,7 +373,8 @@ def test_list_of_commands(run: Run) -> None:
 def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
     """Directories that no side wrote are refused with what to name instead, and no run is made."""
     said = run("join", "one", "two", "--out", "joined").refused()
-    assert "one holds no config.yaml: name the --out of `lavt server`" in said
+    assert "one" in said
+    assert "config.yaml" in said
     assert not (tmp_path / "joined").exists()
 
 
@@ -457,78 +414,82 @@ def taken() -> Iterator[int]:
 def test_relay_port_in_use(taken: int, run: Run) -> None:
     """A relay whose port somebody else has is refused in one sentence."""
     said = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{taken}").refused()
-    assert f"the relay's video port 127.0.0.1:{taken} cannot be opened" in said
+    assert f"127.0.0.1:{taken}" in said
 
 
-def test_port_of_the_rendezvous_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_of_the_rendezvous_in_use(taken: int, run: Run) -> None:
     """A rendezvous of whose ports somebody else has one is refused in one sentence, and gives the other one back."""
-    monkeypatch.setattr(precedence, "take", lambda: None)
     changes = ("--set", "bind=127.0.0.1", "--set", "video_port=0", "--set", f"probe_port={taken}")
-    assert f"the probe port 127.0.0.1:{taken} cannot be opened" in run("rendezvous", RENDEZVOUS, *changes).refused()
+    assert f"127.0.0.1:{taken}" in run("rendezvous", RENDEZVOUS, *changes).refused()
 
 
 WATCHES = {
-    "no such address": (["--bind", "192.0.2.7"], "the video port 192.0.2.7:5600 cannot be opened"),
-    "no host to listen at": (["--bind", "a" * 64], "cannot be opened"),
-    "no host to hear": (["--from", "a" * 64], "--from: the host"),
+    "no such address": (["--bind", "192.0.2.7"], "192.0.2.7:5600"),
+    "no host to listen at": (["--bind", "a" * 64], "a" * 64),
+    "no host to hear": (["--from", "a" * 64], "--from"),
 }
 
 
 @pytest.mark.parametrize("case", WATCHES)
-def test_bad_watch(case: str, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_watch(case: str, run: Run) -> None:
     """A host that nobody knows, and an address that is not this machine's, are refused in one sentence."""
-    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
     arguments, said = WATCHES[case]
     assert said in run("watch", *arguments).refused()
 
 
-def test_watched_port_in_use(taken: int, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watched_port_in_use(taken: int, run: Run) -> None:
     """A port that somebody else has is refused in one sentence."""
-    monkeypatch.setattr(precedence, "take", lambda: None)
     said = run("watch", "--bind", "127.0.0.1", "--port", str(taken)).refused()
-    assert f"the video port 127.0.0.1:{taken} cannot be opened" in said
+    assert f"127.0.0.1:{taken}" in said
 
 
 def test_server_of_an_unknown_route(router: str, run: Run, tmp_path: Path) -> None:
     """A server whose road does not exist is refused in one sentence though its links are open, and nothing is made."""
     changes = ("--set", "vehicle.route=nowhere", "--set", "video.port=0", "--set", f"zenoh.router={router}")
-    assert "there is no road 'nowhere'" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert "'nowhere'" in run("server", SERVER, *changes, "--out", "mine").refused()
     assert files(tmp_path) == {}
 
 
 def test_server_of_an_unknown_rendezvous(router: str, run: Run, tmp_path: Path) -> None:
     """A server whose rendezvous no one can look up is refused in one sentence, and nothing is made."""
     changes = ("--set", f"rendezvous.host={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "rendezvous.host: the host" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert "rendezvous.host" in run("server", SERVER, *changes, "--out", "mine").refused()
     assert files(tmp_path) == {}
 
 
 def test_client_of_an_unknown_server(router: str, run: Run, tmp_path: Path) -> None:
     """A client whose server no one can look up is refused in one sentence, and nothing is made."""
     changes = ("--set", f"video.server={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "is not known" in run("client", CLIENT, *changes, "--out", "mine").refused()
+    assert "video.server" in run("client", CLIENT, *changes, "--out", "mine").refused()
     assert files(tmp_path) == {}
 
 
-def test_processes(router: str, taken: int, tmp_path: Path) -> None:
-    """A process whose input is bad ends by itself with 2, one sentence, a silent standard output and nothing made."""
-    out = ("--out", str(tmp_path / "mine"))
-    cases = {
-        f"the video port 127.0.0.1:{taken} cannot be opened": [
-            "server", SERVER, "--json", "--set", f"video.port={taken}", "--set", "video.bind=127.0.0.1",
-            "--set", f"zenoh.router={router}", *out,
-        ],
-        "start one with `lavt router": ["stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1"],
-        "zenoh.router cannot be 'foo/127.0.0.1:1'": [
-            "client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", *out,
-        ],
-        f"tcp/127.0.0.1:{taken}": ["router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{taken}]"],
-    }  # fmt: skip
-    started = {said: lavt_process(*arguments) for said, arguments in cases.items()}
-    for said, process in started.items():
-        printed, err = process.communicate(timeout=ENDS_S)
-        assert said in Ended(process.returncode, printed, err).refused()
+def test_server_port_in_use(router: str, taken: int, run: Run, tmp_path: Path) -> None:
+    """A server whose video port another program uses is refused in one sentence, and nothing is made."""
+    changes = (f"video.port={taken}", "video.bind=127.0.0.1", f"zenoh.router={router}")
+    sets = [part for change in changes for part in ("--set", change)]
+    assert f"127.0.0.1:{taken}" in run("server", SERVER, "--json", *sets, "--out", "mine").refused()
     assert files(tmp_path) == {}
+
+
+def test_client_of_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
+    """A client whose router has an endpoint of an unknown protocol is refused in one sentence, and nothing is made."""
+    said = run("client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", "--out", "mine").refused()
+    assert "zenoh.router" in said
+    assert "'foo/127.0.0.1:1'" in said
+    assert files(tmp_path) == {}
+
+
+def test_stop_without_a_router(run: Run) -> None:
+    """A stop that reaches no router is refused in one sentence, which names the command that starts one."""
+    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").refused()
+
+
+def test_a_process_whose_input_is_bad(taken: int) -> None:
+    """`python -m lavt` ends by itself with 2 and one sentence; nothing is on its standard output, of Zenoh neither."""
+    process = lavt_process("router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{taken}]")
+    out, err = process.communicate(timeout=ENDS_S)
+    assert f"tcp/127.0.0.1:{taken}" in CommandResult(process.returncode, out, err).refused()
 
 
 @pytest.mark.parametrize("command", [["client", CLIENT], ["server", SERVER, "--set", "video.port=0"]])
@@ -542,13 +503,12 @@ def test_a_side_waits_for_its_router(command: list[str]) -> None:
     _, err = process.communicate(timeout=ENDS_S)
     assert process.returncode == 0
     assert err.count("\n") == 1
-    assert "start one with `lavt router" in err
-    assert "waiting until one does" in err
+    assert "`lavt router" in err
 
 
 def test_version(run: Run) -> None:
     """The version goes to standard output."""
-    assert run("--version") == Ended(0, f"lavt {lavt.__version__}\n", "")
+    assert run("--version") == CommandResult(0, f"lavt {lavt.__version__}\n", "")
 
 
 def test_end_by_ctrl_c() -> None:

@@ -10,30 +10,18 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.support.command_line import Run
 
 from lavt.build.dbw import shipped_profiles
-from lavt.cli import console
-from lavt.cli.main import app
 
-Run = Callable[..., tuple[int, str, str]]
 Edit = Callable[[dict[str, Any]], Any]
 PROFILES = sorted(shipped_profiles())
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Give a function that runs `lavt can check` in this process: exit code, standard output, standard error."""
-
-    def run_here(*arguments: str) -> tuple[int, str, str]:
-        code = 0
-        try:
-            console.run_command(lambda: app(["can", "check", *arguments], standalone_mode=False))
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run_here
+def run(run: Run) -> Run:
+    """Return a function that runs `lavt can check`."""
+    return lambda *arguments: run("can", "check", *arguments)
 
 
 def edited(folder: Path, name: str, edit: Edit = lambda _: None, bits: tuple[str, str] = ("", "")) -> str:
@@ -54,7 +42,7 @@ def test_shipped(run: Run, name: str) -> None:
     """Each profile that comes with LAVT agrees with its DBC."""
     code, out, err = run(name)
     assert (code, err) == (0, "")
-    assert out.startswith(f"{name} and {name.partition(':')[0]}.dbc agree\n")
+    assert out.splitlines()[0].startswith(f"{name} and {name.partition(':')[0]}.dbc ")
 
 
 def test_unverified(run: Run) -> None:
@@ -66,19 +54,21 @@ def test_unverified(run: Run) -> None:
     assert "RemoteSteerCmd.CMD_ANGLE" in told["unverified"]
     assert "RemoteSteerCmd.CRC" not in told["unverified"]
     assert told["may_arm_on_a_real_bus"] is False
-    assert "name the vendor's DBC" in told["hindrances_on_a_real_bus"][0]
+    assert "DBC" in told["hindrances_on_a_real_bus"][0]
     _, out, _ = run("dataspeed_gen2")
     assert "  RemoteSteerCmd.CMD_ANGLE\n" in out
-    assert "on a real bus: may not arm: " in out
+    assert "may not arm" in out.splitlines()[-1]
 
 
 def test_sign_unknown(run: Run, tmp_path: Path) -> None:
     """A verified profile may arm on a real bus once the sign of its steering is known."""
     _, out, _ = run("dataspeed_gen1")
-    assert "unverified: nothing\non a real bus: may not arm: which sign of the steering is left is not known" in out
+    assert "may not arm" in out.splitlines()[-1]
+    assert "sign of the steering" in out.splitlines()[-1]
     code, out, _ = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["vehicle"].update(steering_sign=1)))
     assert code == 0
-    assert out.endswith("on a real bus: may arm, once `lavt can prove` has seen its watchdog brake\n")
+    assert "may arm" in out.splitlines()[-1]
+    assert "`lavt can prove`" in out.splitlines()[-1]
 
 
 def test_vendors_dbc(run: Run, tmp_path: Path) -> None:
@@ -117,133 +107,154 @@ def same(_: dict[str, Any]) -> None:
 
 
 AS_IT_IS = ("", "")
-DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str]] = [
+DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
     (
         "dataspeed_gen1",
         steering(message="SteerCmd"),
         AS_IT_IS,
-        "sent.steering: the DBC has no message SteerCmd; the nearest is SteeringCmd",
+        "sent.steering",
+        ("SteerCmd", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(value="SCMD_ANGEL"),
         AS_IT_IS,
-        "sent.steering.value: SteeringCmd has no signal SCMD_ANGEL; the nearest is SCMD_ANGLE",
+        "sent.steering.value",
+        ("SCMD_ANGEL", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen1",
         steering(enable="SVEL", rate=""),
         AS_IT_IS,
-        "sent.steering.enable: SVEL of SteeringCmd is no single bit, as a switch has to be",
+        "sent.steering.enable",
+        ("SVEL", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(count="RES2"),
         AS_IT_IS,
-        "sent.steering.count: RES2 of SteeringCmd is no unsigned number of several bits, as a counter has to be",
+        "sent.steering.count",
+        ("RES2", "SteeringCmd"),
     ),
     (
         "dataspeed_gen2",
         steering(checksum="RC", count=""),
         AS_IT_IS,
-        "sent.steering.checksum: RC of RemoteSteerCmd is not the last byte, as a checksum here must be",
+        "sent.steering.checksum",
+        ("RC", "RemoteSteerCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(clear="EN"),
         AS_IT_IS,
-        "sent.steering: EN is both enable and clear",
+        "sent.steering",
+        ("EN", "enable", "clear"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["limits"].update(steering_wheel_deg=551.0),
         AS_IT_IS,
-        "sent.steering.value: the limit 551 is not in the range of SCMD_ANGLE, -550 to 550",
+        "sent.steering.value",
+        ("551", "SCMD_ANGLE", "-550", "550"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["sent"]["gears"].update(drive=3),
         AS_IT_IS,
-        "sent.gear.value: drive is 3, but the DBC calls 3 of GCMD NEUTRAL",
+        "sent.gear.value",
+        ("drive is 3", "GCMD", "NEUTRAL"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["sent"]["gears"].update(drive=8),
         AS_IT_IS,
-        "sent.gear.value: drive is 8 does not fit GCMD, which ends at 7",
+        "sent.gear.value",
+        ("drive is 8", "GCMD", "7"),
     ),
     (
         "dataspeed_gen2",
         lambda it: it["sent"]["system"].update(enable=2),
         AS_IT_IS,
-        "sent.system.value: enable is 2, but the DBC calls 2 of CMD DISABLE",
+        "sent.system.value",
+        ("enable is 2", "CMD", "DISABLE"),
     ),
     (
         "dataspeed_gen2",
         reported("remote", needs={"STATE": [9]}),
         AS_IT_IS,
-        "reports.remote.needs.STATE: 9 is needed, for which STATE has no name in the DBC",
+        "reports.remote.needs.STATE",
+        ("9", "STATE"),
     ),
     (
         "dataspeed_gen2",
         reported("system", trip={"STATE=6": "tripped"}),
         AS_IT_IS,
-        "reports.system.trip.STATE=6: 6 is looked for, for which STATE has no name in the DBC",
+        "reports.system.trip.STATE=6",
+        ("6", "STATE"),
     ),
     (
         "dataspeed_gen2",
         reported("steering", timeout_ms=101),
         AS_IT_IS,
-        "reports.steering.timeout_ms: 101 ms is longer than the DBC's 100 ms",
+        "reports.steering.timeout_ms",
+        ("101 ms", "100 ms"),
     ),
     (
         "dataspeed_gen2",
         reported("gear", timeout_ms=199),
         AS_IT_IS,
-        "reports.gear.timeout_ms: 199 ms is too short for GearReport1, which comes each 100 ms",
+        "reports.gear.timeout_ms",
+        ("199 ms", "GearReport1", "100 ms"),
     ),
     (
         "dataspeed_gen1",
         same,
         ('BA_ "TimeoutMs" BO_ 96 100;', 'BA_ "TimeoutMs" BO_ 96 39;'),
-        "sent.brake: BrakeCmd has to come each 39 ms, and comes each 20 ms",
+        "sent.brake",
+        ("BrakeCmd", "39 ms", "20 ms"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["sent"].update(clearing_bytes=2),
         AS_IT_IS,
-        "sent.steering.clear: CLEAR is not in the first 2 bytes (sent.clearing_bytes)",
+        "sent.steering.clear",
+        ("CLEAR", "2 bytes", "sent.clearing_bytes"),
     ),
     (
         "dataspeed_gen1",
         same,
         ("BO_ 121 DriverAssist: 3 KIT", "BO_ 96 DriverAssist: 3 KIT"),
-        "the DBC has two messages of identifier 0x060: BrakeCmd and DriverAssist",
+        "the DBC has two messages of identifier 0x060",
+        ("BrakeCmd", "DriverAssist"),
     ),
     (
         "dataspeed_gen1",
         steering(rate="SCMD_TORQUE"),
         AS_IT_IS,
-        "sent.steering.rate: SCMD_TORQUE is in no frame with SCMD_ANGLE",
+        "sent.steering.rate",
+        ("SCMD_TORQUE", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen2",
         lambda it: it.update(commands=None),
         AS_IT_IS,
-        "sent.steering: the DBC has no message of this set of commands",
+        "sent.steering",
+        ("no message",),
     ),
 ]
 
 
 @pytest.mark.parametrize(
-    ("planted", "sentence"),
-    [pytest.param(each[:3], each[3], id=each[3].partition(":")[0]) for each in DISAGREEMENTS],
+    ("planted", "key", "names"), [pytest.param(each[:3], *each[3:], id=each[3]) for each in DISAGREEMENTS]
 )
-def test_disagreement(run: Run, tmp_path: Path, planted: tuple[str, Edit, tuple[str, str]], sentence: str) -> None:
-    """Each disagreement is said in one sentence that names the profile's key, and ends the check with 2."""
+def test_disagreement(
+    run: Run, tmp_path: Path, planted: tuple[str, Edit, tuple[str, str]], key: str, names: tuple[str, ...]
+) -> None:
+    """Each disagreement is a sentence that begins with the profile's key, and names what disagrees; the code is 2."""
     code, out, err = run(edited(tmp_path, *planted))
     assert (code, out) == (2, "")
-    assert sentence in err.splitlines()
+    sentences = [line for line in err.splitlines() if line.startswith(f"{key}: ")]
+    assert any(all(name in sentence for name in names) for sentence in sentences), err
 
 
 def test_all_of_them(run: Run, tmp_path: Path) -> None:
@@ -251,11 +262,8 @@ def test_all_of_them(run: Run, tmp_path: Path) -> None:
     path = edited(tmp_path, "dataspeed_gen1", lambda it: (steering(count="A")(it), reported("gear", message="B")(it)))
     code, out, err = run(path, "--json")
     assert code == 2
-    assert err.splitlines()[:2] == [
-        "sent.steering.count: SteeringCmd has no signal A",
-        "reports.gear: the DBC has no message B",
-    ]
-    assert err.splitlines()[2].endswith("disagree 2 times: change the profile, or name another DBC")
+    assert [line.partition(": ")[0] for line in err.splitlines()[:2]] == ["sent.steering.count", "reports.gear"]
+    assert " 2 times" in err.splitlines()[2]
     assert json.loads(out)["disagreements"] == err.splitlines()[:2]
 
 
@@ -263,18 +271,16 @@ def test_of_the_reader(run: Run, tmp_path: Path) -> None:
     """What is found only when the profile is read for driving is a disagreement as well."""
     code, _, err = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["sent"]["brake"].update(value="PCMD_TORQUE")))
     assert code == 2
-    assert "PCMD_TORQUE of BrakeCmd is in 'Nm'" in err
+    assert "PCMD_TORQUE of BrakeCmd" in err
 
 
 def test_bad_input(run: Run, tmp_path: Path) -> None:
     """A profile that is none, and a DBC that is missing, are said in one sentence."""
     shutil.copy(shipped_profiles()["dataspeed_gen1"], tmp_path / "alone.yaml")
     for arguments, because in (
-        (["nosuch"], "there is no profile 'nosuch'"),
-        ([str(tmp_path / "alone.yaml")], "dataspeed_gen1.dbc cannot be read"),
-        (["dataspeed_gen1", "--dbc", "nosuch.dbc"], "nosuch.dbc cannot be read"),
-        (["dataspeed_gen1:user"], "has one set of commands only"),
+        (["nosuch"], "'nosuch'"),
+        ([str(tmp_path / "alone.yaml")], "dataspeed_gen1.dbc"),
+        (["dataspeed_gen1", "--dbc", "nosuch.dbc"], "nosuch.dbc"),
+        (["dataspeed_gen1:user"], ":user"),
     ):
-        code, out, err = run(*arguments)
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert because in err
+        assert because in run(*arguments).refused()

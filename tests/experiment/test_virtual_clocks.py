@@ -96,7 +96,8 @@ def test_a_misled_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
 
     _, result, _ = drive_with(tmp_path / "run", change=mislead)
     (reason,) = result["invalid_because"]
-    assert reason.startswith("model and the probe disagree about the offset between the clocks: 287.")
+    assert "model and the probe disagree" in reason
+    assert ": 287." in reason
 
 
 def test_a_probe_without_answers(tmp_path: Path) -> None:
@@ -107,7 +108,7 @@ def test_a_probe_without_answers(tmp_path: Path) -> None:
 
     _, result, _ = drive_with(tmp_path / "run", change=block)
     (reason,) = result["invalid_because"]
-    assert reason.startswith("the probe had no answer during the drive")
+    assert reason.startswith("the probe had no answer")
     assert (result["delta"]["probe_ms"], result["delta"]["probe_bound_ms"]) == (None, None)
 
 
@@ -122,4 +123,5 @@ def test_a_step_is_one_reason(tmp_path: Path, side: str, known: bool) -> None:
         loop.runtime.hosts[side].clock.steps = [(10 * NS_PER_S, NS_PER_S)]
 
     _, result, _ = drive_with(tmp_path / "run", change=step)
-    assert result["invalid_because"] == [f"the wall clock of the {side} stepped by +1000.0 ms"]
+    (reason,) = result["invalid_because"]
+    assert f"the {side} stepped by +1000.0 ms" in reason

@@ -6,7 +6,6 @@ import json
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from tests.support.ports import free_port
 from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
@@ -41,12 +41,6 @@ BEFORE_MS = 200
 STOP_BEFORE_MS, STOP_STALL_MS = 1500, 100
 """The same for a safe stop, which comes after 500 ms and is told within 200 ms; a shorter stall does not explain it."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
-        trial.bind(("127.0.0.1", 0))
-        return int(trial.getsockname()[1])
 
 
 def proved(profile: str, work: Path, stalls: Stalls) -> RunConfig:

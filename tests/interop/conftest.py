@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-
 import pytest
 from tests.interop.tools import PACKAGES, missing
 from tests.require import need
@@ -17,8 +14,5 @@ def pytest_runtest_setup() -> None:
 
 
 @pytest.fixture(autouse=True)
-def switch_interval() -> Iterator[None]:
-    """Put back what our runtime sets for its process."""
-    before = sys.getswitchinterval()
-    yield
-    sys.setswitchinterval(before)
+def _own_switch_interval(own_switch_interval: None) -> None:
+    """Our runtime runs in this process."""

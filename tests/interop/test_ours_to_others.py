@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.interop.tools import free_port, read_frames, running
+from tests.interop.tools import read_frames, running
+from tests.support.ports import free_pair
 
 from lavt.build.entropy import MachineEntropy
 from lavt.build.sides import build_server
@@ -107,14 +108,14 @@ def check_each_in_order(sent: list[int], read: list[int]) -> None:
 
 def test_gstreamer_sees_each_frame(tmp_path: Path) -> None:
     """GStreamer depacketizes and decodes what we send, and each picture has the stamp of the frame sent."""
-    port = free_port()
+    port = free_pair()
     check_each_in_order(*received(GSTREAMER.format(port=port), port, tmp_path / "said"))
 
 
 @pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
 def test_ffmpeg_sees_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
     """With no more than what `lavt sdp` prints ffmpeg finds and decodes our stream, and reads each stamp sent."""
-    port, sdp = free_port(), tmp_path / "lavt.sdp"
+    port, sdp = free_pair(), tmp_path / "lavt.sdp"
     settings = [part for change in changes(port) for part in ("--set", change)]
     with sdp.open("wb") as file:
         subprocess.run([sys.executable, "-m", "lavt", "sdp", str(SERVER), *settings], stdout=file, check=True)

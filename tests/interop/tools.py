@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import functools
 import shutil
-import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -77,17 +76,3 @@ def read_frames(output: IO[bytes], frame_bytes: int, count: int) -> Iterator[byt
         if len(frame) < frame_bytes:
             return
         yield frame
-
-
-def free_port() -> int:
-    """Give a port of the loopback that nobody has, nor the one after it, where some tools expect RTCP."""
-    while True:
-        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as first:
-            first.bind(("127.0.0.1", 0))
-            port = int(first.getsockname()[1])
-            with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:
-                try:
-                    second.bind(("127.0.0.1", port + 1))
-                except (OSError, OverflowError):
-                    continue
-                return port

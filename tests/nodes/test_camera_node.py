@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 from tests.nodes.stand_ins import MONO_NS, SMALL, NoiseCamera, at, give, noise, of
+from tests.support.clocks import ManualClock
 from tests.vehicle.moving_video import MODEL as MOVING
 from tests.vehicle.moving_video import number_of, write_video
 
 from lavt.clock import MachineClock
 from lavt.control.written import WrittenStamps
-from lavt.domain import NS_PER_MS, NS_PER_S, Now, Pose
+from lavt.domain import NS_PER_MS, NS_PER_S, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
 from lavt.transport.fec import RepairSender
@@ -54,16 +55,6 @@ def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], .
         start_ns=MONO_NS,
         send_to=send_to,
     )
-
-
-class HandClock:
-    """Time goes on when the test says so, from when a node's time begins."""
-
-    mono_ns = 0
-
-    def now(self) -> Now:
-        """Give it."""
-        return at(self.mono_ns)
 
 
 def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Send]:
@@ -307,26 +298,25 @@ def test_what_a_device_sees_is_what_is_sent(tmp_path: Path) -> None:
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     receiver = VideoReceiver(Decoder(), (MOVING.height_px, MOVING.width_px))
     seen = []
-    clock = HandClock()
+    clock = ManualClock(MONO_NS)
     with closing(VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=clock)) as device:
         node = node_with(device)
         for number in range(4):
-            clock.mono_ns = number * FRAME_NS
+            clock.mono_ns = MONO_NS + number * FRAME_NS
             assert device.wait(20.0)
             (unit,) = of(wake(node, number * FRAME_NS), "video")
             received = receiver.decode(unit.data)
             assert received is not None
             assert receiver.read_stamp(received) == unit.stamp_ns
             seen.append(number_of(received.picture))
-    assert seen[0] == 0
-    assert seen == sorted(set(seen))
+    assert seen == sorted(set(seen))  # how many come in between depends on this machine
 
 
 def test_a_device_that_vanishes_sends_no_frames_and_is_counted(tmp_path: Path) -> None:
     """A camera's last picture is sent once, with no time where none is known; when it is lost no frame follows."""
     path = write_video(tmp_path / "short.avi", rate_hz=30.0, pictures=1)
     clock = MachineClock()
-    device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=HandClock())
+    device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=ManualClock(MONO_NS))
     path.unlink()
     with closing(device):
         node = node_with(device)

@@ -183,7 +183,8 @@ def test_a_law_that_netem_cannot_do_is_refused_before_anything_is_touched() -> N
     """What no queue could do is refused with the reason, and the condition in force stays."""
     node = in_force()
     [because] = refusals(ask(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
-    assert because.startswith("video: a jitter of 20 ms on a delay of 10 ms would need delays below zero")
+    assert because.startswith("video: ")
+    assert "20 ms" in because
     assert refusals(ask(node, L4, NS_PER_S)) == [""]
 
 

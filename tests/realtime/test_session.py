@@ -15,6 +15,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 from tests.realtime.conftest import LONG_STALL_MS
+from tests.support.ports import free_port
 from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock
@@ -31,13 +32,6 @@ BEGINS_S = 90.0
 """Programs start, routers find each other, a client asks, arms and speeds up: about 10 s on a quiet machine."""
 HELD = "held by operator-1, and the vehicle is not disarmed at standstill"
 ASKS = "operator-2 asks for the vehicle; SIGUSR2 hands it over"
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as opened:
-        opened.bind(("127.0.0.1", 0))
-        port: int = opened.getsockname()[1]
-    return port
 
 
 def status(process: Process) -> dict[str, Any]:

@@ -22,6 +22,8 @@ from lavt.runtime.elsewhere import LATE_NS, NodeElsewhere, NodeHere
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
 
+pytestmark = pytest.mark.usefixtures("own_switch_interval")
+
 CLOCK = MachineClock()
 
 

@@ -1,10 +1,9 @@
 from __future__ import annotations
 
 import statistics
-import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -15,15 +14,7 @@ from lavt.node import WAKE, Hop, Message, Send
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.clock_offset import ClockReport
 
-pytestmark = pytest.mark.realtime
-
-
-@pytest.fixture(autouse=True)
-def switch_interval() -> Iterator[None]:
-    """Put back what the runtime sets for its process."""
-    before = sys.getswitchinterval()
-    yield
-    sys.setswitchinterval(before)
+pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("own_switch_interval")]
 
 
 class Kept:

@@ -18,7 +18,7 @@ def test_expired_authority() -> None:
     for now_ns in (NOW_NS, last - NS_PER_S):
         pair = certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=now_ns, days=30)
         assert certificates.described(pair.shown, "") == certificates.Described("one", "operator", (), "2027-01-25")
-    with pytest.raises(UserError, match="the authority expired on 2027-01-25: make a new one"):
+    with pytest.raises(UserError, match="2027-01-25"):
         certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=last, days=30)
 
 

@@ -7,11 +7,12 @@ from contextlib import closing
 from typing import Any
 
 import pytest
+from tests.support.clocks import ManualClock
 
 from lavt.build.links import injected
 from lavt.cli.relay import flows
 from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
-from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.streams import stream
 from lavt.transport.link import Link
@@ -22,21 +23,6 @@ ARRIVES_S = 5.0
 VIDEO_MS, CONTROL_MS = 75.0, 40.0
 CHALLENGE = b"LAVT challenge"
 LAST = b"that was all"
-
-
-class ManualClock:
-    """A clock that stands until it is told otherwise."""
-
-    def __init__(self) -> None:
-        self.mono_ns = 1_000 * NS_PER_S
-
-    def now(self) -> Now:
-        """Read both clocks."""
-        return Now(self.mono_ns, self.mono_ns)
-
-    def advance(self, duration_ms: float) -> None:
-        """Let time go by."""
-        self.mono_ns += round(duration_ms * NS_PER_MS)
 
 
 class End:
@@ -76,7 +62,7 @@ class Net:
     def __init__(self, **delays: Any) -> None:
         self.ends: list[End] = []
         self.server = {"video": self.end(), "control": self.end()}
-        self.clock = ManualClock()
+        self.clock = ManualClock(1_000 * NS_PER_S)
         config = RelayConfig(
             video_server=f"127.0.0.1:{self.server['video'].address[1]}",
             control_server=f"127.0.0.1:{self.server['control'].address[1]}",
@@ -397,7 +383,7 @@ def test_port_in_use() -> None:
             video_server="127.0.0.1:1", control_server="127.0.0.1:1", control_listen=f"127.0.0.1:{port}"
         )
         with pytest.raises(UserError, match=rf"control port 127\.0\.0\.1:{port} .* in use.*: name another, or 0"):
-            Relay(ManualClock(), flows(config))
+            Relay(ManualClock(1_000 * NS_PER_S), flows(config))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 
 import pytest
+from tests.support.clocks import ShiftedClock
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, Now
@@ -18,18 +19,6 @@ from lavt.transport.video_path import PathClient
 ARRIVES_S = 5.0
 ANY = ("127.0.0.1", 0)
 HELLO = PathClient(b"t" * 16).hello(0)
-
-
-class BackwardClock:
-    """A clock whose wall time is a second earlier at each look."""
-
-    def __init__(self) -> None:
-        self._wall_ns = 1000 * NS_PER_S
-
-    def now(self) -> Now:
-        """Read both clocks."""
-        self._wall_ns -= NS_PER_S
-        return Now(MachineClock().now().mono_ns, self._wall_ns)
 
 
 class Ends:
@@ -121,7 +110,7 @@ def test_what_is_not_wrapped(client: socket.socket) -> None:
 def test_each_registration_is_newer(client: socket.socket) -> None:
     """It registers at once and again after a second, with a later time even where the wall clock goes back."""
     link = RendezvousLink(
-        BackwardClock(), "feedback", lambda *_: None, bind=ANY, rendezvous=client.getsockname(),
+        ShiftedClock(wall_step_ns=-NS_PER_S), "feedback", lambda *_: None, bind=ANY, rendezvous=client.getsockname(),
         registration=lambda wall_ns: wall_ns.to_bytes(8, "big"),
     )  # fmt: skip
     link.start()

@@ -8,6 +8,7 @@ from contextlib import closing
 from typing import Any
 
 import pytest
+from tests.support.clocks import ShiftedClock
 
 from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_S, Now
@@ -18,18 +19,6 @@ from lavt.transport.udp_link import UdpLink
 
 ARRIVES_S = 5.0
 ANY = ("127.0.0.1", 0)
-
-
-class ShiftedClock:
-    """The machine's clock, with the wall clock shifted and the monotonic one counted from elsewhere."""
-
-    def __init__(self, wall_s: float) -> None:
-        self._wall_ns = round(wall_s * NS_PER_S)
-
-    def now(self) -> Now:
-        """Read both clocks."""
-        now = MachineClock().now()
-        return Now(now.mono_ns + 10**15, now.wall_ns + self._wall_ns)
 
 
 class Heard:
@@ -85,7 +74,7 @@ def test_time_of_arrival(sender: socket.socket) -> None:
 
 def test_arrival_on_both_clocks(sender: socket.socket) -> None:
     """A datagram that the kernel stamped 5 s ago arrived 5 s ago on the wall clock and on the monotonic clock."""
-    heard, clock = Heard(), ShiftedClock(wall_s=5.0)
+    heard, clock = Heard(), ShiftedClock(mono_ns=10**15, wall_ns=5 * NS_PER_S)
     with closing(opened(heard, clock)) as link:
         before = MachineClock().now()
         link.start()
@@ -100,7 +89,7 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
 @pytest.mark.parametrize("wall_s", [-5.0, 3600.0])
 def test_stepped_clock(sender: socket.socket, wall_s: float) -> None:
     """A kernel's stamp in the future or an hour old is not believed: the wall clock was stepped, it arrived now."""
-    heard, clock = Heard(), ShiftedClock(wall_s)
+    heard, clock = Heard(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
     with closing(opened(heard, clock)) as link:
         before = clock.now()
         link.start()

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import pytest
 import zenoh
+from tests.support.ports import free_port
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -251,16 +252,14 @@ def is_a_sentence(error: pytest.ExceptionInfo[UserError]) -> bool:
     return "\n" not in text and ".rs" not in text and "Location" not in text and len(text) < 1000
 
 
-def free_port() -> int:
-    with socket.socket() as opened:
-        opened.bind(("127.0.0.1", 0))
-        port: int = opened.getsockname()[1]
-    return port
+def unanswered() -> str:
+    """Return an endpoint at which no router answers."""
+    return f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
 
 def test_no_router() -> None:
     """Where no router answers, the sentence names the endpoint and the command that starts one."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    endpoint = unanswered()
     with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
         link("server", Heard(), endpoint)
     assert is_a_sentence(error)
@@ -268,7 +267,7 @@ def test_no_router() -> None:
 
 def test_waiting_for_a_router() -> None:
     """A link that may wait says why once, counts what it cannot send, and carries messages once a router is there."""
-    endpoint, said, heard = f"tcp/127.0.0.1:{free_port()}", list[str](), Heard()
+    endpoint, said, heard = unanswered(), list[str](), Heard()
     with ExitStack() as stack:
         waiting = ZenohLink(
             MachineClock(), Heard(), side="client", path=SESSION, router=endpoint, vehicle="late", who="client-1",
@@ -292,7 +291,7 @@ def test_leaving_while_waiting_for_a_router() -> None:
     """A link that still waits for its router can be closed."""
     with closing(
         ZenohLink(
-            MachineClock(), Heard(), side="server", path=SESSION, router=f"tcp/127.0.0.1:{free_port()}",
+            MachineClock(), Heard(), side="server", path=SESSION, router=unanswered(),
             vehicle="late", who="server", waiting=lambda _: None,
         )
     ) as waiting:  # fmt: skip

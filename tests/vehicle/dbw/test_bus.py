@@ -15,9 +15,11 @@ from typing import Any
 
 import can
 import pytest
+from tests.support.clocks import ManualClock, ShiftedClock
+from tests.support.ports import free_port
 
 from lavt.clock import MachineClock, pause
-from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
 from lavt.vehicle.dbw import bus as bus_module
@@ -28,18 +30,6 @@ DEADLINE_S = 20
 STEERING = Frame(0x064, bytes(8))
 BRAKE = Frame(0x060, bytes(range(8)))
 FAR = Frame(0x2F01, b"\x01", is_extended=True)
-
-
-class HandClock:
-    """A clock that goes on by `step_ns` each time it is read."""
-
-    def __init__(self, mono_ns: int, step_ns: int = 0, ahead_ns: int = 0) -> None:
-        self.mono_ns, self.step_ns, self.ahead_ns = mono_ns, step_ns, ahead_ns
-
-    def now(self) -> Now:
-        """Read both; the wall clock is ahead of the machine's."""
-        self.mono_ns += self.step_ns
-        return Now(self.mono_ns, MachineClock().now().wall_ns + self.ahead_ns)
 
 
 def until(done: Callable[[], bool]) -> None:
@@ -85,13 +75,6 @@ def raw() -> Iterator[can.BusABC]:
 
 def now_ns() -> int:
     return MachineClock().now().mono_ns
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_virtual(opened: Callable[..., CanPort]) -> None:
@@ -172,7 +155,7 @@ def test_arrival(opened: Callable[..., CanPort]) -> None:
 def test_what_waited_too_long_is_dropped(opened: Callable[..., CanPort], ahead_s: int, is_heard: bool) -> None:
     """A frame that the kernel has had for more than a second is counted; one of the future came now."""
     number = free_port()
-    port = opened("udp_multicast", GROUP, port=number, clock=HandClock(5 * NS_PER_S, ahead_ns=ahead_s * NS_PER_S))
+    port = opened("udp_multicast", GROUP, port=number, clock=ShiftedClock(wall_ns=ahead_s * NS_PER_S))
     opened("udp_multicast", GROUP, port=number).send([STEERING], now_ns())
     if is_heard:
         assert hear(port, 1) == [STEERING]
@@ -198,7 +181,7 @@ def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:
 @pytest.mark.parametrize(("age_ns", "is_sent"), [(60 * NS_PER_MS, True), (60 * NS_PER_MS + 1, False)])
 def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, is_sent: bool) -> None:
     """A frame made more than 60 ms before it is written is not written, and counted."""
-    port = opened(clock=HandClock(5 * NS_PER_S))
+    port = opened(clock=ManualClock(5 * NS_PER_S))
     port.send([STEERING], 5 * NS_PER_S - age_ns)
     assert (raw.recv(0) is not None) is is_sent
     assert port.counts["frames_too_old"] == (not is_sent)
@@ -206,7 +189,7 @@ def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, i
 
 def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
     """The age is looked at before each frame: of those whose writer froze between two, the rest is not written."""
-    clock = HandClock(0)
+    clock = ManualClock(0)
     port = opened(clock=clock)
     clock.step_ns = 25 * NS_PER_MS
     port.send([STEERING, BRAKE, STEERING, BRAKE], 0)
@@ -291,7 +274,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Device:
 
 def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> None:
     """A bus that goes away is told of by reading and writing, tried again each second, and heard when it is back."""
-    port = opened("breakable", "stick", clock=HandClock(0))
+    port = opened("breakable", "stick", clock=ManualClock(0))
     device.open_error = OSError(errno.ENODEV, "No such device")
     device.heard.append(can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN))
     until(lambda: device.shut_down == 1)
@@ -312,7 +295,7 @@ def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> No
 
 def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) -> None:
     """What was heard before the bus went away is taken first."""
-    port = opened("breakable", "stick", clock=HandClock(0))
+    port = opened("breakable", "stick", clock=ManualClock(0))
     device.heard.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
     assert [each.frame.identifier for each in port.take(0)] == [7]
@@ -332,7 +315,7 @@ def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) ->
 )
 def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exception, is_passing: bool) -> None:
     """What cannot be written is told of at once; a bus that has no room now is the same bus, another is tried again."""
-    port = opened("breakable", "stick", clock=HandClock(0))
+    port = opened("breakable", "stick", clock=ManualClock(0))
     device.send_error = error
     with pytest.raises(BusGone, match=r"breakable stick cannot be written to"):
         port.send([STEERING], 0)
@@ -349,7 +332,7 @@ def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exce
 
 def test_bus_off(opened: Callable[..., CanPort], device: Device) -> None:
     """An error frame that says that the controller is off is a bus that has gone."""
-    port = opened("breakable", "stick", clock=HandClock(0))
+    port = opened("breakable", "stick", clock=ManualClock(0))
     device.heard.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
     until(lambda: device.shut_down == 1)
     with pytest.raises(BusGone, match="bus-off"):
@@ -358,7 +341,7 @@ def test_bus_off(opened: Callable[..., CanPort], device: Device) -> None:
 
 def test_closed(device: Device) -> None:
     """A port that is closed has let go of the bus, and can be closed again."""
-    port = CanPort("breakable", "stick", {}, clock=HandClock(0))
+    port = CanPort("breakable", "stick", {}, clock=ManualClock(0))
     port.close()
     port.close()
     assert (device.opened, device.shut_down) == (1, 1)

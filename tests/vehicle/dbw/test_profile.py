@@ -67,9 +67,7 @@ def test_sign_is_open() -> None:
     assert load_profile("dataspeed_gen1", steering_sign=-1).car.steering_sign == -1
     assert load_profile("dataspeed_gen2").car.steering_sign == 1
     assert load_profile("dataspeed_gen2", steering_sign=1).car.steering_sign == 1
-    assert refused("dataspeed_gen2", steering_sign=-1) == (
-        "dataspeed_gen2 has steering_sign 1, not -1: leave vehicle.dbw.steering_sign out"
-    )
+    assert "steering_sign 1, not -1" in refused("dataspeed_gen2", steering_sign=-1)
 
 
 def test_units() -> None:
@@ -82,14 +80,13 @@ def test_units() -> None:
 @pytest.mark.parametrize("name", ["dataspeed_gen3", "dataspeed_gen2:usr", ":user"])
 def test_no_such_profile(name: str) -> None:
     """A profile that does not exist is refused with the known ones."""
-    assert refused(name) == (
-        f"there is no profile {name!r}: name a YAML file, or one of dataspeed_gen1, dataspeed_gen2"
-    )
+    assert repr(name) in refused(name)
+    assert "dataspeed_gen1, dataspeed_gen2" in refused(name)
 
 
 def test_one_set_only() -> None:
     """A set of commands cannot be chosen where there is one."""
-    assert refused("dataspeed_gen1:user") == "dataspeed_gen1 has one set of commands only: leave out :user"
+    assert ":user" in refused("dataspeed_gen1:user")
 
 
 def test_own_file(tmp_path: Path) -> None:

@@ -1,0 +1,36 @@
+"""`lavt` in the test's own process."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from tests.support.command_line import CommandResult, Run
+
+from lavt.cli import console
+from lavt.cli.main import main
+from lavt.runtime import precedence
+
+
+@pytest.fixture
+def run(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    own_switch_interval: None,  # noqa: ARG001 (commands with a loop change it)
+) -> Run:
+    """Return a function that runs `lavt` in this process, from an empty working directory."""
+    monkeypatch.setattr(console, "keep_stdout_for_results", lambda: None)  # it would take pytest's output away
+    monkeypatch.setattr(precedence, "take", lambda *_: None)  # it would be that of all tests
+    monkeypatch.chdir(tmp_path)
+
+    def run_here(*arguments: str) -> CommandResult:
+        monkeypatch.setattr(sys, "argv", ["lavt", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = capsys.readouterr()
+        code = ended.value.code
+        return CommandResult(code if isinstance(code, int) else 0, said.out, said.err)
+
+    return run_here

@@ -1,0 +1,26 @@
+"""Ports of this machine that no program uses."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import closing
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """Return a port that is free at every address: of UDP, or of TCP with `SOCK_STREAM`."""
+    with closing(socket.socket(socket.AF_INET, kind)) as trial:
+        trial.bind(("", 0))
+        port: int = trial.getsockname()[1]
+        return port
+
+
+def free_pair() -> int:
+    """Return the first of two consecutive free UDP ports: some tools expect RTCP at the second."""
+    while True:
+        port = free_port()
+        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:
+            try:
+                second.bind(("", port + 1))
+            except (OSError, OverflowError):
+                continue
+            return port

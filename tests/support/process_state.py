@@ -1,0 +1,75 @@
+"""Hooks and fixtures of pytest: every test leaves the pytest process as it found it.
+
+`tests/conftest.py` loads this as a plugin. A test that leaves the state of the process changed would decide how those
+after it run: at another priority, with other signal handlers, or in another directory.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+OF_PYTEST = "PYTEST_"
+"""Environment variables that pytest itself sets while a test runs."""
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C end the tests and the programs that they start, although a shell without job control ignores it."""
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def process_state() -> dict[str, Any]:
+    """Return what a test could change for the tests after it."""
+    return {
+        "niceness": os.getpriority(os.PRIO_PROCESS, 0),
+        "scheduler": os.sched_getscheduler(0),
+        "processors": os.sched_getaffinity(0),
+        "switch interval": sys.getswitchinterval(),
+        "directory": os.getcwd(),  # noqa: PTH109 (ten times as fast)
+        "environment": {key: value for key, value in os.environ.items() if not key.startswith(OF_PYTEST)},
+        "signal mask": signal.pthread_sigmask(signal.SIG_BLOCK, ()),
+        **{number.name: signal.getsignal(number) for number in SIGNALS},
+    }
+
+
+@contextmanager
+def process_unchanged() -> Iterator[None]:
+    """Fail the test if the process is not left as it was found."""
+    before = process_state()
+    yield
+    after = process_state()
+    if after != before:
+        changed = {name: (before[name], after[name]) for name in before if before[name] != after[name]}
+        pytest.fail(f"the test left the process changed (before, after): {changed}", pytrace=False)
+
+
+@pytest.fixture(autouse=True)
+def _process_unchanged() -> Iterator[None]:
+    """Watch every test."""
+    with process_unchanged():
+        yield
+
+
+@pytest.fixture
+def own_switch_interval() -> Iterator[None]:
+    """Put back what the real-time runtime sets for its process."""
+    before = sys.getswitchinterval()
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.fixture
+def hangup_ends() -> Iterator[None]:
+    """Let a closed terminal end a program that the test starts, although the tests run under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
