@@ -89,9 +89,11 @@ def test_a_probe_that_ended_on_the_host_is_noticed_here() -> None:
 
 
 def test_the_hosts_share_of_idle_time_counts() -> None:
-    """The processor times are the host's."""
-    with line(told(), told()) as device:
+    """The processor times are the host's, and the last ones are still there when the record has ended."""
+    with line(told(), {"ended": "processor 1"}) as device:
         probe = HostProbe(device)
+        with pytest.raises(ProbeEnded):
+            probe.report()
         assert probe.processor_times() == QUIET
         probe.end()
 

@@ -67,6 +67,7 @@ class HostProbe:
             tty.setraw(self._line)
         self._one_at_a_time = threading.Lock()
         self._recorded: list[Stall] = []
+        self._processor_times = ""
         self._over = threading.Event()
         self.above = bool(self._ask()["above"])
         self._thread = threading.Thread(target=self._ask_again_and_again, daemon=True)
@@ -80,9 +81,8 @@ class HostProbe:
         return reported_ns, recorded
 
     def processor_times(self) -> str:
-        """Return the first line of the host's /proc/stat."""
-        with self._one_at_a_time:
-            return str(self._ask()["processor_times"])
+        """Return the first line of the host's /proc/stat as it was told last, also where the record has ended."""
+        return self._processor_times
 
     def end(self) -> None:
         """End the thread, and close the line."""
@@ -119,6 +119,7 @@ class HostProbe:
         answer: dict[str, Any] = json.loads(said)
         if "ended" in answer:
             raise ProbeEnded(answer["ended"])
+        self._processor_times = str(answer["processor_times"])
         ahead_ns = clocks.ahead_ns(clocks.monotonic_reading(), (answer["counter"], answer["mono_ns"]))
         self._recorded += [
             Stall(processor, begin_ns + ahead_ns, end_ns + ahead_ns) for processor, begin_ns, end_ns in answer["stalls"]
