@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 from tests.support.ports import free_port
-from tests.support.stalls import Stalls
+from tests.support.stalls import STALL_MS, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -95,6 +95,7 @@ class Car:
 
     process: subprocess.Popen[str]
     stalls: Stalls | None = None
+    stall_ms: float = STALL_MS
     news: list[dict[str, Any]] = field(default_factory=list)
     _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
     _reader: threading.Thread = field(default_factory=threading.Thread)
@@ -153,7 +154,9 @@ class Car:
 
     def verdict(self, said: str, since_ns: int, until_ns: int) -> Exception:
         """Give what to raise for something that was too late."""
-        return AssertionError(said) if self.stalls is None else self.stalls.verdict(said, since_ns, until_ns)
+        if self.stalls is None:
+            return AssertionError(said)
+        return self.stalls.verdict(said, since_ns, until_ns, stall_ms=self.stall_ms)
 
     def held(self, since_ns: int, *, room_ms: float = ROOM_MS) -> float:
         """Wait until the kit has let go and brakes by its watchdog, in time; tell how many ms after something."""
@@ -184,13 +187,15 @@ class Car:
 
 
 @contextmanager
-def software_car(config: str | Path, *changes: str, stalls: Stalls | None = None) -> Iterator[Car]:
+def software_car(
+    config: str | Path, *changes: str, stalls: Stalls | None = None, stall_ms: float = STALL_MS
+) -> Iterator[Car]:
     """Start a software car of a server's config."""
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "software-car", str(config), *changes, "--json"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    car = Car(process, stalls)
+    car = Car(process, stalls, stall_ms)
     try:
         yield car
     finally:

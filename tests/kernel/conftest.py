@@ -11,12 +11,15 @@ from pathlib import Path
 
 import pytest
 from tests.kernel.lane import clocks, netem
-from tests.kernel.lane.driving import Drive, Loop, collect, reasons_against, start_loop, wait_for_the_end
+from tests.kernel.lane.driving import Drive, Loop, collect, start_loop, wait_for_the_end
+from tests.kernel.lane.guests import LINE
+from tests.kernel.lane.host_stalls import HostProbe
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine
+from tests.kernel.lane.verdicts import require_valid
 from tests.require import need
+from tests.support.inconclusive import SESSION
+from tests.support.stalls import Stalls
 
-DRIVES = 4
-"""At most, where the host holds the machines up."""
 LANE = os.environ.get("LAVT_KERNEL_LANE", "")
 """`pair` in the first of two machines, `native` on this machine's own kernel; set by tests/kernel/run alone."""
 
@@ -25,6 +28,18 @@ LANE = os.environ.get("LAVT_KERNEL_LANE", "")
 def pytest_runtest_setup() -> None:
     if not LANE:
         need("kernel", "needs a kernel with netem: run tests/kernel/run")
+
+
+@pytest.fixture(scope="session")
+def stalls(request: pytest.FixtureRequest) -> Stalls:
+    """Give the record of the host's stalls, as everywhere; inside a machine it is what the host's own probes tell."""
+    if LANE == "pair":
+        probe = HostProbe(LINE)
+        measured = Stalls([probe], probe.processor_times)
+    else:
+        measured = Stalls.measured()
+    request.config.stash[SESSION].stalls = measured
+    return measured
 
 
 @pytest.fixture(scope="session")
@@ -80,20 +95,15 @@ def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable
 
 
 def offset_ns(server: Machine, client: Machine) -> int:
-    client_counter, client_ns = client.call(clocks.reading)
-    server_counter, server_ns = server.call(clocks.reading)
-    gone_ns = (server_counter - client_counter) / clocks.counter_hz() * clocks.NS_PER_S
-    return server_ns - client_ns - round(gone_ns)
+    of_client = client.call(clocks.reading)
+    return clocks.ahead_ns(server.call(clocks.reading), of_client)
 
 
 @pytest.fixture
-def drive(
-    server_machine: Machine, client_machine: Machine, tmp_path: Path, tell: Callable[[str], None]
-) -> Callable[..., Drive]:
+def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path, stalls: Stalls) -> Callable[..., Drive]:
     """Drive over both machines, from the start of the four programs to the result.
 
-    Where other work on the host held the machines up, it is driven again: where the vehicle heard nothing for 300 ms,
-    or something speaks against the drive other than the reason its test is about, which begins with `about`.
+    Nothing may speak against the drive other than the reason its test is about, which begins with `about`.
     """
 
     def once(
@@ -104,19 +114,11 @@ def drive(
         about: str | None = None,
         meanwhile: Callable[[Loop], None] = lambda _: None,
     ) -> Drive:
-        for attempt in range(DRIVES):
-            out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
-            loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
-            wait_for_the_end(loop, meanwhile)
-            driven = collect(loop, client_machine, out)
-            if not was_held_up(driven, about):
-                break
-            tell(f"held up by the host, attempt {attempt + 1}: {driven.result['invalid_because']}")
+        out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
+        loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
+        wait_for_the_end(loop, meanwhile)
+        driven = collect(loop, client_machine, out)
+        require_valid(driven, stalls, about)
         return driven
 
     return once
-
-
-def was_held_up(driven: Drive, about: str | None) -> bool:
-    degraded = any("-> degraded" in each for each in driven.server.table("event").texts("detail"))
-    return degraded or any(about is None or not each.startswith(about) for each in reasons_against(driven))

@@ -18,17 +18,32 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.field.by_wire import GENERATIONS, KIT_MS, ROOM_MS, Car, ms_since, software_car
-from tests.held_up import HeldUp, again_where_held_up
+from tests.field.by_wire import (
+    GENERATIONS,
+    KIT_MS,
+    ROOM_MS,
+    Car,
+    ms_since,
+    software_car,
+)
 from tests.kernel.lane import processes
-from tests.kernel.lane.driving import BY_WIRE, Drive, Loop, collect, reasons_against, start_by_wire, wait_for_the_end
-from tests.kernel.lane.machine import Machine, wait_until
+from tests.kernel.lane.driving import BY_WIRE, Loop, collect, start_by_wire, wait_for_the_end
+from tests.kernel.lane.machine import Machine, MachineError, wait_until
+from tests.kernel.lane.verdicts import (
+    KIT_STALL_MS,
+    changes_of_safety,
+    least_stop_ms,
+    or_too_slow,
+    require_completed,
+    require_valid,
+)
+from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.dbw.bus import CanPort
 
-pytestmark = [pytest.mark.timeout(900), again_where_held_up]
+pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("vcan")]
 
 Tell = Callable[[str], None]
 
@@ -81,10 +96,15 @@ def sets(changes: tuple[str, ...]) -> list[str]:
     return [part for change in changes for part in ("--set", change)]
 
 
-def prove(machine: Machine, changes: tuple[str, ...]) -> None:
+def prove(machine: Machine, changes: tuple[str, ...], stalls: Stalls) -> None:
     """Let `lavt can prove` see that the kit's watchdog brakes."""
-    with software_car(BY_WIRE, *sets(changes)):
-        machine.run([machine.python, "-B", "-m", "lavt", "can", "prove", BY_WIRE, *sets(changes), "--yes"])
+    with software_car(BY_WIRE, *sets(changes)) as car:
+        since_ns = CLOCK.now().mono_ns
+        try:
+            machine.run([machine.python, "-B", "-m", "lavt", "can", "prove", BY_WIRE, *sets(changes), "--yes"])
+        except MachineError as failed:
+            said = f"{failed}, {car.news}"
+            raise stalls.verdict(said, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None
 
 
 @dataclass
@@ -95,17 +115,31 @@ class Driven:
     loop: Loop
     out: Path
     actuator_pid: int
+    stalls: Stalls
 
     def wait_driven(self) -> None:
-        """Wait until it drives at speed; raises `HeldUp` where it is stopped before."""
+        """Wait until it drives at speed; a stop before is a fault, unless the host stalled."""
 
         def is_driven() -> bool:
             status = self.loop.server.latest().get("status", {})
-            if status.get("safety") == "safe_stop" or self.car.heard("watchdog", "watchdog brakes") is not None:
-                raise HeldUp(f"stopped before it drove: {status}, {self.car.news}")
+            braked_ns = self.car.braked_ns()
+            if braked_ns is not None or status.get("safety") == "safe_stop":
+                raise self.stopped_wrongly(status, braked_ns)
             return bool(status.get("speed_mps", 0.0) >= DRIVEN_MPS)
 
         wait_until("the vehicle is driven", is_driven, 90)
+
+    def stopped_wrongly(self, status: dict[str, Any], braked_ns: int | None) -> Exception:
+        """Return what to raise where it stopped though nothing was broken."""
+        now_ns = CLOCK.now().mono_ns
+        since_ns = self.car.heard("enabled", "obeys: ") or now_ns
+        said = f"stopped before it drove: {status}, {self.car.news}"
+        if braked_ns is not None:
+            failure = self.car.let_go_wrongly(braked_ns, said)
+        else:
+            least_ms = least_stop_ms(str(status["because"]))
+            failure = self.stalls.verdict(said, since_ns, now_ns, stall_ms=least_ms)
+        return or_too_slow(failure, self.stalls, since_ns, now_ns)
 
     def because(self) -> str:
         """Tell why the server stopped."""
@@ -128,19 +162,20 @@ class Lab:
     client: Machine
     proofs: Path
     work: Path
+    stalls: Stalls
 
     @contextmanager
     def driving(self, profile: str) -> Iterator[Driven]:
         """Drive a software car at speed, by a server that is proved to leave it braking. The proof is made once."""
         changes = by_wire(profile, self.proofs)
         if not (self.proofs / f"{profile}.json").exists():
-            prove(self.server, changes)
+            prove(self.server, changes, self.stalls)
         out = self.work / "drive"
-        with software_car(BY_WIRE, *sets(changes)) as car:
+        with software_car(BY_WIRE, *sets(changes), stalls=self.stalls, stall_ms=KIT_STALL_MS) as car:
             client = ("clock.source=probe", *SMALL)
             loop = start_by_wire(self.server, self.client, out, server_changes=changes, client_changes=client)
             try:
-                driven = Driven(car, loop, out, loop.server.first_line()["ready"]["actuator_pid"])
+                driven = Driven(car, loop, out, loop.server.first_line()["ready"]["actuator_pid"], self.stalls)
                 driven.wait_driven()
                 yield driven
             finally:
@@ -154,8 +189,8 @@ def proofs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def lab(vcan: None, server_machine: Machine, client_machine: Machine, proofs: Path, tmp_path: Path) -> Lab:  # noqa: ARG001 (vcan is there)
-    return Lab(server_machine, client_machine, proofs, tmp_path)
+def lab(server_machine: Machine, client_machine: Machine, proofs: Path, tmp_path: Path, stalls: Stalls) -> Lab:
+    return Lab(server_machine, client_machine, proofs, tmp_path, stalls)
 
 
 def a_port() -> closing[CanPort]:
@@ -172,22 +207,20 @@ def last_command_ns(port: CanPort) -> int:
 def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
     """Route A key at L0 over real SocketCAN, and how long a command takes to the wheel is in the record."""
     with lab.driving(profile) as driven:
+        since_ns = CLOCK.now().mono_ns
         wait_for_the_end(driven.loop, lambda _: None)
         drive = collect(driven.loop, lab.client, driven.out)
+        braked_ns = driven.car.braked_ns()
     told = f"{profile}: {in_short(drive.result)}; {'; '.join(changes_of_safety(drive))}"
     tell(told)
-    if drive.result["ending"] != "completed" or reasons_against(drive):
-        raise HeldUp(told)
+    if drive.result["ending"] != "completed" and braked_ns is not None:
+        raise or_too_slow(driven.car.let_go_wrongly(braked_ns, told), lab.stalls, since_ns, braked_ns)
+    require_completed(drive, lab.stalls)
+    require_valid(drive, lab.stalls)
     assert drive.result["p95_m"] <= P95_M
     wheel = to_wheel(drive.result)
     assert wheel["n"] > 100
     assert 0 < wheel["p50"] < wheel["p95"]
-
-
-def changes_of_safety(drive: Drive) -> list[str]:
-    events = drive.server.table("event")
-    told = zip(events.texts("kind"), events.texts("detail"), strict=True)
-    return [detail for kind, detail in told if kind == "safety"]
 
 
 def to_wheel(result: dict[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chr
 from tests.kernel.lane.driving import Drive
 from tests.kernel.lane.machine import Machine, MachineError
 from tests.kernel.lane.netem import netem_on_all
+from tests.kernel.lane.verdicts import require_completed
+from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -18,6 +20,7 @@ from lavt.transport.chrony import NOT_RUNNING, Chronyc, read_chrony
 
 TrueOffset = Callable[[], int]
 NTP_PORT = 11123
+CLOCK = MachineClock()
 
 
 def least_round_trip_ms(machine: Machine, to: Machine) -> float:
@@ -53,6 +56,20 @@ def test_a_started_program_ends_with_its_test(client_machine: Machine) -> None:
     assert started.running
     client_machine.end_all()
     assert not started.running
+
+
+def test_the_hosts_stalls_are_told_in_this_machines_time(server_machine: Machine, stalls: Stalls) -> None:
+    """What the host's probes tell at a time has that time, to the 5 ms that asking takes, also on a slewed clock."""
+    server_machine.call(clocks.drift, 500)
+    pause(2 * NS_PER_S)
+    took_ns = []
+    for _ in range(20):
+        before_ns = CLOCK.now().mono_ns
+        told_ns, _ = stalls.probes[0].report()
+        after_ns = CLOCK.now().mono_ns
+        assert before_ns < told_ns < after_ns
+        took_ns.append(after_ns - before_ns)
+    assert min(took_ns) < 5 * NS_PER_MS
 
 
 def test_a_step_of_one_clock_is_the_change_of_the_true_offset(
@@ -125,7 +142,7 @@ def test_chrony_finds_the_offset_while_the_server_is_slewed(
 
 
 def test_a_road_is_driven_over_both_machines(
-    server_machine: Machine, client_machine: Machine, drive: Callable[..., Drive]
+    server_machine: Machine, client_machine: Machine, drive: Callable[..., Drive], stalls: Stalls
 ) -> None:
     """With the server's clock 250 ms ahead, a short road is driven to its end, and the loop's parts close to 1 ms."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)
@@ -135,7 +152,7 @@ def test_a_road_is_driven_over_both_machines(
 
     driven = drive()
 
-    assert driven.result["ending"] == "completed"
+    require_completed(driven, stalls)
     assert driven.measured.closure_p95_ms is not None
     assert driven.measured.closure_p95_ms <= 1
     assert driven.measured.clocks.bound_ms is not None
@@ -155,5 +172,5 @@ def test_one_client_of_chrony_outlives_the_daemon(server_machine: Machine) -> No
 
 
 def status_of(chronyc: Chronyc) -> str | None:
-    report = read_chrony(MachineClock(), chronyc.run)
+    report = read_chrony(CLOCK, chronyc.run)
     return None if report is None else report.status

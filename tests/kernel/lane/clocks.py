@@ -59,6 +59,19 @@ def reading(attempts: int = 60) -> tuple[int, int]:
     return best[1:]
 
 
+def monotonic_reading(attempts: int = 10) -> tuple[int, int]:
+    """Read counter and CLOCK_MONOTONIC (ns) together: of some attempts, the one that was interrupted least."""
+    tries = [(counter(), time.monotonic_ns(), counter()) for _ in range(attempts)]
+    before, mono_ns, after = min(tries, key=lambda each: each[2] - each[0])
+    return (before + after) // 2, mono_ns
+
+
+def ahead_ns(one: tuple[int, int], other: tuple[int, int]) -> int:
+    """Return how far one clock is ahead of another, from a reading of each together with the counter."""
+    gone_ns = (one[0] - other[0]) / counter_hz() * NS_PER_S
+    return one[1] - other[1] - round(gone_ns)
+
+
 @cache
 def counter_hz() -> float:
     """Tell how fast the counter runs, against a clock that nobody adjusts."""

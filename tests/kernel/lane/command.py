@@ -12,8 +12,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -127,20 +127,20 @@ def _pair(python: str, tests: Sequence[str], writable: Sequence[Path]) -> int:
     agent = [python, "-B", "-m", "tests.kernel.lane.agent", CLIENT["vec1"]]
     processors = sorted(os.sched_getaffinity(0))
     guests: list[Guest] = []
-    with TemporaryDirectory(prefix="lavt-kernel-") as folder:
+    with TemporaryDirectory(prefix="lavt-kernel-") as folder, _host_stalls(python) as line:
         scratch = Path(folder)
         prepare(tools, scratch)
         links = {device: socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for device in SERVER}
         output, inlet = os.pipe()
         agent_output = os.open(scratch / "client.output", os.O_WRONLY | os.O_CREAT)
         try:
-            for side, (name, command, addresses, to) in enumerate(
-                [("server", tests, SERVER, inlet), ("client", agent, CLIENT, agent_output)]
+            for side, (name, command, addresses, to, its_line) in enumerate(
+                [("server", tests, SERVER, inlet, line), ("client", agent, CLIENT, agent_output, None)]
             ):
                 ends = {device: (pair[side].fileno(), addresses[device]) for device, pair in links.items()}
                 guest = start_guest(
                     name, command, tools=tools, scratch=scratch, environment=environment, links=ends,
-                    writable=writable, output=to, processor=processors[side % len(processors)],
+                    writable=writable, output=to, line=its_line, processor=processors[side % len(processors)],
                 )  # fmt: skip
                 guests.append(guest)
             os.close(inlet)
@@ -148,6 +148,25 @@ def _pair(python: str, tests: Sequence[str], writable: Sequence[Path]) -> int:
         finally:
             for guest in guests:
                 guest.end()
+
+
+@contextmanager
+def _host_stalls(python: str) -> Iterator[tuple[int, int]]:
+    """Record this machine's stalls; give what a guest needs to ask for them: where it reads and where it writes."""
+    questions, asked = os.pipe()
+    answered, answers = os.pipe()
+    recorder = [python, "-B", "-m", "tests.kernel.lane.host_stalls"]
+    process = subprocess.Popen(
+        recorder, stdin=questions, stdout=answers, env=_environment(), start_new_session=True
+    )  # fmt: skip
+    os.close(questions)
+    os.close(answers)
+    try:
+        yield answered, asked
+    finally:
+        os.close(asked)
+        os.close(answered)
+        process.wait()
 
 
 def _watch(guests: Sequence[Guest], output: int) -> int:

@@ -30,6 +30,9 @@ KEEP_MEMORY = {
 }
 """A page that is touched first costs a user-mode kernel 50 us and more: programs keep what they have been given."""
 
+LINE = "/run/line"
+"""A serial line: the second console, where a machine is given the other end."""
+
 MODULES = "usr/lib/uml/modules/*"
 KERNEL, LOADED = "linux.uml", "libraries"
 """The kernel that runs, and what it loads, in the directory that the guests share."""
@@ -43,6 +46,7 @@ $b mount -t devpts devpts /dev/pts
 $b mount -t tmpfs shm /dev/shm
 $b mount -t tmpfs run /run
 $b ln -s /proc/self/fd /dev/fd
+$b mknod {line} c 4 2
 for d in {writable}; do $b mkdir -p "$d"; $b mount -t hostfs -o "$d" none "$d"; done
 echo {modprobe} > /proc/sys/kernel/modprobe
 $b mkdir -p /run/tmp /run/netns
@@ -117,14 +121,15 @@ def start_guest(
     links: Mapping[str, tuple[int, str]],
     writable: Sequence[Path],
     output: int,
+    line: tuple[int, int] | None = None,
     processor: int,
 ) -> Guest:
     """Start a machine that runs `command` and ends with it.
 
     `links` says of each network device which socket it is joined to and its address; `writable` are the directories of
-    this machine that it may write; its command's output goes to the descriptor `output`. All of it runs on one
-    processor of this machine, as a system call of the guest is a change from one process to another, and back: from one
-    processor to another that took four times as long.
+    this machine that it may write. Its command's output goes to the descriptor `output`; its device LINE reads from and
+    writes to those of `line`. All of it runs on one processor of this machine, as a system call of the guest is a
+    change from one process to another, and back: from one processor to another that took four times as long.
     """
     busybox = program(tools, "busybox")
     setup = ["ip link set lo up"]
@@ -138,6 +143,7 @@ def start_guest(
         INIT.format(
             busybox=busybox,
             name=name,
+            line=LINE,
             writable=shlex.join(str(path) for path in (scratch, *writable)),
             modprobe=scratch / "modprobe",
             environment=shlex.join([str(busybox), "env", "-i", *_inside(environment, tools)]),
@@ -150,13 +156,14 @@ def start_guest(
     kernel = [str(scratch / KERNEL), "seccomp=auto", f"mem={MEMORY_MB}M", "rootfstype=hostfs", "rootflags=/", "ro"]
     kernel += [f"init={scratch / name}.init", "quiet", "loglevel=1", f"umid={name}", f"uml_dir={scratch}/"]
     kernel += ["con=null", "con0=null,fd:1", f"con1=null,fd:{output}", "ssl=null", *devices]
+    kernel += [f"con2=fd:{line[0]},fd:{line[1]}"] if line else []
     with (scratch / f"{name}.console").open("wb") as console:
         process = subprocess.Popen(
             kernel,
             stdin=subprocess.DEVNULL,
             stdout=console,
             stderr=subprocess.STDOUT,
-            pass_fds=[output, *(descriptor for descriptor, _ in links.values())],
+            pass_fds=[output, *(line or ()), *(descriptor for descriptor, _ in links.values())],
             start_new_session=True,  # a process group of its own: Ctrl-C goes to who started it, who ends it
             preexec_fn=partial(_settle, processor),  # noqa: PLW1509 (there are no threads here)
             env={
