@@ -121,7 +121,7 @@ def test_the_runner_sums_lanes_up() -> None:
         ),
     )  # fmt: skip
     assert code == 0
-    assert said.index("one") < said.index("3 passed, 1 rerun") < said.index(f"{os.nice(0) + 19}\n== 1 passed")
+    assert said.index("one") < said.index("3 passed, 1 rerun") < said.index(f"{min(os.nice(0) + 19, 19)}\n== 1 passed")
     assert said.splitlines()[-1].startswith("6 passed, 0 failed, 1 skipped, 1 rerun in ")
 
 
