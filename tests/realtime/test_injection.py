@@ -40,7 +40,9 @@ def test_both_records_of_a_drive_are_complete(demo: Demo) -> None:
 
 def test_the_parts_of_the_loop_sum_to_the_whole(demo: Demo) -> None:
     """tau_v, client time, tau_c and actuator time sum to the loop latency within 1 ms, under L0 and under L5."""
-    assert all(drive.closure_p95_ms < 1 for drive in demo.injected.values())
+    off_ms = [drive.closure_p95_ms for drive in demo.injected.values()]
+
+    assert all(each is not None and each < 1 for each in off_ms)
 
 
 def test_without_injected_delay_the_road_is_driven_well(demo: Demo, stalls: Stalls) -> None:
