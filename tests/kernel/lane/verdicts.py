@@ -1,7 +1,7 @@
 """Which stalls of the host explain that a drive went wrong.
 
 A drive that went wrong is a fault, unless the record has a stall that is long enough at the time that counts. A machine
-that uses up its processor for a second loses up to 60 ms of it to ordinary programs, if there are any (the kernel's
+that uses up its processor for a second loses 50 to 60 ms of it to ordinary programs, if there are any (the kernel's
 fair server). That is a stall, too: a fault that occupies the processor all the time could hide behind it only if all
 three attempts failed within 200 ms of one. Longer stalls, and shares above 6 %, are never a machine's own doing.
 """
