@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.kernel.lane.command import pytest_arguments
+from tests.kernel.lane.command import pytest_arguments, writable
 
 RUN = Path(__file__).parent / "kernel" / "run"
 
@@ -66,3 +66,16 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
 
     assert "LAVT_KERNEL" in refusal(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_the_machines_may_write_where_they_are_told_to(
+    told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They write below --out and beside the file of LAVT_PROGRESS, and nowhere else."""
+    progress = tmp_path / "lane" / "progress"
+    monkeypatch.delenv("LAVT_PROGRESS", raising=False)
+    if told:
+        monkeypatch.setenv("LAVT_PROGRESS", str(progress))
+    assert writable(None) == [progress.parent] * told
+    assert writable(tmp_path / "out") == [*[progress.parent] * told, tmp_path / "out"]

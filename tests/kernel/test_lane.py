@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 from tests.kernel.lane import clocks, ntp_server
@@ -48,6 +50,14 @@ def test_what_fails_on_the_other_machine_is_told_here(client_machine: Machine) -
         client_machine.run(["ls", "/no-such-file"])
     with pytest.raises(MachineError, match="No such file"):
         client_machine.read("/no-such-file")
+
+
+def test_whoever_runs_the_lane_is_told_of_the_test_that_runs(request: pytest.FixtureRequest) -> None:
+    """The file of LAVT_PROGRESS, which lies on the host, has the name of this test."""
+    progress = os.environ.get("LAVT_PROGRESS")
+    if not progress:
+        pytest.skip("needs LAVT_PROGRESS, which python -m tests.lanes sets")
+    assert request.node.nodeid in Path(progress).read_text()
 
 
 def test_a_started_program_ends_with_its_test(client_machine: Machine) -> None:

@@ -59,7 +59,8 @@ class RunningLane:
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        self._progress = folder / f"{lane.name}.progress"
+        self._progress = folder / lane.name / "progress"  # alone there: the kernel lane lets its machines write to it
+        self._progress.parent.mkdir()
         self._output.touch()
         self._told = 0
         self._began_ns = self._ended_ns = MachineClock().now().mono_ns

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
         signal.signal(number, _stop)
     try:
-        out = _writable(options.out)
+        out = writable(options.out)
         os.chdir(REPOSITORY)
         python = interpreter()
         compileall.compile_dir(REPOSITORY / "src", quiet=2)  # the machines are slow, and start LAVT a hundred times
@@ -81,14 +81,17 @@ def interpreter() -> str:
     raise Refusal("no Python here has LAVT and pytest: python3 -m venv .venv && .venv/bin/pip install -e '.[all]'")
 
 
-def _writable(out: Path | None) -> list[Path]:
+def writable(out: Path | None) -> list[Path]:
+    """Return the directories that the machines may write to: below `out`, and beside the file of LAVT_PROGRESS."""
+    progress = os.environ.get("LAVT_PROGRESS")
+    directories = [Path(progress).resolve().parent] if progress else []
     if out is None:
-        return []
+        return directories
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Refusal(f"{out} cannot be made ({error.strerror}): name another directory with --out") from None
-    return [out.resolve()]
+    return [*directories, out.resolve()]
 
 
 def _environment() -> dict[str, str]:
