@@ -20,7 +20,7 @@ CHANGES: dict[str, Callable[[pytest.MonkeyPatch], object]] = {
     "niceness": lambda patch: patch.setattr(os, "getpriority", lambda *_: -10),
     "switch interval": lambda _: sys.setswitchinterval(0.001),
     "directory": lambda patch: patch.chdir(Path(os.sep)),
-    "environment": lambda patch: patch.setenv("LAVT_CHANGED", "1"),
+    "$LAVT_CHANGED": lambda patch: patch.setenv("LAVT_CHANGED", "1"),
     "signal mask": lambda _: signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1}),
     "SIGINT": lambda _: ignore(signal.SIGINT),
     "SIGTERM": lambda _: ignore(signal.SIGTERM),

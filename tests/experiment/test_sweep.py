@@ -259,6 +259,7 @@ def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
 
 
 @pytest.mark.full
+@pytest.mark.usefixtures("own_environment")  # distributed sets variables for its workers
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     """The same runs have the same digests on a repeat, with one process, with two, and on Dask's workers."""
     pytest.importorskip("distributed")

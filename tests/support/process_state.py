@@ -35,7 +35,7 @@ def process_state() -> dict[str, Any]:
         "processors": os.sched_getaffinity(0),
         "switch interval": sys.getswitchinterval(),
         "directory": os.getcwd(),  # noqa: PTH109 (ten times as fast)
-        "environment": {key: value for key, value in os.environ.items() if not key.startswith(OF_PYTEST)},
+        **{f"${key}": value for key, value in os.environ.items() if not key.startswith(OF_PYTEST)},
         "signal mask": signal.pthread_sigmask(signal.SIG_BLOCK, ()),
         **{number.name: signal.getsignal(number) for number in SIGNALS},
     }
@@ -48,7 +48,8 @@ def process_unchanged() -> Iterator[None]:
     yield
     after = process_state()
     if after != before:
-        changed = {name: (before[name], after[name]) for name in before if before[name] != after[name]}
+        names = sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
+        changed = {name: (before.get(name), after.get(name)) for name in names}
         pytest.fail(f"the test left the process changed (before, after): {changed}", pytrace=False)
 
 
@@ -65,6 +66,16 @@ def own_switch_interval() -> Iterator[None]:
     before = sys.getswitchinterval()
     yield
     sys.setswitchinterval(before)
+
+
+@pytest.fixture
+def own_environment() -> Iterator[None]:
+    """Put back the environment variables that a library sets for its process."""
+    before = dict(os.environ)
+    yield
+    for name in set(os.environ) - set(before):
+        del os.environ[name]
+    os.environ.update(before)
 
 
 @pytest.fixture
