@@ -24,6 +24,9 @@ SIDE_BY_SIDE = (QUICK, "full")
 """With these marker expressions tests use all processors."""
 
 
+SLOWEST = ("--durations=12", "--durations-min=5")
+
+
 @dataclass(frozen=True)
 class Lane:
     """One command, or several, that have to pass."""
@@ -37,8 +40,8 @@ class Lane:
 
 
 def pytest(*arguments: str) -> tuple[str, ...]:
-    """Return the command for some tests."""
-    return (sys.executable, "-m", "pytest", *arguments)
+    """Return the command for some tests; it lists the slowest at the end."""
+    return (sys.executable, "-m", "pytest", *arguments, *SLOWEST)
 
 
 def program(name: str, *arguments: str) -> tuple[str, ...]:
@@ -54,7 +57,7 @@ LANES = (
     Lane("interop", (pytest("tests/interop"),), 5),
     Lane("realtime", (pytest("-m", "realtime"),), 20),
     Lane("field", (pytest("tests/field"),), 20),
-    Lane("kernel", ((sys.executable, "tests/kernel/run"),), 25, meanwhile=FULL),
+    Lane("kernel", ((sys.executable, "tests/kernel/run", *SLOWEST),), 25, meanwhile=FULL),
 )
 
 
