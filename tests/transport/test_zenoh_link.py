@@ -122,6 +122,7 @@ def test_control(pair: Pair) -> None:
 
 
 @pytest.mark.realtime
+@pytest.mark.judges_times(share=0.05)  # a slow host may bring the query before most of the commands
 def test_more_than_can_be_heard(routers: tuple[str, str]) -> None:
     """While a command is being looked at the newest of the others are kept, and a query is heard at once."""
     with closing(Pair(routers, "vehicle-busy")) as pair:

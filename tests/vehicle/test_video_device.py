@@ -86,7 +86,7 @@ def test_a_picture_that_is_late_by_a_little_is_waited_for(tmp_path: Path, opens:
 
 
 @pytest.mark.realtime
-@pytest.mark.judges_times
+@pytest.mark.judges_times(share=0.05)
 def test_pictures_that_come_just_when_they_are_asked_for_are_not_missed(tmp_path: Path, opens: Opens) -> None:
     """Asked at its own rate, at the very moment when its pictures come, a camera gives one for nearly each question."""
     camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
