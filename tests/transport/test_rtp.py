@@ -13,7 +13,6 @@ from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
 from lavt.transport.h264 import Encoder
 from lavt.transport.rtp import (
-    MAX_ACCESS_UNIT_BYTES,
     AccessUnit,
     Depacketizer,
     Packetizer,
@@ -22,6 +21,8 @@ from lavt.transport.rtp import (
     split_nal_units,
 )
 
+MAX_ACCESS_UNIT_BYTES = 2 * 1024 * 1024
+"""The design's limit, in a number of our own: whoever changes the code's must change this."""
 START = b"\x00\x00\x00\x01"
 SPS, PPS, IDR, SLICE = b"\x67\x42\xc0\x1e", b"\x68\xce\x3c\x80", b"\x65", b"\x41"
 
@@ -163,6 +164,22 @@ def test_three_ways() -> None:
     assert [one.payload for one in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
+@pytest.mark.parametrize(
+    ("unit_bytes", "kinds"),
+    [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],
+)
+def test_what_fits_one_packet(unit_bytes: list[int], kinds: list[int]) -> None:
+    """A packet of 1200 bytes has room for a unit of 1188 bytes, or for units that take 1188 with type and sizes."""
+    packets = packets_of(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
+    assert [one.payload[0] & 0x1F for one in packets] == kinds
+
+
+def test_the_first_number_is_taken_modulo_2_to_the_16() -> None:
+    """A first sequence number beyond the field of the header wraps."""
+    assert Packetizer(1, 2**16).next_sequence == 0
+    assert Packetizer(1, 2**16 - 1).next_sequence == 2**16 - 1
+
+
 def test_nothing_to_send() -> None:
     """An access unit without NAL units makes no packets."""
     assert Packetizer(1, 0).packetize(b"", 1) == []
@@ -268,6 +285,9 @@ MALFORMED = {
     "FU-A without header": b"\x7c",
     "FU-A that starts and ends": b"\x7c\xc5abc",
     "FU-A of type 28": b"\x7c\x9cabc",
+    "FU-A that starts type 0": b"\x7c\x80abc",
+    "FU-A that goes on with type 0": b"\x7c\x00abc",
+    "FU-A that ends type 0": b"\x7c\x40abc",
 }
 
 
@@ -299,6 +319,15 @@ def test_fragments_without_end(payloads: list[bytes]) -> None:
     packets = [packet(payload) for payload in payloads]
     units = push_all(Depacketizer(), [*packets[:-1], packet(payloads[-1], marker=True)])
     assert [unit.complete for unit in units] == [False]
+
+
+def test_pieces_of_another_unit_end_a_fragmented_unit() -> None:
+    """After a piece of another type the remaining pieces of a fragmented unit are left out."""
+    payloads = [b"\x7c\x81start", b"\x7c\x05other", b"\x7c\x41end"]
+    packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
+    assert push_all(Depacketizer(), packets) == [
+        AccessUnit(byte_stream(b"\x61start"), 1, complete=False, keyframe=False)
+    ]
 
 
 def test_a_peer_that_never_ends() -> None:
