@@ -164,6 +164,12 @@ def test_three_ways() -> None:
     assert [one.payload for one in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
+def test_headers_of_fragments() -> None:
+    """Each piece of a large unit has its importance and type, the first also the start bit and the last the end bit."""
+    payloads = [one.payload for one in packets_of(START + b"\x46" + b"s" * 5000)]
+    assert [payload[:2].hex() for payload in payloads] == ["5c86", "5c06", "5c06", "5c06", "5c46"]
+
+
 @pytest.mark.parametrize(
     ("unit_bytes", "kinds"),
     [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],

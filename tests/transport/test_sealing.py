@@ -293,6 +293,17 @@ def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
     assert pair.operator.counts["states_forged"] == 1
 
 
+def test_a_reply_makes_no_old_state_new(pair: Pair) -> None:
+    """After a reply of the same process of the server, states from before are still replays."""
+    pair.hold()
+    state = pair.vehicle.seal_state(b"state")
+    assert pair.operator.open_state(state).body == b"state"
+    pair.ask(pair.request())
+    assert not pair.operator.is_next_state(state)
+    assert pair.operator.open_state(state) == OpenedState(None, ask=False)
+    assert pair.operator.counts["states_replayed"] == 1
+
+
 def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pair) -> None:
     """A state of a server's process that has not answered a request may be a recorded one: it is asked first."""
     pair.hold()
