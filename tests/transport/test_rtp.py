@@ -164,6 +164,13 @@ def test_three_ways() -> None:
     assert [one.payload for one in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
+@pytest.mark.parametrize("units", [(b"\x06sei", b"\x41slice"), (b"\x41slice", b"\x06sei")])
+def test_importance_of_units_that_share_a_packet(units: tuple[bytes, bytes]) -> None:
+    """A STAP-A is as important as the most important of its units (RFC 6184, section 5.7.1)."""
+    (shared,) = packets_of(byte_stream(*units))
+    assert shared.payload[0] == 0x58
+
+
 def test_headers_of_fragments() -> None:
     """Each piece of a large unit has its importance and type, the first also the start bit and the last the end bit."""
     payloads = [one.payload for one in packets_of(START + b"\x46" + b"s" * 5000)]
