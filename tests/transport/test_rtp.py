@@ -205,6 +205,13 @@ def test_bad_packet_size(size: int) -> None:
         Packetizer(1, 0, max_packet_bytes=size)
 
 
+@pytest.mark.parametrize("size", [64, 65_507])
+def test_smallest_and_largest_packet_size(size: int) -> None:
+    """Packets may have 64 bytes at least and 65 507 at most, as many as a datagram has room for."""
+    sizes = [len(one.to_bytes()) for one in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)]
+    assert sizes == [size]
+
+
 @pytest.mark.parametrize("missing", range(6))
 def test_a_packet_is_lost(missing: int) -> None:
     """Whichever packet of a keyframe is lost, its access unit leaves once, incomplete, and the next one is whole."""
@@ -244,6 +251,22 @@ def test_only_a_keyframe_stands_alone() -> None:
     for head in (b"\x09\x10", SPS):
         (unit,) = push_all(Depacketizer(), packets_of(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
         assert not unit.complete
+
+
+@pytest.mark.parametrize(
+    ("head", "complete"), [(b"\x09\x10", True), (SPS, True), (PPS, False), (b"\x06sei", False), (b"\x0aend", False)]
+)
+def test_a_keyframe_after_a_loss(head: bytes, *, complete: bool) -> None:
+    """After a loss a keyframe is complete when it begins with a delimiter or a sequence parameter set."""
+    packets = packets_of(byte_stream(head, IDR + b"k"))
+    assert [unit.complete for unit in push_all(Depacketizer(), packets, lost_before=True)] == [complete]
+
+
+def test_pieces_without_bytes() -> None:
+    """A piece of a fragmented unit may be empty (RFC 6184, section 5.8)."""
+    payloads = [b"\x7c\x85", b"\x7c\x05", b"\x7c\x05k", b"\x7c\x45"]
+    packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
+    assert push_all(Depacketizer(), packets) == [AccessUnit(byte_stream(IDR + b"k"), 1, complete=True, keyframe=True)]
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
