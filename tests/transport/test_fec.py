@@ -231,6 +231,7 @@ WRONG_HEADERS = [
     with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
     with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
     changed(REPAIRS[0], _0=2),
+    changed(REPAIRS[0], _1=0x80),
     changed(REPAIRS[0], _1=0xE0),
     changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
     changed(REPAIRS[0], _7=5),
