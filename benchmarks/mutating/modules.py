@@ -26,7 +26,7 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     "control/written.py": ("control/test_written.py", "nodes/test_camera_node.py"),
     "nodes/client_session.py": ("nodes/test_client_session.py", "nodes/test_driver_node.py"),
     "transport/signing.py": ("transport/test_signing.py", "transport/test_sealing.py", "transport/test_door.py"),
-    "transport/sealing.py": ("transport/test_sealing.py", "transport/test_door.py"),
+    "transport/sealing.py": ("transport/test_sealing.py", "transport/test_sealing_wire.py", "transport/test_door.py"),
     "transport/door.py": ("transport/test_door.py",),
     "transport/screen.py": ("transport/test_screen.py", "transport/test_door.py"),
     "transport/fec.py": ("transport/test_fec.py", "transport/test_rtp_stream.py", "nodes/test_receiver_node.py"),

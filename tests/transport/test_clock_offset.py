@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
-from lavt.domain import Now
+from lavt.domain import NS_PER_S, Now
 from lavt.transport import clock_offset
-from lavt.transport.clock_offset import ClockReport, host_addresses, kernel_identity, plain_address, unknown_clock
+from lavt.transport.clock_offset import ClockReport, ask, host_addresses, kernel_identity, plain_address, unknown_clock
+from lavt.transport.shell import Ended
 
 ROUTES = """Main:
   +-- 0.0.0.0/1 2 0 2
@@ -37,6 +39,44 @@ SIX = """fe80000000000000000000fffe000002 02 40 20 80     vec0
 def test_kernel_identity() -> None:
     """A kernel's identity does not change while it runs."""
     assert kernel_identity() == kernel_identity()
+
+
+def test_the_identity_is_what_the_kernel_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel's identity is the text of its boot identifier without white space, and empty where it tells none."""
+    monkeypatch.setattr(clock_offset, "BOOT_ID", tmp_path / "boot_id")
+    assert kernel_identity() == ""
+    (tmp_path / "boot_id").write_text(" 5b1c\n")
+    assert kernel_identity() == "5b1c"
+
+
+class SteppedClock:
+    """A clock on which the same time goes by from one reading to the next."""
+
+    def __init__(self, step_ns: int) -> None:
+        self._step_ns = step_ns
+        self._mono_ns = 0
+
+    def now(self) -> Now:
+        """Read both clocks."""
+        self._mono_ns += self._step_ns
+        return Now(self._mono_ns, self._mono_ns + 1)
+
+
+@pytest.mark.parametrize(("took_ns", "in_time"), [(2 * NS_PER_S, True), (2 * NS_PER_S + 1, False)])
+def test_an_answer_may_take_two_seconds(took_ns: int, *, in_time: bool) -> None:
+    """An answer within 2 s is parsed with the clocks before and after it; a later one is a missed poll."""
+    asked: list[tuple[Sequence[str], float]] = []
+
+    def run(command: Sequence[str], timeout_s: float) -> Ended:
+        asked.append((command, timeout_s))
+        return Ended(0, "answer")
+
+    def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
+        return ClockReport(before.mono_ns, after.mono_ns, host, output)
+
+    report = ask(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
+    assert asked == [(("tool",), 2.0)]
+    assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 
 
 def test_addresses_of_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,18 +10,12 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.fec import (
-    BLOCK_LIFE_NS,
-    MAX_SYMBOL_BYTES,
-    MEDIA_KEPT,
-    OPEN_BLOCKS,
-    REPAIR_PAYLOAD_TYPE,
-    RepairChooser,
-    RepairReceiver,
-    RepairSender,
-)
+from lavt.transport.fec import RepairChooser, RepairReceiver, RepairSender
 from lavt.transport.rtp import Depacketizer, Packetizer, RtpPacket, parse_packet
 
+REPAIR_PAYLOAD_TYPE, MAX_SYMBOL_BYTES = 97, 1500
+MEDIA_KEPT, OPEN_BLOCKS, BLOCK_LIFE_NS = 4096, 64, 500 * NS_PER_MS
+"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
 MEDIA_SSRC, REPAIR_SSRC = 0x01020304, 0x0A0B0C0D
 
 
@@ -119,6 +113,23 @@ def test_long_packets(payload_bytes: int, repairs: int) -> None:
     assert len(repairs_of(media, 2)) == repairs
     receiver = RepairReceiver()
     assert push_all(receiver, [media[0], *repairs_of(media, 2)]) == media[1:][:repairs]
+
+
+def test_the_largest_frame() -> None:
+    """A frame of 255 blocks is repaired, and repair packets of a larger one are malformed."""
+    media = frame([b"x"] * 4080)
+    repairs = repairs_of(media, 1)
+    receiver = RepairReceiver()
+    assert push_all(receiver, [*media[:4079], repairs[254]]) == [media[4079]]
+    # 4081 packets are 256 blocks.
+    assert push_all(receiver, [changed(repairs[0], _8=0x0F, _9=0xF1)]) == []
+    assert counters(receiver) == (1, 1, 0)
+
+
+def test_the_first_number_is_taken_modulo_2_to_the_16() -> None:
+    """A first sequence number beyond the field of the header wraps."""
+    assert RepairSender(1, 2**16).next_sequence == 0
+    assert RepairSender(1, 2**16 - 1).next_sequence == 2**16 - 1
 
 
 def test_burst() -> None:
@@ -220,6 +231,7 @@ WRONG_HEADERS = [
     with_payload(REPAIRS[0], REPAIRS[0].payload[:14]),
     with_payload(REPAIRS[0], REPAIRS[0].payload.ljust(12 + MAX_SYMBOL_BYTES + 1, b"\x00")),
     changed(REPAIRS[0], _0=2),
+    changed(REPAIRS[0], _1=0x80),
     changed(REPAIRS[0], _1=0xE0),
     changed(REPAIRS[0], _1=REPAIR_PAYLOAD_TYPE),
     changed(REPAIRS[0], _7=5),

@@ -5,7 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.hold import LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS, AdaptiveHold
+from lavt.transport.hold import AdaptiveHold
+
+LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
+"""The limits that docs/video.md states."""
 
 
 @pytest.mark.parametrize(

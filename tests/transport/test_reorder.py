@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.hold import LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS
-from lavt.transport.reorder import CAPACITY, MAX_JUMP, Ordered, ReorderBuffer
+from lavt.transport.reorder import Ordered, ReorderBuffer
 from lavt.transport.rtp import RtpPacket
 
+CAPACITY, MAX_JUMP = 1024, 3000
+LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
+"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
 HOLD_NS = 10 * NS_PER_MS
 STARTED_NS = HOLD_NS
 
@@ -137,6 +139,17 @@ def test_one_stray_packet() -> None:
     assert numbers(buffer.push(packet(1), STARTED_NS)) == [1]
     assert buffer.stray == 2
     assert buffer.next_wake_ns() is None
+
+
+def test_the_farthest_packet_of_a_stream() -> None:
+    """A packet as far from the newest one as is allowed belongs to the stream, on either side."""
+    buffer = started(10_000)
+    assert buffer.push(packet(10_000 + MAX_JUMP), STARTED_NS) == []
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [10_000 + MAX_JUMP]
+    assert buffer.push(packet(10_000), STARTED_NS + HOLD_NS) == []
+    assert numbers(buffer.push_recovered(packet(10_000 + 2 * MAX_JUMP), STARTED_NS + HOLD_NS)) == []
+    assert numbers(buffer.expire(STARTED_NS + 2 * HOLD_NS)) == [10_000 + 2 * MAX_JUMP]
+    assert (buffer.stray, buffer.duplicate, buffer.recovered) == (0, 1, 1)
 
 
 def test_stray_packets_apart() -> None:
@@ -266,7 +279,7 @@ def test_recovered_that_nobody_waits_for() -> None:
     assert buffer.push(packet(2), STARTED_NS) == []
     assert buffer.push_recovered(packet(2), STARTED_NS) == []
     assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
-    for one in (packet(1), packet(2), packet(3, ssrc=8), packet(3 + MAX_JUMP)):
+    for one in (packet(1), packet(2), packet(3, ssrc=8), packet(2 + MAX_JUMP + 1)):
         assert buffer.push_recovered(one, STARTED_NS + HOLD_NS) == []
     counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
     assert counts == (0, 1, 0, 0, 0)

@@ -13,7 +13,6 @@ from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
 from lavt.transport.h264 import Encoder
 from lavt.transport.rtp import (
-    MAX_ACCESS_UNIT_BYTES,
     AccessUnit,
     Depacketizer,
     Packetizer,
@@ -22,6 +21,8 @@ from lavt.transport.rtp import (
     split_nal_units,
 )
 
+MAX_ACCESS_UNIT_BYTES = 2 * 1024 * 1024
+"""The design's limit, in a number of our own: whoever changes the code's must change this."""
 START = b"\x00\x00\x00\x01"
 SPS, PPS, IDR, SLICE = b"\x67\x42\xc0\x1e", b"\x68\xce\x3c\x80", b"\x65", b"\x41"
 
@@ -163,6 +164,35 @@ def test_three_ways() -> None:
     assert [one.payload for one in packets_of(START + SLICE + b"small")] == [SLICE + b"small"]
 
 
+@pytest.mark.parametrize("units", [(b"\x06sei", b"\x41slice"), (b"\x41slice", b"\x06sei")])
+def test_importance_of_units_that_share_a_packet(units: tuple[bytes, bytes]) -> None:
+    """A STAP-A is as important as the most important of its units (RFC 6184, section 5.7.1)."""
+    (shared,) = packets_of(byte_stream(*units))
+    assert shared.payload[0] == 0x58
+
+
+def test_headers_of_fragments() -> None:
+    """Each piece of a large unit has its importance and type, the first also the start bit and the last the end bit."""
+    payloads = [one.payload for one in packets_of(START + b"\x46" + b"s" * 5000)]
+    assert [payload[:2].hex() for payload in payloads] == ["5c86", "5c06", "5c06", "5c06", "5c46"]
+
+
+@pytest.mark.parametrize(
+    ("unit_bytes", "kinds"),
+    [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],
+)
+def test_what_fits_one_packet(unit_bytes: list[int], kinds: list[int]) -> None:
+    """A packet of 1200 bytes has room for a unit of 1188 bytes, or for units that take 1188 with type and sizes."""
+    packets = packets_of(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
+    assert [one.payload[0] & 0x1F for one in packets] == kinds
+
+
+def test_the_first_number_is_taken_modulo_2_to_the_16() -> None:
+    """A first sequence number beyond the field of the header wraps."""
+    assert Packetizer(1, 2**16).next_sequence == 0
+    assert Packetizer(1, 2**16 - 1).next_sequence == 2**16 - 1
+
+
 def test_nothing_to_send() -> None:
     """An access unit without NAL units makes no packets."""
     assert Packetizer(1, 0).packetize(b"", 1) == []
@@ -173,6 +203,13 @@ def test_bad_packet_size(size: int) -> None:
     """A packet size that no stream can use is refused."""
     with pytest.raises(UserError, match="choose"):
         Packetizer(1, 0, max_packet_bytes=size)
+
+
+@pytest.mark.parametrize("size", [64, 65_507])
+def test_smallest_and_largest_packet_size(size: int) -> None:
+    """Packets may have 64 bytes at least and 65 507 at most, as many as a datagram has room for."""
+    sizes = [len(one.to_bytes()) for one in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)]
+    assert sizes == [size]
 
 
 @pytest.mark.parametrize("missing", range(6))
@@ -214,6 +251,22 @@ def test_only_a_keyframe_stands_alone() -> None:
     for head in (b"\x09\x10", SPS):
         (unit,) = push_all(Depacketizer(), packets_of(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
         assert not unit.complete
+
+
+@pytest.mark.parametrize(
+    ("head", "complete"), [(b"\x09\x10", True), (SPS, True), (PPS, False), (b"\x06sei", False), (b"\x0aend", False)]
+)
+def test_a_keyframe_after_a_loss(head: bytes, *, complete: bool) -> None:
+    """After a loss a keyframe is complete when it begins with a delimiter or a sequence parameter set."""
+    packets = packets_of(byte_stream(head, IDR + b"k"))
+    assert [unit.complete for unit in push_all(Depacketizer(), packets, lost_before=True)] == [complete]
+
+
+def test_pieces_without_bytes() -> None:
+    """A piece of a fragmented unit may be empty (RFC 6184, section 5.8)."""
+    payloads = [b"\x7c\x85", b"\x7c\x05", b"\x7c\x05k", b"\x7c\x45"]
+    packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
+    assert push_all(Depacketizer(), packets) == [AccessUnit(byte_stream(IDR + b"k"), 1, complete=True, keyframe=True)]
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
@@ -268,6 +321,9 @@ MALFORMED = {
     "FU-A without header": b"\x7c",
     "FU-A that starts and ends": b"\x7c\xc5abc",
     "FU-A of type 28": b"\x7c\x9cabc",
+    "FU-A that starts type 0": b"\x7c\x80abc",
+    "FU-A that goes on with type 0": b"\x7c\x00abc",
+    "FU-A that ends type 0": b"\x7c\x40abc",
 }
 
 
@@ -299,6 +355,15 @@ def test_fragments_without_end(payloads: list[bytes]) -> None:
     packets = [packet(payload) for payload in payloads]
     units = push_all(Depacketizer(), [*packets[:-1], packet(payloads[-1], marker=True)])
     assert [unit.complete for unit in units] == [False]
+
+
+def test_pieces_of_another_unit_end_a_fragmented_unit() -> None:
+    """After a piece of another type the remaining pieces of a fragmented unit are left out."""
+    payloads = [b"\x7c\x81start", b"\x7c\x05other", b"\x7c\x41end"]
+    packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
+    assert push_all(Depacketizer(), packets) == [
+        AccessUnit(byte_stream(b"\x61start"), 1, complete=False, keyframe=False)
+    ]
 
 
 def test_a_peer_that_never_ends() -> None:

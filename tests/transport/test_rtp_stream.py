@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 from tests.nodes.stand_ins import at
 
-from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.transport.extended_reports import ReferenceTime, answered_round_trip_ns
 from lavt.transport.fec import RepairSender
 from lavt.transport.ntp_time import ntp_of_elapsed, short_time
@@ -82,6 +82,11 @@ def test_a_limit_is_of_this_stream_and_of_its_payload() -> None:
     assert sender.bit_rate_limit_bps is None
     sender.hear(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
     assert sender.bit_rate_limit_bps == 10**6 * 1188 // 1228
+
+
+def test_the_first_frame_has_a_report() -> None:
+    """A sender report is due with the first frame, even when the monotonic clock is at its origin."""
+    assert len(stream().packets(UNIT, 0, Now(0, 0)).report) == 1
 
 
 def test_sender_reports() -> None:

@@ -157,7 +157,7 @@ class RepairReceiver:
         if packet.ssrc != self._ssrc:
             self._change_stream(packet.ssrc)
         too_long = len(packet.payload) + _LENGTH_BYTES > MAX_SYMBOL_BYTES
-        if too_long or not self._keep(packet) or not self._open:
+        if too_long or not self._keep(packet):
             return []
         recovered: list[RtpPacket] = []
         for key, block in list(self._open.items()):

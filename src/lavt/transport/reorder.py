@@ -44,7 +44,6 @@ class ReorderBuffer:
         self._after_loss = False
         self._ssrc: int | None = None
         self._next: int | None = None
-        self._highest = 0
         self._start(0)
 
     @property

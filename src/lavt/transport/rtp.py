@@ -191,8 +191,7 @@ class Depacketizer:
 
     def __init__(self) -> None:
         self.malformed = 0
-        self._damaged = False
-        self._begin(0, after_loss=False)
+        self._begun = False
 
     def push(self, packet: RtpPacket, lost_before: bool) -> list[AccessUnit]:
         """Take the next packet; return the access units that are over, oldest first: at most two.
@@ -201,16 +200,15 @@ class Depacketizer:
         packet is missing leaves when the next one begins.
         """
         over = []
-        if self._packets and packet.timestamp != self._timestamp:
+        if self._begun and packet.timestamp != self._timestamp:
             if lost_before:
                 self._damaged = True
             over.append(self._finish())
-        if not self._packets:
+        if not self._begun:
             self._begin(packet.timestamp, after_loss=lost_before)
         elif lost_before:
             self._damaged = True
             self._open_fragment = _NONE
-        self._packets += 1
         if not self._take(packet.payload):
             self.malformed += 1
             self._damaged = True
@@ -220,9 +218,9 @@ class Depacketizer:
 
     def _begin(self, timestamp: int, *, after_loss: bool) -> None:
         """Start an empty access unit."""
+        self._begun = True
         self._timestamp = timestamp
         self._after_loss = after_loss
-        self._packets = 0
         self._data = bytearray()
         self._first_kind = _NONE
         self._keyframe = False
@@ -237,7 +235,7 @@ class Depacketizer:
         fresh = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
         complete = not damaged and bool(self._data) and (fresh or not self._after_loss)
         unit = AccessUnit(bytes(self._data), self._timestamp, complete, self._keyframe)
-        self._begin(self._timestamp, after_loss=False)
+        self._begun = False
         return unit
 
     def _take(self, payload: bytes) -> bool:
@@ -271,7 +269,7 @@ class Depacketizer:
             return False
         kind = payload[1] & _NAL_TYPE
         starts, ends = bool(payload[1] & _FU_START), bool(payload[1] & _FU_END)
-        if starts and ends:
+        if kind == _NONE or (starts and ends):
             return False
         if starts:
             self._damaged = self._damaged or self._open_fragment != _NONE

@@ -85,7 +85,7 @@ def may_be_obeyed(body: bytes, epoch: int, sequence: int) -> bool:
 
 def _head(body: bytes) -> tuple[int, int] | None:
     """Read epoch and sequence from the beginning of a command; None for what is none of this version."""
-    if not 0 < len(body) <= MAX_MESSAGE_BYTES:
+    if len(body) > MAX_MESSAGE_BYTES:
         return None
     head = msgpack.Unpacker(max_buffer_size=_HEAD_BYTES)
     try:
