@@ -12,7 +12,7 @@ from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
 from lavt.vehicle.dbw.adapter import Adapter
 from lavt.vehicle.dbw.vehicle import DbwVehicle, Truth
-from lavt.vehicle.vehicle import Capabilities
+from lavt.vehicle.vehicle import Capabilities, Reached
 
 CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
 SPEED = Frame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
@@ -141,6 +141,19 @@ def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
     assert port.sent == [(SPEED, START_NS + 7)]
     assert adapter.tick_ns == START_NS + 7
+
+
+def test_wishes_and_echoes(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adapter hears whether driving is wanted, and what it saw reach the wheels is told."""
+    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    wishes: list[tuple[bool, int]] = []
+    monkeypatch.setattr(adapter, "engage", lambda *wish: wishes.append(wish))
+    monkeypatch.setattr(adapter, "take_reached", lambda: [Reached(1, 2)])
+    vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
+    vehicle.engage(True, 3)
+    vehicle.engage(False, 4)
+    assert wishes == [(True, 3), (False, 4)]
+    assert vehicle.take_reached() == [Reached(1, 2)]
 
 
 def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
