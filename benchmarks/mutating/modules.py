@@ -53,11 +53,11 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/crc8.py": (f"{_DBW}/test_crc8.py",),
     f"{_DBW}/profile.py": (f"{_DBW}/test_profile.py", f"{_DBW}/test_profile_dbc.py", *_ADAPTER),
     f"{_DBW}/proving.py": (f"{_DBW}/test_proving.py",),
-    f"{_DBW}/reports.py": _ADAPTER,
+    f"{_DBW}/reports.py": (f"{_DBW}/test_reports.py", *_ADAPTER),
     f"{_DBW}/sending.py": _ADAPTER,
     f"{_DBW}/states.py": (*_ADAPTER, f"{_DBW}/test_by_wire_page.py"),
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
-    f"{_DBW}/vehicle.py": (*_ADAPTER, "test_build_by_wire.py"),
+    f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "test_build_by_wire.py"),
 }  # fmt: skip
 """Path below `src/lavt` to paths below `tests`, the most special ones first."""
 

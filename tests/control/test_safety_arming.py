@@ -230,6 +230,8 @@ def test_the_number_of_an_emergency_stop_only_grows() -> None:
     assert rig.state == "driving"
     for number in (40, 39, 1, 0):
         reply = rig.ask("emergency_stop", "bob", 2, number=number)
+        assert isinstance(reply.because, str)
+        assert reply.because != ""
         assert (reply.granted, reply.emergency_stop) == (False, 40)
     rig.picture()
     assert rig.drive(emergency_stop=40).reason == "it carries an emergency stop"

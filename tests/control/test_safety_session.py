@@ -127,6 +127,8 @@ def test_only_the_holder_changes_the_session(operation: Operation) -> None:
     for who, instance in (("bob", 1), ("alice", 2)):
         reply = rig.ask(operation, who, instance)
         assert not reply.granted
+        assert isinstance(reply.because, str)
+        assert reply.because != ""
         assert reply.epoch == 0
     assert rig.state == "driving"
 

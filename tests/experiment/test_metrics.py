@@ -242,6 +242,24 @@ def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
     assert entry["collisions"] == 0
 
 
+def test_samples_begin_at_the_first_row() -> None:
+    """Errors are interpolated every 0.25 m from the first row on, wherever the route was entered."""
+    rows = [{"progress_m": 2.0, "cross_track_m": 4.0}, {"progress_m": 3.0, "cross_track_m": 8.0}]
+    assert sampled_by_distance(table(rows), "cross_track_m").tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
+
+
+def test_percentiles_of_errors_that_grow_evenly() -> None:
+    """Of errors that grow evenly from 0 to 1 the mean is 0.5, the 95th percentile 0.95 and the maximum 1."""
+    rows = [
+        {"progress_m": index * 0.25, "cross_track_m": index / 100, "heading_error_rad": -index / 100}
+        for index in range(101)
+    ]
+    errors_m, errors_rad = cross_track(table(rows)), heading(table(rows))
+    assert [errors_m[name] for name in ("mae_m", "p95_m", "max_m")] == pytest.approx([0.5, 0.95, 1.0])
+    assert [errors_rad[name] for name in ("heading_mae_rad", "heading_p95_rad")] == pytest.approx([0.5, 0.95])
+    assert p95_by_10m(table(rows)) == pytest.approx([0.38, 0.76])
+
+
 def test_standing_still_weighs_nothing() -> None:
     """Errors are sampled by distance: a car that waits 1 m off the centre for 1000 rows has the error of its way."""
     way = [{"progress_m": index * 0.1, "cross_track_m": 0.0} for index in range(101)]

@@ -321,6 +321,17 @@ def probed(
     return exchanges(table_of(rows, [0] * len(rows), [0] * len(rows)))
 
 
+def test_an_exchange_by_hand() -> None:
+    """An exchange counts at the middle of its times on each clock, without the server's time in the round trip."""
+    names = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
+    found = exchanges(table_of([dict(zip(names, (100, 1030, 1050, 160), strict=True))], [0], [0]))
+    assert found.client_wall_ns.tolist() == [130]
+    assert found.server_wall_ns.tolist() == [1040]
+    assert found.delta_ns.tolist() == [910.0]
+    assert found.round_trip_ns.tolist() == [40]
+    assert [len(found.within(*interval)) for interval in ((1040, 1040), (1041, 1050), (1030, 1039))] == [1, 0, 0]
+
+
 @given(st.integers(0, 2**32), st.floats(-240, 240), st.floats(-240, 240))
 @settings(max_examples=30, deadline=None)
 def test_delta_by_the_probe_is_within_its_bound(seed: int, client_ppm: float, server_ppm: float) -> None:

@@ -15,7 +15,7 @@ from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import Frame
 from lavt.vehicle.dbw.adapter import Adapter
 from lavt.vehicle.dbw.crc8 import frame_crc8
-from lavt.vehicle.dbw.profile import PERIOD_NS
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS
 from lavt.vehicle.dbw.states import TABLE
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.state import AXES, Gear
@@ -341,6 +341,15 @@ def test_wake() -> None:
         wake_ns = rig.adapter.next_wake_ns()
         assert rig.now_ns < wake_ns <= rig.now_ns + PERIOD_NS
         rig.run_ms(1)
+
+
+@both
+def test_wake_when_overdue(generation: int) -> None:
+    """A set of frames that is overdue wakes the adapter in the next nanosecond, not in the past."""
+    rig = driving(generation)
+    rig.run_until(lambda rig: rig.now_ns - rig.sent[-1][0] >= LEAST_GAP_NS if rig.sent else False)
+    rig.adapter.ask(Actuation(0.1, 0.0, 0.0), rig.now_ns)
+    assert rig.adapter.next_wake_ns() == rig.now_ns + 1
 
 
 def test_table_is_whole() -> None:

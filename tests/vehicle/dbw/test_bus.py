@@ -222,6 +222,11 @@ def test_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: p
     assert [each.frame.identifier for each in port.take(0)] == [6, 7, 8, 9]
 
 
+def test_queue_holds_two_seconds_of_a_full_bus() -> None:
+    """A port keeps 8192 frames that nobody has taken: two seconds of a full bus of 500 kbit/s."""
+    assert bus_module.QUEUE_FRAMES == 8192
+
+
 @dataclass
 class Device:
     """A driver's device that can be pulled out."""

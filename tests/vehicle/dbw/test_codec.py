@@ -44,6 +44,9 @@ BO_ 16 Nested: 8 A
  SG_ OUTER M : 0|4@1+ (1,0) [0|15] "" A
  SG_ INNER m1M : 4|4@1+ (1,0) [0|15] "" A
  SG_ DEEP m2 : 8|8@1+ (1,0) [0|255] "" A
+BO_ 17 Unlimited: 8 A
+ SG_ UNSIGNED : 0|8@1+ (1,0) [0|0] "" A
+ SG_ SIGNED : 8|8@1- (0.5,1) [0|0] "" A
 SIG_VALTYPE_ 2566844671 REAL : 1;
 SG_MUL_VAL_ 16 INNER OUTER 1-1;
 SG_MUL_VAL_ 16 DEEP INNER 2-2;
@@ -161,6 +164,18 @@ def test_range_of_bits() -> None:
     lateral = GENERATION_1.messages["Accel"].signals["LATERAL"]
     assert (lateral.minimum, lateral.maximum) == (-327.67, 327.68)
     assert GENERATION_1.encode("Accel", {"LATERAL": 327.68})[:2] == bytes([0x00, 0x80])
+
+
+def test_range_of_bits_by_sign(tmp_path: Path) -> None:
+    """Without limits in the DBC, 8 bits go from 0 to 255, or from -128 to 127 where they are signed, before scaling."""
+    codec = awkward(tmp_path)
+    signals = codec.messages["Unlimited"].signals
+    assert (signals["UNSIGNED"].minimum, signals["UNSIGNED"].maximum) == (0, 255)
+    assert (signals["SIGNED"].minimum, signals["SIGNED"].maximum) == (-63, 64.5)
+    assert codec.encode("Unlimited", {"UNSIGNED": 255, "SIGNED": -63})[:2] == bytes([0xFF, 0x80])
+    for name, value in (("UNSIGNED", 256), ("UNSIGNED", -1), ("SIGNED", 65), ("SIGNED", -63.5)):
+        with pytest.raises(ValueError, match=f"{name} of Unlimited is"):
+            codec.encode("Unlimited", {name: value})
 
 
 def test_offsets_nesting_and_reals(tmp_path: Path) -> None:

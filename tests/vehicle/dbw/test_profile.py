@@ -12,6 +12,9 @@ from lavt.build.dbw import load_profile, shipped_profiles
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError
+from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.dbw.reports import Reports
+from lavt.vehicle.dbw.sending import Sender
 
 NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user", "dataspeed_gen2:remote")
 
@@ -47,6 +50,21 @@ def test_shipped() -> None:
     assert {profile.kit for name, profile in known.items() if "gen2" in name} == {"dataspeed_2"}
     assert known["dataspeed_gen1"].kit == "dataspeed_1"
     assert [known[name].commands for name in NAMES] == [None, "remote", "user", "remote"]
+
+
+def test_angles_in_radians(tmp_path: Path) -> None:
+    """Where the DBC has the wheel's angle in radians, 90 degrees are 1.571 rad in commands and in reports."""
+    text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
+    for before in ('(0.1,0) [-550|550] "deg"', '(0.1,0) [-3276.8|3276.7] "deg"'):
+        assert text.count(before) == 1
+        text = text.replace(before, '(0.001,0) [-10|10] "rad"')
+    (tmp_path / "radians.dbc").write_text(text)
+    profile = load_profile(str(changed(tmp_path, "dataspeed_gen1", dbc=str(tmp_path / "radians.dbc"))))
+    command = Sender(profile, 0).axis_frame("steering", 90.0, is_enabled=True)
+    assert int.from_bytes(command.data[:2], "little", signed=True) == 1571
+    reports = Reports(profile, 0)
+    reports.receive(Frame(0x065, command.data[:2] + bytes(6)), 0)
+    assert reports.wheel_deg == pytest.approx(90.0, abs=0.06)
 
 
 def test_unverified() -> None:

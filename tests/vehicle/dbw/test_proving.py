@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 from tests.vehicle.dbw.rig import START_NS, both, profile, road
 
-from lavt.domain import NS_PER_MS, NS_PER_S, VehicleState
+from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.vehicle.can_frame import Frame
 from lavt.vehicle.dbw.profile import OwnBrake
 from lavt.vehicle.dbw.proving import Proving
@@ -88,6 +89,24 @@ def test_held(generation: int) -> None:
     assert last_ns - enabled[0] > 480 * NS_PER_MS
     assert enabled[-1] - last_ns <= 100 * NS_PER_MS
     assert attempt.now_ns - last_ns == NS_PER_S
+
+
+def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the kit is enabled, the adapter has a tick each 20 ms, and none once the silence has begun."""
+    attempt = Attempt(1)
+    ticks_ns: list[int] = []
+    ask = attempt.proving._adapter.ask
+
+    def record(actuation: Actuation, now_ns: int) -> None:
+        ticks_ns.append(now_ns)
+        ask(actuation, now_ns)
+
+    monkeypatch.setattr(attempt.proving._adapter, "ask", record)
+    attempt.run()
+    began_ns, last_ns = attempt.sent[0][0], attempt.sent[-1][0]
+    in_time = [each_ns for each_ns in ticks_ns if each_ns >= began_ns]
+    assert {after - before for before, after in pairwise(in_time)} == {20 * NS_PER_MS}
+    assert in_time[-1] - last_ns < 20 * NS_PER_MS
 
 
 @both

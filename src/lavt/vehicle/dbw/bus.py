@@ -68,7 +68,6 @@ class CanPort:
         self._clock = clock
         self._mark = secrets.token_hex(8) if interface == HEARS_ITSELF else None
         self._heard: deque[HeardFrame] = deque(maxlen=QUEUE_FRAMES)
-        self._bus: BusABC | None = None
         self._why = ""
         self._tried_ns = clock.now().mono_ns
         self.counts: Counter[str] = Counter()
@@ -115,7 +114,7 @@ class CanPort:
 
     def _open(self) -> None:
         bus = _opened(self._interface, self._channel, self._options)
-        self._bus = bus
+        self._bus: BusABC | None = bus
         self._reader = threading.Thread(target=self._read, args=(bus,), name="can", daemon=True)
         self._reader.start()
 

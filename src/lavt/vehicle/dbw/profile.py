@@ -28,7 +28,7 @@ COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
 TICK_LIMIT_NS = 60 * NS_PER_MS
 """Nothing leaves that was asked for longer ago."""
 
-IN_DEGREES = {"deg": 1.0, "rad": math.degrees(1.0)}
+IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}
 IN_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 3.6}
 IN_DEGREES_PER_SECOND = {"": 1.0, "deg/s": 1.0, "rad/s": math.radians(1.0)}

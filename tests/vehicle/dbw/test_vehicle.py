@@ -1,0 +1,181 @@
+"""A car on a bus as a `Vehicle`: what its adapter, its port and a software car's truth are asked for and tell."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import pytest
+from tests.vehicle.dbw.rig import START_NS, profile
+
+from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
+from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.dbw.vehicle import DbwVehicle, Truth
+from lavt.vehicle.vehicle import Capabilities, Reached
+
+CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
+SPEED = Frame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
+"""A SteeringReport of generation 1 with a speed above zero."""
+
+
+class StandInPort:
+    """A port that says what a test puts into it, and keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter(overflowed=3)
+        self.waiting: list[HeardFrame] = []
+        self.sent: list[tuple[Frame, int]] = []
+        self.wake_ns: int | None = None
+        self.taken_ns = 0
+        self.is_gone = self.is_closed = False
+
+    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+        """Keep frames with the time at which they were made."""
+        self._check()
+        self.sent += [(frame, made_ns) for frame in frames]
+
+    def take(self, now_ns: int) -> list[HeardFrame]:
+        """Return what is waiting, once, and keep when it was taken."""
+        self._check()
+        self.taken_ns = now_ns
+        taken, self.waiting = self.waiting, []
+        return taken
+
+    def next_wake_ns(self) -> int | None:
+        """Return what the test has set."""
+        return self.wake_ns
+
+    def close(self) -> None:
+        """Keep that it was called."""
+        self.is_closed = True
+
+    def _check(self) -> None:
+        if self.is_gone:
+            raise BusGone("pulled out")
+
+
+@pytest.fixture
+def port() -> StandInPort:
+    return StandInPort()
+
+
+def made(port: StandInPort, truth: Truth | None = None) -> DbwVehicle:
+    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    return DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS, truth=truth)
+
+
+def truth_at(mono_ns: int) -> GroundTruth:
+    return GroundTruth(mono_ns, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_without_truth(port: StandInPort) -> None:
+    """A vehicle without a software car tells no ground truth, and what its kit says goes on."""
+    vehicle = made(port)
+    port.waiting = [HeardFrame(SPEED, START_NS + 1)]
+    assert vehicle.advance(START_NS + NS_PER_MS) == []
+    assert vehicle.ground_truth() is None
+    assert vehicle.state().speed_mps > 0
+    assert port.taken_ns == START_NS + NS_PER_MS
+
+
+def test_truth_and_events(port: StandInPort) -> None:
+    """Events of the software car and of the kit come in order of time, and the newest truth is kept."""
+    told: list[tuple[GroundTruth | None, list[VehicleEvent]]] = [
+        (truth_at(START_NS), []),
+        (truth_at(START_NS + 5), [VehicleEvent(START_NS + 5, "collision", ""), VehicleEvent(START_NS, "off_road", "")]),
+        (None, []),
+    ]
+    vehicle = made(port, lambda _: told.pop(0))
+    assert vehicle.ground_truth() == truth_at(START_NS)
+    override = Frame(0x061, bytes([0, 0, 0, 0, 0, 0, 0, 0x10]))  # a foot on the brake
+    port.waiting = [HeardFrame(override, START_NS + 3)]
+    events = vehicle.advance(START_NS + 9)
+    assert [(event.mono_ns - START_NS, event.kind) for event in events] == [
+        (0, "off_road"), (3, "fault"), (5, "collision"),
+    ]  # fmt: skip
+    assert vehicle.ground_truth() == truth_at(START_NS + 5)
+    vehicle.advance(START_NS + 20)
+    assert vehicle.ground_truth() == truth_at(START_NS + 5)
+
+
+@pytest.mark.parametrize(("arrived_ns", "counted_ns"), [(-7, -7), (0, 0), (1, 0)])
+def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
+    """A frame counts from its arrival, but never from later than now."""
+    vehicle = made(port)
+    now_ns = START_NS + NS_PER_MS
+    port.waiting = [HeardFrame(SPEED, now_ns + arrived_ns)]
+    vehicle.apply(Actuation(0.0, 0.0, 0.0), now_ns)
+    assert vehicle.state().mono_ns == now_ns + counted_ns
+
+
+def test_wake(port: StandInPort) -> None:
+    """The bus is listened to every 10 ms, or when the port says, and never later than the adapter wants."""
+    vehicle = made(port)
+    vehicle.advance(START_NS + NS_PER_MS)
+    assert vehicle.next_wake_ns() == START_NS + 11 * NS_PER_MS
+    port.wake_ns = START_NS + 2 * NS_PER_MS
+    assert vehicle.next_wake_ns() == START_NS + 2 * NS_PER_MS
+    port.wake_ns = START_NS + 10**12
+    assert vehicle.next_wake_ns() == START_NS + 100 * NS_PER_MS
+
+
+def test_bus_gone(port: StandInPort) -> None:
+    """A bus that has gone inhibits driving until a frame comes, and raises neither in reading nor in writing."""
+    vehicle = made(port)
+    port.is_gone = True
+    vehicle.advance(START_NS + 1)
+    vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
+    assert "pulled out" in vehicle.state().hindrance
+    port.is_gone = False
+    port.waiting = [HeardFrame(SPEED, START_NS + 3)]
+    vehicle.advance(START_NS + 3)
+    assert "pulled out" not in vehicle.state().hindrance
+
+
+def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the adapter has due leaves with the time of the tick, after the bus was heard."""
+    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.taken_ns == now_ns else [])
+    vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
+    vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
+    assert port.sent == [(SPEED, START_NS + 7)]
+    assert adapter.tick_ns == START_NS + 7
+
+
+def test_wishes_and_echoes(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adapter hears whether driving is wanted, and what it saw reach the wheels is told."""
+    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    wishes: list[tuple[bool, int]] = []
+    monkeypatch.setattr(adapter, "engage", lambda *wish: wishes.append(wish))
+    monkeypatch.setattr(adapter, "take_reached", lambda: [Reached(1, 2)])
+    vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
+    vehicle.engage(True, 3)
+    vehicle.engage(False, 4)
+    assert wishes == [(True, 3), (False, 4)]
+    assert vehicle.take_reached() == [Reached(1, 2)]
+
+
+def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bus that cannot be written to inhibits driving, though it could be read."""
+    vehicle = made(port)
+
+    def fail(*_: object) -> None:
+        raise BusGone("no more room")
+
+    monkeypatch.setattr(port, "send", fail)
+    vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
+    assert "no more room" in vehicle.state().hindrance
+
+
+def test_what_it_passes_on(port: StandInPort) -> None:
+    """Capabilities, counts of adapter and port, silence and closing are those of its parts."""
+    vehicle = made(port)
+    port.waiting = [HeardFrame(Frame(0x555, bytes(8)), START_NS)]
+    before = vehicle.counts.get("unknown_identifier", 0)
+    vehicle.advance(START_NS + 1)
+    assert vehicle.capabilities == CAPABILITIES
+    assert (vehicle.counts["unknown_identifier"] - before, vehicle.counts["overflowed"]) == (1, 3)
+    assert vehicle.is_silent
+    vehicle.close()
+    assert port.is_closed
