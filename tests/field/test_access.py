@@ -31,7 +31,7 @@ from tests.field.secured import (
     tls_changes,
 )
 from tests.require import need
-from tests.support.stalls import Shared, Stalls
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Shared, Stalls
 
 from lavt.control.limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -59,9 +59,6 @@ MAY = [("operator-1", DRIVES), ("operator-2", set()), ("monitor-1", WATCHES)]
 OPEN_SITES = 3
 """So many sites without the lists are attacked at most."""
 NOBODY = 65534
-LONG_STALL_MS = 100
-BUSY_SHARE = 0.05
-"""A host that takes this share of a drive moves the medians of its times."""
 CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY}); " + (
     "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
 )

@@ -17,7 +17,7 @@ import pytest
 from tests.field.counting import Measured, measure, table
 from tests.field.driving import TCP, Drive, driven
 from tests.field.namespaces import Field, Way, plain_field
-from tests.support.stalls import Stalls
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_S
@@ -44,13 +44,10 @@ UNHEARD = 0.05
 """So much of what the server obeyed may have been dropped on its way to the process outside."""
 MARGIN_S = 0.5
 """For brakes that build up."""
-LONG_STALL_MS = 100
 AGAIN_S = 10.0
 """From the end of an outage until the vehicle is driven again; 1.0 s of it is arming."""
 AGAIN_NS = round(AGAIN_S * NS_PER_S)
 USUALLY_AGAIN_S = 3.0
-BUSY_SHARE = 0.05
-"""A host that takes this share of a drive moves the medians of its times."""
 
 SHORT = tuple(f"{name} {SHORT_S:g} s{again}" for again in ("", ", again") for name in WAYS)
 LONG = tuple(f"{name} {duration_s:g} s" for duration_s in LONG_S for name in WAYS)

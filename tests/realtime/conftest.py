@@ -27,10 +27,6 @@ from lavt.experiment.record import read_record
 
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS
-BUSY_SHARE = 0.05
-"""A host that takes this share of a drive moves the medians of its latencies."""
-LONG_STALL_MS = 100
-"""A stall this long can cost a drive its lane, or its driver: commands time out after 300 ms."""
 LONGEST_S = 900
 """A test may have to drive several times, on a host that is busy."""
 

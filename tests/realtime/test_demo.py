@@ -6,8 +6,8 @@ import json
 import subprocess
 import sys
 
-from tests.realtime.conftest import LONG_STALL_MS, Demo
-from tests.support.stalls import Stalls
+from tests.realtime.conftest import Demo
+from tests.support.stalls import LONG_STALL_MS, Stalls
 
 RUN_KEYS = {
     "run", "time", "injection", "inherent", "route", "condition", "controller", "preset", "driver", "participant",

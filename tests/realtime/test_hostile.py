@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from tests.realtime.conftest import BUSY_SHARE, LONG_STALL_MS
-from tests.support.stalls import Shared, Stalls
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Shared, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-from tests.realtime.conftest import BUSY_SHARE, LONG_STALL_MS, Demo
-from tests.support.stalls import Stalls
+from tests.realtime.conftest import Demo
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 from lavt.experiment.record import read_record
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from tests.realtime.conftest import BUSY_SHARE, LONG_STALL_MS, Demo
-from tests.support.stalls import Stalls
+from tests.realtime.conftest import Demo
+from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 CONDITIONS = ("L0", "L5")
 

@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import yaml
 from pydantic import BaseModel
-from tests.realtime.conftest import LONG_STALL_MS
 from tests.support.ports import free_port
-from tests.support.stalls import Shared, Stalls
+from tests.support.stalls import LONG_STALL_MS, Shared, Stalls
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S

@@ -28,6 +28,10 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 PROBE = Path(__file__).with_name("lateness_probe.py")
 STALL_MS = 30.0
 """A stall this long matters where the caller says nothing else."""
+LONG_STALL_MS = 100.0
+"""A stall this long can cost a drive its lane, or its driver: commands time out after 300 ms."""
+BUSY_SHARE = 0.05
+"""A host that takes this share of a drive moves the medians of its latencies."""
 LISTED_MS = 10.0
 """The session's summary counts stalls from this length on."""
 SHOWN = 4
