@@ -13,7 +13,7 @@ from tests.kernel.lane.chrony import SERVING, correction_s, following, start_chr
 from tests.kernel.lane.driving import Drive
 from tests.kernel.lane.machine import Machine, MachineError
 from tests.kernel.lane.netem import netem_on_all
-from tests.kernel.lane.verdicts import require_completed
+from tests.kernel.lane.verdicts import MEDIAN_SHARE, require_completed
 from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
@@ -23,6 +23,7 @@ from lavt.transport.chrony import NOT_RUNNING, Chronyc, read_chrony
 TrueOffset = Callable[[], int]
 NTP_PORT = 11123
 CLOCK = MachineClock()
+TIMES = pytest.mark.judges_times(share=MEDIAN_SHARE)
 
 
 def least_round_trip_ms(machine: Machine, to: Machine) -> float:
@@ -34,6 +35,7 @@ def delta_ns(server: Machine, client: Machine) -> float:
     return (correction_s(client) - correction_s(server)) * NS_PER_S
 
 
+@TIMES
 def test_a_delay_on_one_machine_is_in_the_round_trip_and_gone_afterwards(
     server_machine: Machine, client_machine: Machine
 ) -> None:
@@ -68,6 +70,7 @@ def test_a_started_program_ends_with_its_test(client_machine: Machine) -> None:
     assert not started.running
 
 
+@TIMES
 def test_the_hosts_stalls_are_told_in_this_machines_time(server_machine: Machine, stalls: Stalls) -> None:
     """What the host's probes tell at a time has that time, to the 5 ms that asking takes, also on a slewed clock."""
     server_machine.call(clocks.drift, 500)
@@ -82,6 +85,7 @@ def test_the_hosts_stalls_are_told_in_this_machines_time(server_machine: Machine
     assert min(took_ns) < 5 * NS_PER_MS
 
 
+@TIMES
 def test_a_step_of_one_clock_is_the_change_of_the_true_offset(
     server_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
@@ -94,6 +98,7 @@ def test_a_step_of_one_clock_is_the_change_of_the_true_offset(
     assert true_offset_ns() - before_ns == pytest.approx(250 * NS_PER_MS, abs=50_000)
 
 
+@TIMES
 def test_the_true_offset_is_what_an_exchange_of_time_stamps_finds(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
@@ -107,6 +112,7 @@ def test_the_true_offset_is_what_an_exchange_of_time_stamps_finds(
     assert -client_ahead_ns == pytest.approx(true_offset_ns(), abs=round_trip_ns / 2)
 
 
+@TIMES
 def test_a_drift_of_one_clock_is_the_rate_of_the_true_offset(
     server_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
@@ -119,6 +125,7 @@ def test_a_drift_of_one_clock_is_the_rate_of_the_true_offset(
     assert (true_offset_ns() - begin_ns) / gone_s == pytest.approx(30_000, abs=5_000)
 
 
+@TIMES
 def test_chrony_of_the_client_finds_the_offset(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:
@@ -131,6 +138,7 @@ def test_chrony_of_the_client_finds_the_offset(
     assert delta_ns(server_machine, client_machine) == pytest.approx(true_offset_ns(), abs=NS_PER_MS)
 
 
+@TIMES
 def test_chrony_finds_the_offset_while_the_server_is_slewed(
     server_machine: Machine, client_machine: Machine, true_offset_ns: TrueOffset
 ) -> None:

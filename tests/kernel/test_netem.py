@@ -36,6 +36,8 @@ CLOCK = MachineClock()
 VIDEO, CONTROL, PROBE = 5600, 7448, 5602
 NEVER = [Port("udp", PROBE, "the clock probe")]
 L = ("L0", "L1", "L2", "L3", "L4", "L5")
+MEDIANS = pytest.mark.judges_times(share=MEDIAN_SHARE)
+"""For tests whose assertions are about medians or other quantiles of delays."""
 
 HELD = [
     Flight("video", "server", "udp", VIDEO, 40_000),
@@ -94,6 +96,7 @@ def queues(side: str) -> Any:
     return json.loads(command(f"tc -n {side} -j qdisc show dev {DEVICES[side]}"))
 
 
+@MEDIANS
 def test_each_condition_shifts_video_and_control_and_nothing_else(
     baseline: dict[str, float], sides: dict[str, Netem]
 ) -> None:
@@ -111,6 +114,7 @@ def test_each_condition_shifts_video_and_control_and_nothing_else(
     assert {key: shift_ms for key, shift_ms in shifts_ms.items() if abs(shift_ms) >= 1} == {}
 
 
+@MEDIANS
 def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides: dict[str, Netem]) -> None:
     """With state_delay with_video, what the server's router sends is held as long as the video, by tcp as by udp."""
     for protocol in ("udp", "tcp"):
@@ -126,6 +130,7 @@ def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides
         assert median(flown["control now"].delays_ms) < 1
 
 
+@MEDIANS
 def test_control_by_tcp_is_held(sides: dict[str, Netem]) -> None:
     """Where the routers talk by tcp, the control to the server's router is held, and udp to that port is not."""
     flows = netem_flows(condition("L4"), "client", video_port=VIDEO, control_port=CONTROL, protocol="tcp")
@@ -218,6 +223,7 @@ def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, Netem])
         command("tc -n server qdisc del dev va root")
 
 
+@MEDIANS
 @pytest.mark.parametrize(
     ("distribution", "least_ms", "most_ms"),
     [("normal", 9, 19), ("uniform", 7, 14), ("pareto", 4, 12), ("paretonormal", 4, 12)],
@@ -238,6 +244,7 @@ def test_jitter_spreads_and_keeps_order(
         assert 65 <= p5 < p95 < 87
 
 
+@MEDIANS
 def test_jitter_in_order_is_later(sides: dict[str, Netem]) -> None:
     """At 300 packets a second, 10 ms of normal jitter in order add 3 to 9 ms to the median: the late hold up others."""
     hold_video(sides, Law(75, jitter_ms=10))
@@ -247,6 +254,7 @@ def test_jitter_in_order_is_later(sides: dict[str, Netem]) -> None:
     assert 3 < median(flown.delays_ms) - 75 < 9
 
 
+@MEDIANS
 def test_correlated_jitter_wanders(sides: dict[str, Netem]) -> None:
     """With a correlation of 0.9 the delays of packets 20 ms apart are correlated by 0.6 to 0.97, in order."""
     hold_video(sides, Law(75, jitter_ms=10, jitter_correlation=0.9))
@@ -286,6 +294,7 @@ def test_loss_comes_in_bursts_where_asked(sides: dict[str, Netem]) -> None:
     assert 150 < lost < 480
 
 
+@MEDIANS
 def test_rate_spaces_packets(sides: dict[str, Netem]) -> None:
     """At 2 Mbit/s packets of 1042 bytes, sent 1 ms apart, leave 4.17 ms apart in the median."""
     hold_video(sides, Law(20, rate_bps=2_000_000))
@@ -298,6 +307,7 @@ def test_rate_spaces_packets(sides: dict[str, Netem]) -> None:
     assert abs(spacing_ms - 1042 * 8 / 2_000_000 * 1000) < 0.2
 
 
+@MEDIANS
 def test_reordering_is_as_asked(sides: dict[str, Netem]) -> None:
     """A quarter of 400 packets are not delayed, within four standard deviations, and only these overtake."""
     hold_video(sides, Law(75, jitter_ms=5, reorder=0.25))
@@ -360,6 +370,7 @@ def lavt(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
     return run
 
 
+@MEDIANS
 def test_the_command_applies_verifies_and_clears(lavt: Callable[..., Ended]) -> None:
     """On lo: apply exits 0 and says what it measured, verify finds what was changed by hand, clear puts it back."""
     before = command("tc -j qdisc show dev lo")
@@ -399,21 +410,26 @@ def test_apply_puts_the_interface_back_where_it_cannot_be_verified(lavt: Callabl
 @pytest.mark.parametrize(
     ("name", "number"), [("L1", signal.SIGINT), ("L1", signal.SIGHUP), ("jitter_correlated", signal.SIGINT)]
 )
-def test_a_held_delay_ends_with_its_command(lavt: Callable[..., Ended], name: str, number: signal.Signals) -> None:
+def test_a_held_delay_ends_with_its_command(
+    lavt: Callable[..., Ended], stalls: Stalls, name: str, number: signal.Signals
+) -> None:
     """`lavt netem apply --hold` holds, refuses others, and puts the interface back when the terminal ends its group."""
     before = command("tc -j qdisc show dev lo")
+    since_ns = CLOCK.now().mono_ns
     words = ["netem", "apply", name, "--role", "server", "--interface", "lo", "--hold", "--json"]
     with subprocess.Popen(
         [sys.executable, "-B", "-m", "lavt", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as holder:
         assert holder.stdout is not None
         answer = json.loads(holder.stdout.readline())
+        measured_ns = CLOCK.now().mono_ns
         refused = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
         held = command("tc -j qdisc show dev lo")
         os.killpg(holder.pid, number)
         holder.wait(30)
 
-    assert answer["reasons"] == []
+    with stalls.judging(since_ns, measured_ns, share=MEDIAN_SHARE):
+        assert answer["reasons"] == []
     assert held != before
     assert refused.code == 2
     assert f"{name} on lo, of process {holder.pid}" in refused.err
@@ -426,6 +442,7 @@ def planned(*changes: str) -> PlannedRun:
     return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), sets))
 
 
+@MEDIANS
 @pytest.mark.parametrize("name", ["L4", "jitter", "jitter_correlated", "loss", "loss_burst", "rate", "reorder"])
 def test_what_holds_a_run_does_as_each_condition_asks(name: str, tmp_path: Path) -> None:
     """Each condition, as a run holds its ports on lo, is read back and measured as asked twice, and lo is as it was."""
