@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from lavt.domain import CameraModel, Picture, Pose
-from lavt.vehicle.sim.light import LIGHTS, LightName
-from lavt.vehicle.sim.renderer import Renderer
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
+from lavt.vehicle.sim.rendering.renderer import Renderer
+from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 PLACES = (("a", 30.0), ("a", 205.0), ("b", 175.0), ("b", 470.0), ("c", 60.0), ("c", 230.0))

@@ -34,8 +34,8 @@ from benchmarks.round_trip.carriers import CARRIERS
 
 import lavt
 from lavt.errors import LavtError, UserError, WorkError
-from lavt.experiment.processes import Processes
-from lavt.runtime import precedence
+from lavt.experiment.runs.processes import Processes
+from lavt.runtime import process_priority
 
 FOLDER = Path(__file__).parents[1]
 PACES = {"at_50_hz": "50 Hz", "back_to_back": "back to back"}
@@ -166,7 +166,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure what is asked for and there; 2 where what is asked for is not there."""
     asked = arguments()
-    precedence.take()  # as the server and the client do; routers and both sides inherit it
+    process_priority.take()  # as the server and the client do; routers and both sides inherit it
     missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (asked.only or CARRIERS)]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)

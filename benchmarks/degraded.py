@@ -17,10 +17,10 @@ import numpy as np
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.perception.calibration import calibrated, picture_points
 from lavt.streams import stream
-from lavt.transport.h264 import Decoder, Encoder
-from lavt.vehicle.sim.cross_section import RoadMark
-from lavt.vehicle.sim.renderer import Renderer
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.vehicle.sim.rendering.renderer import Renderer
+from lavt.vehicle.sim.road.cross_section import RoadMark
+from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])

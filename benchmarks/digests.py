@@ -16,8 +16,8 @@ from lavt.clock import MachineClock
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
-from lavt.experiment.plan import PlannedRun, plan_sweep
-from lavt.experiment.sweep import run_all
+from lavt.experiment.runs.plan import PlannedRun, plan_sweep
+from lavt.experiment.sweep.sweep import run_all
 
 
 def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:

@@ -26,7 +26,7 @@ from benchmarks.video.pictures import render_loop
 from benchmarks.video.run import RATE_HZ
 from benchmarks.video.sides import Process, measure
 
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 
 SAMPLE_S = 0.5
 STRETCH_S = 10
@@ -116,7 +116,7 @@ def main() -> int:
     asked = parser.parse_args()
     if not 0 < asked.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
-    precedence.take()  # as the server and the client do
+    process_priority.take()  # as the server and the client do
     sampler = Sampler(asked.minutes * 60)  # the run has a warm-up besides
     with tempfile.TemporaryDirectory() as name:
         run = clean_run(Path(name), SIZES[0], asked.minutes * 60)

@@ -25,8 +25,8 @@ from scipy.special import expit
 
 from lavt.config import SweepConfig
 from lavt.config_file import conditions, load_config, parse_config, shipped
-from lavt.experiment.plan import plan_sweep
-from lavt.experiment.sweep import run_all
+from lavt.experiment.runs.plan import plan_sweep
+from lavt.experiment.sweep.sweep import run_all
 
 PAPER = {"L0": 30, "L1": 28, "L2": 15, "L3": 11, "L4": 9, "L5": 3}
 """Completed of 30."""

@@ -2,14 +2,14 @@
 
     python benchmarks/find_designed_preset.py
 
-Only the model of `lavt.experiment.theory` is used, no drive and no result under injected delay.
+Only the model of `lavt.experiment.boundary.delay_margin` is used, no drive and no result under injected delay.
 """
 
 from __future__ import annotations
 
 import math
 
-from lavt.experiment.theory import LateralLoop, critical_delay_s, phase_margin_rad, smallest_lookahead_s
+from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s, phase_margin_rad, smallest_lookahead_s
 
 MARGIN_RAD = math.radians(30)
 VIDEO_S = 0.062  # paper_wifi5, median, stamp written to stamp read

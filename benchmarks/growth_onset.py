@@ -14,9 +14,9 @@ from statistics import median
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.boundary import theoretical_ms, with_video_delay
-from lavt.experiment.boundary_search import zero_bracket
-from lavt.experiment.growth import straight_growth
+from lavt.experiment.boundary.bisection import zero_bracket
+from lavt.experiment.boundary.boundary import theoretical_ms, with_video_delay
+from lavt.experiment.boundary.oscillation_growth import straight_growth
 
 LONGEST_MS = 1000.0
 WITHIN_MS = 0.5

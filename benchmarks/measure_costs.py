@@ -24,9 +24,9 @@ import yaml
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.plan import plan_run
-from lavt.experiment.record import Record, read_record
-from lavt.experiment.run import run_once
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.run import run_once
+from lavt.recording.record import Record, read_record
 
 US = 1000.0
 Samples = dict[tuple[str, str], list[float]]

@@ -1,6 +1,6 @@
 """Mutate the modules that matter, and measure which share of the mutants the quick tests catch.
 
-    python benchmarks/mutation.py [--seed 16] [--count 320] [--jobs 1] [--only control/safety.py] [--out results.jsonl]
+    python benchmarks/mutation.py [--seed 16] [--count 320] [--jobs 1] [--only safety/gate.py] [--out results.jsonl]
 
 A mutant is one small change in one place: a comparison, a number, a statement that is removed (`mutating/sites.py`).
 The places are drawn at random from all places of the modules in `mutating/modules.py`, and follow from the seed and the

@@ -15,10 +15,10 @@ from statistics import median
 import numpy as np
 
 from lavt.domain import CameraModel, FloatArray, Pose
-from lavt.vehicle.sim import renderer
-from lavt.vehicle.sim.light import LightName
-from lavt.vehicle.sim.renderer import Renderer, SceneryKind
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.rendering import renderer
+from lavt.vehicle.sim.rendering.light import LightName
+from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
+from lavt.vehicle.sim.road.road import Road, load_road
 
 FRAME_M = 8.33 / 30
 SWERVE_M, SWERVE_RAD, SWERVE_EVERY_M = 6.0, 0.6, 56.0

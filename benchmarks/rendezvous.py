@@ -22,11 +22,11 @@ import numpy as np
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US
-from lavt.experiment.processes import Processes
-from lavt.runtime import precedence
+from lavt.experiment.runs.processes import Processes
+from lavt.runtime import process_priority
 from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
-from lavt.transport.rendezvous import REGISTER_EVERY_NS, Address, wrap, write_registration
-from lavt.transport.video_path import PathClient
+from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, wrap, write_registration
+from lavt.transport.video.path_validation import PathClient
 
 HERE = "127.0.0.1"
 PACKETS, PACKET_BYTES, RATE_HZ = 14, 1216, 30
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
-    precedence.take()
+    process_priority.take()
     took_ns: dict[str, list[int]] = {"straight": [], "through": []}
     config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
     sets = [word for change in CHANGES for word in ("--set", change)]

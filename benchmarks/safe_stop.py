@@ -2,7 +2,7 @@
 
     python -m benchmarks.safe_stop [PICTURE]        # at the top of the repository
 
-About two minutes on one core. The stops are those of tests/control/test_safe_stop.py.
+About two minutes on one core. The stops are those of tests/safety/test_safe_stop.py.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from itertools import groupby
 from operator import itemgetter
 
 from matplotlib.figure import Figure
-from tests.control.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
+from tests.safety.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
 
-from lavt.experiment.figure_style import COLOURS, new_figure
+from lavt.experiment.report.figure_style import COLOURS, new_figure
 
 Done = list[tuple[Curve, Stop, Stop]]
 FOLLOWED, HELD = "along the path", "wheel held"

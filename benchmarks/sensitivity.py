@@ -20,9 +20,9 @@ from typing import Any
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, parse_config, shipped
 from lavt.control.drive_controller import Preset, find_preset
-from lavt.experiment.plan import plan_sweep
-from lavt.experiment.sweep import run_all
-from lavt.experiment.theory import LateralLoop, critical_delay_s, phase_margin_rad
+from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s, phase_margin_rad
+from lavt.experiment.runs.plan import plan_sweep
+from lavt.experiment.sweep.sweep import run_all
 
 DELAY_S = 0.081
 """At L0 with `paper_wifi5`: 62 + 9 ms, and 10 ms from the picture to the wheel's command: see find_designed_preset."""

@@ -31,15 +31,15 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Pose
 from lavt.errors import BadPacket
 from lavt.streams import stream
-from lavt.transport.fec import RepairReceiver, RepairSender
-from lavt.transport.h264 import DecodedPicture, Decoder, Encoder
-from lavt.transport.hold import LEAST_HOLD_NS
-from lavt.transport.reorder import Ordered, ReorderBuffer
-from lavt.transport.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
-from lavt.transport.stamp import read_clear_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp_i420
-from lavt.transport.stamp_check import LearnedBase
-from lavt.vehicle.sim.renderer import Renderer
-from lavt.vehicle.sim.road import load_road
+from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.fec import RepairReceiver, RepairSender
+from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
+from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
+from lavt.transport.video.stamp import read_clear_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp_i420
+from lavt.transport.video.stamp_check import LearnedBase
+from lavt.vehicle.sim.rendering.renderer import Renderer
+from lavt.vehicle.sim.road.road import load_road
 
 SIZES = ("320x240", "640x480", "1280x720", "1920x1080")
 RATES_KBPS = (200, 350, 460, 700, 1000, 2000, 3200, 4000, 8000)

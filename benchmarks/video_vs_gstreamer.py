@@ -25,7 +25,7 @@ from benchmarks.video.impaired import CASES, impaired_part
 from benchmarks.video.pictures import render_loop
 
 from lavt.errors import LavtError, UserError
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 
 QUICK = {"pairs": 1, "seconds": 4.0, "frames": 120}
 
@@ -58,7 +58,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure what is asked for; 2 where GStreamer is missing."""
     asked = arguments()
-    precedence.take()  # as the server and the client do; the processes of both sides and the relay inherit it
+    process_priority.take()  # as the server and the client do; the processes of both sides and the relay inherit it
     try:
         gstreamer()
         with tempfile.TemporaryDirectory() as name:

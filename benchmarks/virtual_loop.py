@@ -34,8 +34,8 @@ from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
-from lavt.experiment.plan import plan_run
-from lavt.experiment.virtual_run import VirtualLoop, build_loop, drive
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive
 from lavt.node import Hop, Node
 
 SETTINGS = {

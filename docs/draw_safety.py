@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lavt.control.safety_page import drawn
+from lavt.safety.safety_page import drawn
 
 PAGE = Path(__file__).with_name("safety.md")
 

@@ -11,8 +11,8 @@ from tempfile import mkdtemp
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.plan import plan_run
-from lavt.experiment.run import run_once
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.run import run_once
 
 
 def main() -> None:

@@ -19,8 +19,8 @@ from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.control.drive_controller import CONTROLLERS, Preset
 from lavt.domain import PATH_POINTS, Decision, Lane
-from lavt.experiment.plan import plan_run
-from lavt.experiment.run import run_once
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.run import run_once
 
 
 class Stanley:

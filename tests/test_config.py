@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.build.sides import limits_of
+from lavt.assembly.nodes import limits_of
 from lavt.config import (
     BoundaryConfig,
     ClientConfig,
@@ -29,9 +29,9 @@ from lavt.config import (
     SweepConfig,
 )
 from lavt.config_file import condition, conditions, load_config, parse_config, parse_yaml, shipped
-from lavt.control.limits import LIMITS
 from lavt.errors import UserError
-from lavt.experiment.plan import plan_run, plan_sweep
+from lavt.experiment.runs.plan import plan_run, plan_sweep
+from lavt.safety.limits import LIMITS
 
 SCHEMAS: dict[str, type[Section]] = {
     "boundary.yaml": BoundaryConfig,

@@ -10,7 +10,7 @@ from benchmarks import fuzz
 from benchmarks.fuzzing.mutation import Chance, Corpus, an_input
 from benchmarks.fuzzing.target import Target
 
-from lavt.control.safety import SafetyGate
+from lavt.safety.gate import SafetyGate
 
 INPUTS = (50_000, 2_000_000)
 """Two million take a minute of CPU time, where it was measured."""

@@ -35,7 +35,7 @@ def refusal(*arguments: str, **environment: str) -> str:
         (["test_lane.py"], ["tests/kernel/test_lane.py"]),
         (["tests/kernel/test_lane.py", "-q"], ["tests/kernel/test_lane.py", "-q"]),
         (["test_lane.py::test_a[b.py]"], ["tests/kernel/test_lane.py::test_a[b.py]"]),
-        (["tests/test_build.py"], ["tests/test_build.py", "tests/kernel"]),
+        (["tests/assembly/test_assembly.py"], ["tests/assembly/test_assembly.py", "tests/kernel"]),
     ],
 )
 def test_tests_are_named_by_their_file_alone(given: list[str], passed: list[str]) -> None:

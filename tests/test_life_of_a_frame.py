@@ -5,20 +5,20 @@ from __future__ import annotations
 from itertools import count
 
 from lavt.control.drive_controller import PRESETS, make_controller
-from lavt.control.limiter import Limiter
-from lavt.control.limits import LIMITS
-from lavt.control.safety import SafetyGate
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Command, SessionRequest
 from lavt.perception.lane_detector import LaneDetector
-from lavt.transport.delay import DelayLaw, DelayLine
-from lavt.transport.h264 import Decoder, Encoder
-from lavt.transport.hold import LEAST_HOLD_NS
+from lavt.safety.gate import SafetyGate
+from lavt.safety.limiter import Limiter
+from lavt.safety.limits import LIMITS
+from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
 from lavt.transport.messages import decode, encode
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
-from lavt.transport.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
-from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.road import load_road
+from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+from lavt.vehicle.sim.rendering.camera import SimCamera
+from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 
 WALL_NS = 1_790_000_000 * NS_PER_S

@@ -129,7 +129,7 @@ def test_every_path_of_the_table_exists() -> None:
 
 def test_the_sample_follows_from_the_seed() -> None:
     """The same seed gives the same mutants, a smaller count the first of them, and another seed others."""
-    sites = mutation.sites_of(["control/claims.py", "transport/hold.py"])
+    sites = mutation.sites_of(["safety/takeover_requests.py", "transport/rtp/adaptive_hold.py"])
     drawn = mutation.sample(sites, 1, 30)
     assert drawn == mutation.sample(sites, 1, 30)
     assert drawn[:10] == mutation.sample(sites, 1, 10)
@@ -146,7 +146,7 @@ def test_sampled_mutants_compile(every: dict[str, list[Site]]) -> None:
         assert each.line != each.mutated
 
 
-def a_result(by: str, module: str = "control/claims.py") -> results.Result:
+def a_result(by: str, module: str = "safety/takeover_requests.py") -> results.Result:
     return results.Result(module, "f", "g(a < b)", "g(a <= b)", 0, 3, "comparison", bool(by), by, 1.0)
 
 
@@ -263,8 +263,8 @@ def test_wider_tests_follow_when_those_of_the_module_pass(
     pretended: type[PretendedTree], tmp_path: Path, jobs: int
 ) -> None:
     """A mutant survives where its module's tests and then the rest of its area's pass."""
-    own, rest = own_tests("transport/hold.py"), rest_of_area("transport/hold.py")
-    of_one = mutation.sites_of(["transport/hold.py"])["transport/hold.py"][0][:1]
+    own, rest = own_tests("transport/rtp/adaptive_hold.py"), rest_of_area("transport/rtp/adaptive_hold.py")
+    of_one = mutation.sites_of(["transport/rtp/adaptive_hold.py"])["transport/rtp/adaptive_hold.py"][0][:1]
     for passing, expected in ((set(), [own]), ({*own}, [own, rest]), ({*own, *rest}, [own, rest])):
         pretended.passing, pretended.mutated_runs = passing, []
         (result,) = mutation.Runner(tmp_path, jobs, 10.0).run(of_one)
@@ -272,15 +272,15 @@ def test_wider_tests_follow_when_those_of_the_module_pass(
         assert result.caught == (passing != {*own, *rest})
 
 
-@pytest.mark.parametrize("broken", [own_tests("transport/hold.py")[0], "tests/transport"])
+@pytest.mark.parametrize("broken", [own_tests("transport/rtp/adaptive_hold.py")[0], "tests/transport"])
 def test_tests_that_fail_unmutated_end_the_run(
     pretended: type[PretendedTree], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str], broken: str,
 ) -> None:  # fmt: skip
     """Tests that fail without a mutation end the program with one line and exit code 2."""
     pretended.broken = {broken}
-    pretended.passing = {*own_tests("transport/hold.py")}
-    monkeypatch.setattr(sys, "argv", ["mutation.py", "--only", "transport/hold.py", "--count", "1"])
+    pretended.passing = {*own_tests("transport/rtp/adaptive_hold.py")}
+    monkeypatch.setattr(sys, "argv", ["mutation.py", "--only", "transport/rtp/adaptive_hold.py", "--count", "1"])
     monkeypatch.chdir(tmp_path)
     assert mutation.main() == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

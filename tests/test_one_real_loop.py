@@ -10,9 +10,9 @@ import pytest
 
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.plan import plan_run
-from lavt.experiment.record import Record, read_record
-from lavt.experiment.run import run_once
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.run import run_once
+from lavt.recording.record import Record, read_record
 
 VIDEO_MS, CONTROL_MS = 75.0, 40.0
 CHANGES = (

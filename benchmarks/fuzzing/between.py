@@ -9,8 +9,15 @@ from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Target, expect, total
 
 from lavt.domain import NS_PER_MS
-from lavt.transport.rendezvous import MOST_CLIENTS, REGISTER_EVERY_NS, Forwarder, unwrap, wrap, write_registration
-from lavt.transport.signing import SIGNATURE_BYTES, PublicKey
+from lavt.transport.rendezvous.forwarder import (
+    MOST_CLIENTS,
+    REGISTER_EVERY_NS,
+    Forwarder,
+    unwrap,
+    wrap,
+    write_registration,
+)
+from lavt.transport.security.keys import SIGNATURE_BYTES, PublicKey
 
 VEHICLE = ("203.0.113.2", 5600)
 

@@ -9,7 +9,7 @@ from itertools import count
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Bench, Target, Wrong, expect, of, total
 
-from lavt.build.entropy import SeededEntropy
+from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
@@ -19,12 +19,12 @@ from lavt.domain import (
 from lavt.node import Send
 from lavt.nodes.camera import CameraNode
 from lavt.nodes.clock_sync import ClockSyncNode
-from lavt.transport.clock_probe import LAYOUT, decode_reply, encode_request
-from lavt.transport.fec import RepairSender
-from lavt.transport.rtcp import ReceptionReport, is_rtcp, max_bit_rate, picture_loss, receiver_report
-from lavt.transport.rtp import Packetizer
-from lavt.transport.rtp_stream import StreamSender
-from lavt.transport.video_path import PathClient, PathServer
+from lavt.transport.clock_sync.probe import LAYOUT, decode_reply, encode_request
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.rtcp import ReceptionReport, is_rtcp, max_bit_rate, picture_loss, receiver_report
+from lavt.transport.rtp.rtp import Packetizer
+from lavt.transport.video.path_validation import PathClient, PathServer
+from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import CapturedFrame
 
 STEP_NS = NS_PER_MS

@@ -10,7 +10,7 @@ from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Bench, Target, expect, of, total
 
 from lavt.control.drive_controller import PRESETS, make_controller
-from lavt.control.limits import CLIENT_LIMITS
+from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
@@ -29,22 +29,23 @@ from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient
+from lavt.nodes.payloads import PathToken, ReceivedUnit, View
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
-from lavt.nodes.reports import PathToken, ReceivedUnit, View
 from lavt.streams import stream
-from lavt.transport.clock_probe import ProbeReply, decode_request, encode_reply
-from lavt.transport.extended_reports import ReferenceAnswer
-from lavt.transport.fec import RepairSender
-from lavt.transport.h264 import Decoder, Encoder
-from lavt.transport.injector import Injected
+from lavt.transport.clock_sync.probe import ProbeReply, decode_request, encode_reply
+from lavt.transport.emulation.impairment import Flow, Law
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem import Flow, Law
-from lavt.transport.pictures import RenderedPicture, VideoReceiver
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import parse_feedback, sender_report
-from lavt.transport.rtp import Depacketizer, Packetizer
-from lavt.transport.stamp import (
+from lavt.transport.netem.injector import Injected
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtcp import parse_feedback, sender_report
+from lavt.transport.rtp.rtcp_xr import ReferenceAnswer
+from lavt.transport.rtp.rtp import Depacketizer, Packetizer
+from lavt.transport.video.frame_codec import RenderedPicture, VideoReceiver
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.path_validation import PathClient, PathServer, is_path_datagram
+from lavt.transport.video.stamp import (
     STAMP_PX,
     read_clear_stamp,
     read_stamp,
@@ -53,7 +54,6 @@ from lavt.transport.stamp import (
     write_stamp,
     write_stamp_luma,
 )
-from lavt.transport.video_path import PathClient, PathServer, is_path_datagram
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS

@@ -16,23 +16,23 @@ from benchmarks.fuzzing.operator_side import STEP_NS, TOKEN, units, video_corpor
 from benchmarks.fuzzing.target import START, Bench, Target, expect, total
 from benchmarks.fuzzing.vehicle import STRAIGHT
 
-from lavt.build.entropy import SeededEntropy
+from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import NS_PER_MS, Command, SessionReply, SessionRequest, State
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
+from lavt.nodes.payloads import PathToken
 from lavt.nodes.receiver import ReceiverNode
-from lavt.nodes.reports import PathToken
-from lavt.transport.door import ClientDoor, ServerDoor
-from lavt.transport.fec import RepairSender
 from lavt.transport.messages import encode
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import parse_feedback, picture_loss, sender_report
-from lavt.transport.rtp import Depacketizer, Packetizer
-from lavt.transport.rtp_stream import StreamSender
-from lavt.transport.sealing import OperatorSeal, VehicleSeal
-from lavt.transport.signing import PrivateKey
-from lavt.transport.video_cipher import SrtpCipher
-from lavt.transport.video_path import PathClient, PathServer, is_path_datagram
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtcp import parse_feedback, picture_loss, sender_report
+from lavt.transport.rtp.rtp import Depacketizer, Packetizer
+from lavt.transport.security.envelope import OperatorSeal, VehicleSeal
+from lavt.transport.security.gateway import ClientDoor, ServerDoor
+from lavt.transport.security.keys import PrivateKey
+from lavt.transport.video.cipher import SrtpCipher
+from lavt.transport.video.path_validation import PathClient, PathServer, is_path_datagram
+from lavt.transport.video.stream_sender import StreamSender
 
 DOOR_STEP_NS = 4 * NS_PER_MS
 """Between two inputs: more of them a second would stay outside unread."""

@@ -11,7 +11,7 @@ from benchmarks.fuzzing.mutation import Chance, Corpus
 
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Send
-from lavt.runtime.chain import walk
+from lavt.runtime.pipeline import walk
 
 START = Now(1_000 * NS_PER_S, 1_790_000_000 * NS_PER_S)
 

@@ -8,10 +8,7 @@ from typing import Any
 from benchmarks.fuzzing.mutation import Chance, Corpus
 from benchmarks.fuzzing.target import START, Bench, Target, Wrong, expect, of, total
 
-from lavt.build.entropy import SeededEntropy
-from lavt.control.limiter import Limiter
-from lavt.control.limits import LIMITS
-from lavt.control.safety import LARGEST_STORED_NUMBER, SafetyGate
+from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
@@ -28,10 +25,13 @@ from lavt.domain import (
 from lavt.node import Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.injection import InjectionNode
-from lavt.nodes.reports import FrameWritten, Rest
-from lavt.transport.injector import Inject, Injected
+from lavt.nodes.payloads import FrameWritten, Rest
+from lavt.safety.gate import LARGEST_STORED_NUMBER, SafetyGate
+from lavt.safety.limiter import Limiter
+from lavt.safety.limits import LIMITS
+from lavt.transport.emulation.impairment import check_flows
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
-from lavt.transport.netem import check_flows
+from lavt.transport.netem.injector import Inject, Injected
 from lavt.vehicle.vehicle import Capabilities, Reached
 
 FRAME_NS = NS_PER_S // 30

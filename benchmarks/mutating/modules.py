@@ -10,43 +10,82 @@ SOURCES: Final = "src/lavt"
 
 _DBW = "vehicle/dbw"
 _SAFETY = (
-    "control/test_safety_machine.py", "control/test_safety_commands.py", "control/test_safety_arming.py",
-    "control/test_safety_session.py", "control/test_safety_vehicle.py", "control/test_safety_path.py",
-    "control/test_safety_page.py", "nodes/test_actuator_node.py",
-)  # fmt: skip
+    "safety/test_safety_machine.py",
+    "safety/test_safety_commands.py",
+    "safety/test_safety_arming.py",
+    "safety/test_safety_session.py",
+    "safety/test_safety_vehicle.py",
+    "safety/test_safety_path.py",
+    "safety/test_safety_page.py",
+    "nodes/test_actuator_node.py",
+)
 _ADAPTER = tuple(
     f"{_DBW}/test_adapter_{name}.py" for name in ("engaging", "faults", "limits", "vectors", "and_gate", "properties")
 )
 
 MODULES: Final[dict[str, tuple[str, ...]]] = {
-    "control/safety.py": _SAFETY,
-    "control/claims.py": ("control/test_safety_session.py",),
-    "control/limits.py": (*_SAFETY, "control/test_limiter.py", "nodes/test_driver_node.py"),
-    "control/limiter.py": ("control/test_limiter.py", "control/test_safety_path.py", "nodes/test_actuator_node.py"),
-    "control/written.py": ("control/test_written.py", "nodes/test_camera_node.py"),
+    "safety/gate.py": _SAFETY,
+    "safety/takeover_requests.py": ("safety/test_safety_session.py",),
+    "safety/limits.py": (*_SAFETY, "safety/test_limiter.py", "nodes/test_driver_node.py"),
+    "safety/limiter.py": ("safety/test_limiter.py", "safety/test_safety_path.py", "nodes/test_actuator_node.py"),
+    "safety/issued_stamps.py": ("safety/test_issued_stamps.py", "nodes/test_camera_node.py"),
     "nodes/client_session.py": ("nodes/test_client_session.py", "nodes/test_driver_node.py"),
-    "transport/signing.py": ("transport/test_signing.py", "transport/test_sealing.py", "transport/test_door.py"),
-    "transport/sealing.py": ("transport/test_sealing.py", "transport/test_sealing_wire.py", "transport/test_door.py"),
-    "transport/door.py": ("transport/test_door.py",),
-    "transport/screen.py": ("transport/test_screen.py", "transport/test_door.py"),
-    "transport/fec.py": ("transport/test_fec.py", "transport/test_rtp_stream.py", "nodes/test_receiver_node.py"),
-    "transport/erasure.py": ("transport/test_erasure.py", "transport/test_fec.py"),
-    "transport/reorder.py": ("transport/test_reorder.py", "transport/test_loss.py", "transport/test_reception.py"),
-    "transport/hold.py": ("transport/test_hold.py", "transport/test_reorder.py"),
-    "transport/rtp.py": ("transport/test_rtp.py", "transport/test_rtp_stream.py", "transport/test_pictures.py"),
-    "transport/rtp_stream.py": ("transport/test_rtp_stream.py", "nodes/test_camera_node.py"),
-    "transport/clock_offset.py": (
-        "transport/test_clock_offset.py", "transport/test_chrony.py", "transport/test_ptp.py",
+    "transport/security/keys.py": (
+        "transport/security/test_signing_keys.py",
+        "transport/security/test_envelope.py",
+        "transport/security/test_gateway.py",
+    ),
+    "transport/security/envelope.py": (
+        "transport/security/test_envelope.py",
+        "transport/security/test_envelope_wire.py",
+        "transport/security/test_gateway.py",
+    ),
+    "transport/security/gateway.py": ("transport/security/test_gateway.py",),
+    "transport/security/flood_filter.py": (
+        "transport/security/test_flood_filter.py",
+        "transport/security/test_gateway.py",
+    ),
+    "transport/rtp/fec.py": (
+        "transport/rtp/test_fec.py",
+        "transport/video/test_stream_sender.py",
+        "nodes/test_receiver_node.py",
+    ),
+    "transport/rtp/parity.py": ("transport/rtp/test_parity.py", "transport/rtp/test_fec.py"),
+    "transport/rtp/jitter_buffer.py": (
+        "transport/rtp/test_jitter_buffer.py",
+        "transport/rtp/test_loss.py",
+        "transport/rtp/test_reception_stats.py",
+    ),
+    "transport/rtp/adaptive_hold.py": ("transport/rtp/test_adaptive_hold.py", "transport/rtp/test_jitter_buffer.py"),
+    "transport/rtp/rtp.py": (
+        "transport/rtp/test_rtp.py",
+        "transport/video/test_stream_sender.py",
+        "transport/video/test_frame_codec.py",
+    ),
+    "transport/video/stream_sender.py": ("transport/video/test_stream_sender.py", "nodes/test_camera_node.py"),
+    "transport/clock_sync/clock_report.py": (
+        "transport/clock_sync/test_clock_report.py",
+        "transport/clock_sync/test_chrony.py",
+        "transport/clock_sync/test_ptp.py",
         "nodes/test_clock_sync_node.py",
     ),
-    "experiment/metrics.py": ("experiment/test_metrics.py", "experiment/test_hops.py", "experiment/test_validity.py"),
-    "experiment/tracking.py": ("experiment/test_metrics.py",),
-    "experiment/statistics.py": (
-        "experiment/test_statistics.py", "experiment/test_survival.py", "experiment/test_summary.py",
+    "experiment/analysis/metrics.py": (
+        "experiment/analysis/test_metrics.py",
+        "experiment/analysis/test_stage_latency.py",
+        "experiment/analysis/test_validity.py",
     ),
-    "experiment/survival.py": ("experiment/test_survival.py", "experiment/test_summary.py"),
-    "experiment/contrasts.py": ("experiment/test_contrasts.py",),
-    "experiment/offset.py": ("experiment/test_offset.py", "experiment/test_clock_check.py"),
+    "experiment/analysis/tracking.py": ("experiment/analysis/test_metrics.py",),
+    "experiment/statistics/intervals.py": (
+        "experiment/statistics/test_intervals.py",
+        "experiment/statistics/test_survival.py",
+        "experiment/statistics/test_summary.py",
+    ),
+    "experiment/statistics/survival.py": (
+        "experiment/statistics/test_survival.py",
+        "experiment/statistics/test_summary.py",
+    ),
+    "experiment/statistics/contrasts.py": ("experiment/statistics/test_contrasts.py",),
+    "experiment/analysis/clock_offset.py": ("experiment/analysis/test_clock_offset.py", "doctor/test_clock_checks.py"),
     f"{_DBW}/adapter.py": _ADAPTER,
     f"{_DBW}/bus.py": (f"{_DBW}/test_bus.py",),
     f"{_DBW}/codec.py": (f"{_DBW}/test_codec.py", f"{_DBW}/test_profile_dbc.py", f"{_DBW}/test_adapter_vectors.py"),
@@ -57,42 +96,24 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/sending.py": _ADAPTER,
     f"{_DBW}/states.py": (*_ADAPTER, f"{_DBW}/test_by_wire_page.py"),
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
-    f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "test_build_by_wire.py"),
-}  # fmt: skip
+    f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "assembly/test_assembly_by_wire.py"),
+}
 """Path below `src/lavt` to paths below `tests`, the most special ones first."""
 
 AREAS: Final[dict[str, tuple[str, ...]]] = {
-    "control": ("control", "nodes", "test_life_of_a_frame.py"),
-    "nodes": ("nodes", "control", "test_life_of_a_frame.py"),
+    "safety": ("safety", "nodes", "test_life_of_a_frame.py"),
+    "nodes": ("nodes", "safety", "test_life_of_a_frame.py"),
     "transport": ("transport", "nodes", "test_life_of_a_frame.py"),
-    "experiment": tuple(
-        f"experiment/test_{name}.py"
-        for name in (
-            "metrics",
-            "hops",
-            "validity",
-            "statistics",
-            "survival",
-            "summary",
-            "swept_summary",
-            "contrasts",
-            "compared_error",
-            "offset",
-            "clock_check",
-            "virtual_clocks",
-            "report",
-            "report_parts",
-            "report_words",
-            "figures",
-            "tabular",
-            "join",
-            "steering",
-            "plan",
-        )
+    "experiment": (
+        "experiment/analysis",
+        "experiment/statistics",
+        "experiment/report",
+        "experiment/runs/test_join.py",
+        "experiment/runs/test_plan.py",
     ),  # those that make up records; the others drive
-    _DBW: (_DBW, "test_build_by_wire.py"),
+    _DBW: (_DBW, "assembly/test_assembly_by_wire.py"),
 }
-"""Folder of a module to the wider tests: they are run for what its own tests let pass."""
+"""Folder of a module, or one above it, to the wider tests: they are run for what its own tests let pass."""
 
 
 def own_tests(module: str) -> tuple[str, ...]:
@@ -102,7 +123,8 @@ def own_tests(module: str) -> tuple[str, ...]:
 
 def area_of(module: str) -> tuple[str, ...]:
     """Return the paths of the wider tests around a module, from the repository's top."""
-    return tuple(f"tests/{path}" for path in AREAS[module.rpartition("/")[0]])
+    folder = next(folder for folder in sorted(AREAS, key=len, reverse=True) if module.startswith(f"{folder}/"))
+    return tuple(f"tests/{path}" for path in AREAS[folder])
 
 
 def rest_of_area(module: str) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from av.video.frame import VideoFrame
 from benchmarks.video.pictures import picture_of, planes_loop
 from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, asked_run, freeze, tell, wall_ns
 
-from lavt.transport.stamp import write_stamp_i420
+from lavt.transport.video.stamp import write_stamp_i420
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from benchmarks.video.gstreamer import gstreamer, receiving
 from benchmarks.video.run import Run, asked_run, freeze, tell, wait_for_line, wall_ns
 from benchmarks.video.watch import Watch
 
-from lavt.transport.stamp import read_stamp
+from lavt.transport.video.stamp import read_stamp
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from benchmarks.video.run import Pace, Run, asked_run, cpu_ns, freeze, save_unit
 from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_S
-from lavt.transport.stamp import write_stamp_i420
+from lavt.transport.video.stamp import write_stamp_i420
 
 
 def main() -> None:

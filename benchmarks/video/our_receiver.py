@@ -10,7 +10,7 @@ from benchmarks.video.run import TOKEN, asked_run, tell, wait_for_line
 from benchmarks.video.watch import Watch
 
 from lavt.domain import Now
-from lavt.nodes.reports import PathToken
+from lavt.nodes.payloads import PathToken
 
 
 class ReadPictures:

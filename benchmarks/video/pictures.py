@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavt.domain import CameraModel, Picture, Pose
-from lavt.transport.stamp import STAMP_PX
-from lavt.vehicle.sim.renderer import Renderer
-from lavt.vehicle.sim.road import load_road
+from lavt.transport.video.stamp import STAMP_PX
+from lavt.vehicle.sim.rendering.renderer import Renderer
+from lavt.vehicle.sim.road.road import load_road
 
 LOOP_FRAMES = 300
 FRAME_M = 8.33 / 30

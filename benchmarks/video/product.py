@@ -9,10 +9,10 @@ from typing import Any, Protocol
 from benchmarks.video.pictures import picture_of, planes_loop
 from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
-from lavt.build.entropy import MachineEntropy
-from lavt.build.fidelity import VIDEO
-from lavt.build.sides import build_client, build_server
-from lavt.build.vehicles import Plant, build_unpictured
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.fidelity import VIDEO
+from lavt.assembly.nodes import build_client, build_server
+from lavt.assembly.vehicles import Plant, build_unpictured
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
@@ -20,8 +20,8 @@ from lavt.node import Hop, Message, Node, Send
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.watcher import WatcherNode
 from lavt.runtime.realtime import RealRuntime
-from lavt.transport.pictures import PictureReceiver
 from lavt.transport.udp_link import UdpLink
+from lavt.transport.video.frame_codec import PictureReceiver
 from lavt.vehicle.camera import CapturedFrame
 
 LOOPBACK = "127.0.0.1"

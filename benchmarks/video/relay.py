@@ -22,8 +22,8 @@ from benchmarks.video.run import asked_run, freeze, tell
 from benchmarks.video.sides import WARM_UP_FRAMES
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.chance import Draws, Losses
-from lavt.transport.netem import Law, gilbert
+from lavt.transport.emulation.impairment import Law, gilbert
+from lavt.transport.emulation.random_process import Draws, Losses
 
 ONE_WAY_MS = 20
 BUFFER_BYTES = 4 * 1024 * 1024

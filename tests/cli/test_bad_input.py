@@ -17,7 +17,7 @@ from tests.support.command_line import CommandResult, Run
 import lavt
 from lavt.cli.main import app
 from lavt.config_file import shipped
-from lavt.experiment.results import IDENTITY
+from lavt.experiment.analysis.results import IDENTITY
 from lavt.transport.zenoh_link import Router, quiet_logs
 
 DEMO = str(shipped("configs/demo.yaml"))

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from tests.support.command_line import Run
 
-from lavt.build.dbw import shipped_profiles
+from lavt.assembly.dbw import shipped_profiles
 
 Edit = Callable[[dict[str, Any]], Any]
 PROFILES = sorted(shipped_profiles())

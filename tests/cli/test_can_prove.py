@@ -16,8 +16,8 @@ from tests.support.command_line import Run
 from tests.support.ports import free_port
 from tests.support.stalls import Stalls
 
-from lavt.build.dbw import load_profile, shipped_profiles
-from lavt.build.dbw_proof import check_proof, proof_of
+from lavt.assembly.dbw import load_profile, shipped_profiles
+from lavt.assembly.dbw_proof import check_proof, proof_of
 from lavt.clock import MachineClock
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import shipped

@@ -14,7 +14,7 @@ from lavt.clock import MachineClock
 from lavt.domain import Now
 from lavt.node import Message
 from lavt.nodes.clock_sync import ClockSyncNode
-from lavt.transport.clock_offset import ClockReport
+from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import UdpLink
 
 

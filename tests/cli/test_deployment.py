@@ -12,7 +12,7 @@ from tests.require import need
 from typer.testing import CliRunner
 
 from lavt.cli.main import app
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
@@ -61,7 +61,7 @@ def test_units_run_as_a_user_of_their_own(path: Path) -> None:
     service = unit(path)["Service"]
     assert (service["User"], service["Group"]) == ("lavt", "lavt")
     assert (service["CapabilityBoundingSet"], service["NoNewPrivileges"]) == ("", "yes")
-    asked = precedence.OF_THE_CAR if path.name == "lavt-server.service" else precedence.NICENESS
+    asked = process_priority.OF_THE_CAR if path.name == "lavt-server.service" else process_priority.NICENESS
     assert service["LimitNICE"] == str(asked)
 
 

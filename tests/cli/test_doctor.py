@@ -17,19 +17,19 @@ from tests.field import by_wire
 from tests.support.command_line import Run
 from tests.vehicle.moving_video import write_video
 
-from lavt.build.by_wire import listen
-from lavt.cli import doctor, examine
+from lavt.assembly.by_wire import listen
+from lavt.cli import doctor
 from lavt.clock import MachineClock
 from lavt.config import Section, ServerConfig
 from lavt.config_file import load_config, parse_config, shipped
+from lavt.doctor import checks, probes
+from lavt.doctor.checks import Check, CodecTimes, Heard, Seen, Verdict
+from lavt.doctor.clock_checks import Finding, Opinion
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, State
-from lavt.experiment import checkup
-from lavt.experiment.checkup import Check, CodecTimes, Heard, Seen, Verdict
-from lavt.experiment.clock_check import Finding, Opinion
 from lavt.node import Message, Send
 from lavt.nodes.clock_sync import ClockSyncNode
-from lavt.transport import chrony
-from lavt.transport.clock_offset import ClockReport, unknown_clock
+from lavt.transport.clock_sync import chrony
+from lavt.transport.clock_sync.clock_report import ClockReport, unknown_clock
 from lavt.transport.messages import encode
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES, UdpLink
 from lavt.transport.zenoh_link import Router, Routers, ZenohLink, quiet_logs
@@ -45,7 +45,7 @@ def times(encode_ms: float, decode_ms: float = 1.0) -> CodecTimes:
 
 
 def check_codec(measured: CodecTimes, side: str = "", cores: int = 2) -> Check:
-    return checkup.check_codec(measured, size="640x480", rate_hz=50.0, side=side, cores=cores)
+    return checks.check_codec(measured, size="640x480", rate_hz=50.0, side=side, cores=cores)
 
 
 def known(bound_s: float) -> ClockReport:
@@ -53,15 +53,15 @@ def known(bound_s: float) -> ClockReport:
 
 
 def check_port(refusal: str, served: bool) -> Check:
-    return checkup.check_port("video port", "video.port", "0.0.0.0", 5600, refusal=refusal, served=served)
+    return checks.check_port("video port", "video.port", "0.0.0.0", 5600, refusal=refusal, served=served)
 
 
 def check_key_file(refusal: str = "", mode: int = 0o600, private: bool = True) -> Check:
-    return checkup.check_key_file("security.key", Path("a.key"), refusal=refusal, mode=mode, private=private)
+    return checks.check_key_file("security.key", Path("a.key"), refusal=refusal, mode=mode, private=private)
 
 
 def check_camera(seen: Seen | str) -> Check:
-    return checkup.check_camera(seen, name="/dev/video0", size="640x480", rate_hz=30.0)
+    return checks.check_camera(seen, name="/dev/video0", size="640x480", rate_hz=30.0)
 
 
 def came(rate_hz: float, timed: int = 0) -> Seen:
@@ -71,15 +71,15 @@ def came(rate_hz: float, timed: int = 0) -> Seen:
 FOUND = Finding(True, ("this clock", "these two agree"), None, Opinion(1.0, 0.5), 1.0)
 
 VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
-    (lambda: checkup.check_versions("3.11", INSTALLED, REQUIREMENTS), "ok", "Python 3.11, lavt 0.1.0, av 14.0.1"),
-    (lambda: checkup.check_versions("3.11", INSTALLED | {"av": "9.2"}, REQUIREMENTS), "problem", "at least 14 is need"),
-    (lambda: checkup.check_versions("3.11", INSTALLED | {"numpy": None}, REQUIREMENTS), "problem", "numpy is missing"),
+    (lambda: checks.check_versions("3.11", INSTALLED, REQUIREMENTS), "ok", "Python 3.11, lavt 0.1.0, av 14.0.1"),
+    (lambda: checks.check_versions("3.11", INSTALLED | {"av": "9.2"}, REQUIREMENTS), "problem", "at least 14 is need"),
+    (lambda: checks.check_versions("3.11", INSTALLED | {"numpy": None}, REQUIREMENTS), "problem", "numpy is missing"),
     (
-        lambda: checkup.check_versions("3.11", INSTALLED | {"cryptography": "41"}, REQUIREMENTS),
+        lambda: checks.check_versions("3.11", INSTALLED | {"cryptography": "41"}, REQUIREMENTS),
         "problem",
         "at least 42",
     ),
-    (lambda: checkup.check_versions("3.11", INSTALLED, []), "ok", "Python 3.11"),
+    (lambda: checks.check_versions("3.11", INSTALLED, []), "ok", "Python 3.11"),
     (lambda: check_codec(times(2.0)), "ok", "10% of a frame"),
     (lambda: check_codec(times(11.0)), "warning", "55% of a frame"),
     (lambda: check_codec(times(21.0)), "problem", "105% of a frame"),
@@ -93,69 +93,69 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: check_camera(Seen([], 0)), "warning", "0.0 pictures a second"),
     (lambda: check_camera(Seen([5], 0)), "warning", "0.0 pictures a second"),
     (lambda: check_camera("/dev/video0 cannot be opened"), "problem", "/dev/video0"),
-    (lambda: checkup.check_by_wire(300, "", name="socketcan can0"), "ok", "300 frames"),
+    (lambda: checks.check_by_wire(300, "", name="socketcan can0"), "ok", "300 frames"),
     (
-        lambda: checkup.check_by_wire(0, "no BrakeReport for 200 ms", name="can0"),
+        lambda: checks.check_by_wire(0, "no BrakeReport for 200 ms", name="can0"),
         "problem",
         "no BrakeReport for 200 ms",
     ),
-    (lambda: checkup.check_buffer(RECEIVE_BUFFER_BYTES), "ok", "4194304 are asked for"),
-    (lambda: checkup.check_buffer(212_992), "warning", "may keep 212992 bytes"),
-    (lambda: checkup.check_arrival(True), "ok", "stamps datagrams"),
-    (lambda: checkup.check_arrival(False), "warning", "does not stamp"),
-    (lambda: checkup.check_timer(400, [NS_PER_MS // 10] * 20), "ok", "0.10 ms late (95 %: 0.10 ms)"),
-    (lambda: checkup.check_timer(400, [0] * 18 + [5 * NS_PER_MS] * 2), "warning", "95 %: 5.00 ms"),
-    (lambda: checkup.check_timer(400, [21 * NS_PER_MS] * 20), "problem", "21.00 ms late"),
-    (lambda: checkup.check_precedence(-10), "ok", "nice -10"),
-    (lambda: checkup.check_precedence(0), "warning", "wait like ordinary ones"),
-    (lambda: checkup.check_governor(["performance"] * 2), "ok", "performance"),
-    (lambda: checkup.check_governor(["performance", "powersave"]), "warning", "performance, powersave"),
-    (lambda: checkup.check_governor([]), "not checked", "does not tell"),
-    (lambda: checkup.check_clock(known(0.0001)), "ok", "follows 192.0.2.1"),
-    (lambda: checkup.check_clock(known(0.01)), "warning", "too wide"),
-    (lambda: checkup.check_clock(unknown_clock(NOW, "here", "chrony", chrony.ABSENT)), "warning", "not installed"),
-    (lambda: checkup.check_clock(unknown_clock(NOW, "here", "probe", "left to the probe")), "ok", "left to the probe"),
-    (lambda: checkup.check_clock(None), "warning", "did not answer in time"),
-    (lambda: checkup.check_netem("", "eth0"), "ok", "can delay packets"),
-    (lambda: checkup.check_netem("no netem", ""), "ok", "not needed"),
-    (lambda: checkup.check_netem("no netem", "eth0"), "problem", "no netem"),
+    (lambda: checks.check_buffer(RECEIVE_BUFFER_BYTES), "ok", "4194304 are asked for"),
+    (lambda: checks.check_buffer(212_992), "warning", "may keep 212992 bytes"),
+    (lambda: checks.check_arrival(True), "ok", "stamps datagrams"),
+    (lambda: checks.check_arrival(False), "warning", "does not stamp"),
+    (lambda: checks.check_timer(400, [NS_PER_MS // 10] * 20), "ok", "0.10 ms late (95 %: 0.10 ms)"),
+    (lambda: checks.check_timer(400, [0] * 18 + [5 * NS_PER_MS] * 2), "warning", "95 %: 5.00 ms"),
+    (lambda: checks.check_timer(400, [21 * NS_PER_MS] * 20), "problem", "21.00 ms late"),
+    (lambda: checks.check_precedence(-10), "ok", "nice -10"),
+    (lambda: checks.check_precedence(0), "warning", "wait like ordinary ones"),
+    (lambda: checks.check_governor(["performance"] * 2), "ok", "performance"),
+    (lambda: checks.check_governor(["performance", "powersave"]), "warning", "performance, powersave"),
+    (lambda: checks.check_governor([]), "not checked", "does not tell"),
+    (lambda: checks.check_clock(known(0.0001)), "ok", "follows 192.0.2.1"),
+    (lambda: checks.check_clock(known(0.01)), "warning", "too wide"),
+    (lambda: checks.check_clock(unknown_clock(NOW, "here", "chrony", chrony.ABSENT)), "warning", "not installed"),
+    (lambda: checks.check_clock(unknown_clock(NOW, "here", "probe", "left to the probe")), "ok", "left to the probe"),
+    (lambda: checks.check_clock(None), "warning", "did not answer in time"),
+    (lambda: checks.check_netem("", "eth0"), "ok", "can delay packets"),
+    (lambda: checks.check_netem("no netem", ""), "ok", "not needed"),
+    (lambda: checks.check_netem("no netem", "eth0"), "problem", "no netem"),
     (lambda: check_port("", False), "ok", "UDP 0.0.0.0:5600 can be opened"),
     (lambda: check_port("Address already in use", True), "ok", "`lavt server`"),
     (lambda: check_port("Address already in use", False), "problem", "Address already in use"),
-    (lambda: checkup.check_router("tcp/127.0.0.1:7447", ""), "ok", "tcp/127.0.0.1:7447"),
-    (lambda: checkup.check_router("tcp/127.0.0.1:7447", "no router answers"), "problem", "no router answers"),
-    (lambda: checkup.check_link(Routers(1, ("v1", "v1")), heard=False), "ok", "1 other router"),
-    (lambda: checkup.check_link(Routers(0, ("v1",)), heard=True), "ok", "linked to 0 other routers"),
-    (lambda: checkup.check_link(Routers(0, ("v1",)), heard=False), "warning", "no link to another one"),
-    (lambda: checkup.check_link(Routers(1, ("v1", "v2")), heard=True), "warning", "Zenoh v1, v2"),
-    (lambda: checkup.check_link(None, heard=True), "not checked", "does not tell"),
+    (lambda: checks.check_router("tcp/127.0.0.1:7447", ""), "ok", "tcp/127.0.0.1:7447"),
+    (lambda: checks.check_router("tcp/127.0.0.1:7447", "no router answers"), "problem", "no router answers"),
+    (lambda: checks.check_link(Routers(1, ("v1", "v1")), heard=False), "ok", "1 other router"),
+    (lambda: checks.check_link(Routers(0, ("v1",)), heard=True), "ok", "linked to 0 other routers"),
+    (lambda: checks.check_link(Routers(0, ("v1",)), heard=False), "warning", "no link to another one"),
+    (lambda: checks.check_link(Routers(1, ("v1", "v2")), heard=True), "warning", "Zenoh v1, v2"),
+    (lambda: checks.check_link(None, heard=True), "not checked", "does not tell"),
     (
-        lambda: checkup.check_vehicle(Heard([STATE] * 50), "v-1", "1"),
+        lambda: checks.check_vehicle(Heard([STATE] * 50), "v-1", "1"),
         "ok",
         "held by op",
     ),
-    (lambda: checkup.check_vehicle(Heard([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
-    (lambda: checkup.check_vehicle(Heard([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
-    (lambda: checkup.check_vehicle(Heard(), "v-1", "1"), "problem", "v-1 tells no state"),
+    (lambda: checks.check_vehicle(Heard([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
+    (lambda: checks.check_vehicle(Heard([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
+    (lambda: checks.check_vehicle(Heard(), "v-1", "1"), "problem", "v-1 tells no state"),
     (
-        lambda: checkup.check_vehicle(Heard([], {"of another version": 50}), "v-1", "1"),
+        lambda: checks.check_vehicle(Heard([], {"of another version": 50}), "v-1", "1"),
         "problem",
         "another version (50)",
     ),
-    (lambda: checkup.check_probe(FOUND, "car", 5602), "ok", "these two agree"),
-    (lambda: checkup.check_probe(replace(FOUND, good=False), "car", 5602), "warning", "these two agree"),
-    (lambda: checkup.check_probe(None, "car", 5602), "problem", "nobody answers at UDP car:5602"),
-    (lambda: checkup.check_video("car", 0), "not checked", "video.port (5600 as shipped)"),
-    (lambda: checkup.check_video("car", 5601), "not checked", "UDP car:5601"),
-    (lambda: checkup.check_plain(True), "ok", "messages are signed"),
-    (lambda: checkup.check_plain(False), "warning", "router"),
+    (lambda: checks.check_probe(FOUND, "car", 5602), "ok", "these two agree"),
+    (lambda: checks.check_probe(replace(FOUND, good=False), "car", 5602), "warning", "these two agree"),
+    (lambda: checks.check_probe(None, "car", 5602), "problem", "nobody answers at UDP car:5602"),
+    (lambda: checks.check_video("car", 0), "not checked", "video.port (5600 as shipped)"),
+    (lambda: checks.check_video("car", 5601), "not checked", "UDP car:5601"),
+    (lambda: checks.check_plain(True), "ok", "messages are signed"),
+    (lambda: checks.check_plain(False), "warning", "router"),
     (lambda: check_key_file(), "ok", "a.key is there"),
     (lambda: check_key_file(mode=0o640), "problem", "mode 640"),
     (lambda: check_key_file(mode=0o644, private=False), "ok", "a.key is there"),
     (lambda: check_key_file("No such file or directory"), "problem", "cannot be read: No such file"),
-    (lambda: checkup.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
-    (lambda: checkup.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
-    (lambda: checkup.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
+    (lambda: checks.check_certificate(Path("a.pem"), 100.0), "ok", "valid for 100 days"),
+    (lambda: checks.check_certificate(Path("a.pem"), 13.0), "warning", "valid for 13 days"),
+    (lambda: checks.check_certificate(Path("a.pem"), -1.0), "problem", "expired 1 days ago"),
 ]
 """What is measured, the verdict on it, and a part of the words."""
 
@@ -174,8 +174,8 @@ def test_every_check_has_verdicts() -> None:
     for check, verdict, _ in VERDICTS:
         for name in check.__code__.co_names:
             verdicts.setdefault(name, set()).add(verdict)
-    checks = {name for name in vars(checkup) if name.startswith("check_")} - {"check_host", "check_video"}
-    assert {name for name in checks if len(verdicts[name]) < 2} == set()
+    names = {name for name in vars(checks) if name.startswith("check_")} - {"check_host", "check_video"}
+    assert {name for name in names if len(verdicts[name]) < 2} == set()
 
 
 MACHINE = [
@@ -228,7 +228,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The machine itself is not looked at, and a peer is waited for a second only."""
     monkeypatch.setattr(doctor, "_machine", lambda *_: iter(()))
     monkeypatch.setattr(doctor, "PROBING_NS", 100 * NS_PER_MS)
-    monkeypatch.setattr(examine, "FIRST_STATE_NS", 1000 * NS_PER_MS)
+    monkeypatch.setattr(probes, "FIRST_STATE_NS", 1000 * NS_PER_MS)
 
 
 def looked_at(path: Path, *changes: str) -> dict[str, Check]:
@@ -351,7 +351,7 @@ def test_a_pair(run: Run, router: str, probe_port: int) -> None:
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Signing keys of a vehicle and two operators."""
-    certificates = pytest.importorskip("lavt.transport.certificates")
+    certificates = pytest.importorskip("lavt.transport.security.certificates")
     folder = tmp_path_factory.mktemp("keys")
     for name in ("vehicle-3", "operator-1", "operator-2"):
         pair = certificates.new_signing_pair()
@@ -372,8 +372,8 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("quick")
 def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, said: tuple[str, str]) -> None:
     """Signed states are opened with the configured keys, without a session; where these do not fit, it is said why."""
-    from lavt.build.security import vehicle_seal
-    from lavt.transport.door import ServerDoor
+    from lavt.assembly.security import vehicle_seal
+    from lavt.transport.security.gateway import ServerDoor
 
     security = {"key": str(keys / "vehicle-3.key"), "operators": {"operator-1": str(keys / "operator-1.pub")}}
     seal = vehicle_seal(parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test"))
@@ -393,7 +393,7 @@ def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, 
 @pytest.mark.usefixtures("quick")
 def test_keys_that_are_none(tmp_path: Path) -> None:
     """A file that holds no key is a problem, and the router is not asked with it."""
-    pytest.importorskip("lavt.transport.certificates")
+    pytest.importorskip("lavt.transport.security.certificates")
     for name in ("key", "pub"):
         (tmp_path / name).write_text("no key")
         (tmp_path / name).chmod(0o600)
@@ -455,12 +455,12 @@ def test_key_files(tmp_path: Path) -> None:
     private.write_text("key")
     private.chmod(0o644)
     section = Security(key=str(private), operators={"operator-1": str(public)})
-    files = examine.key_files(section)
+    files = probes.key_files(section)
     assert files == [("security.key", private, True), ("security.operators.operator-1", public, False)]
-    assert examine.file_state(private) == ("", 0o644)
-    assert examine.file_state(public) == ("No such file or directory", 0)
+    assert probes.file_state(private) == ("", 0o644)
+    assert probes.file_state(public) == ("No such file or directory", 0)
     assert stat.S_IMODE(private.stat().st_mode) == 0o644
-    assert examine.key_files(Security()) == []
+    assert probes.key_files(Security()) == []
 
 
 def test_certificates(tmp_path: Path) -> None:
@@ -483,8 +483,8 @@ def test_certificates(tmp_path: Path) -> None:
     (tmp_path / "vehicle-1.pem").write_bytes(certificate.public_bytes(Encoding.PEM))
     (tmp_path / "other.pem").write_text("no certificate")
     now_ns = round(begins.timestamp()) * 10**9
-    assert examine.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
-    assert examine.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
+    assert probes.certificates(tmp_path, now_ns) == [(tmp_path / "vehicle-1.pem", 30.0)]
+    assert probes.certificates(tmp_path, now_ns + 31 * 86_400 * 10**9) == [(tmp_path / "vehicle-1.pem", -1.0)]
 
 
 @pytest.mark.realtime

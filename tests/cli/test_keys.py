@@ -186,7 +186,7 @@ def test_others_may_not_look(run: Run) -> None:
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without cryptography a sentence says what to install."""
-    monkeypatch.delitem(sys.modules, "lavt.transport.certificates", raising=False)
+    monkeypatch.delitem(sys.modules, "lavt.transport.security.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     import lavt.transport
 

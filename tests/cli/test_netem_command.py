@@ -9,8 +9,8 @@ import pytest
 from lavt.cli import console
 from lavt.cli import netem as command
 from lavt.errors import LavtError, WorkError
-from lavt.transport.netem_control import Netem, Verified
-from lavt.transport.netem_tc import Command
+from lavt.transport.netem.netem import Netem, Verified
+from lavt.transport.netem.tc import Command
 
 
 class Kernel(Netem):

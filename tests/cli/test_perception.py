@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from lavt.build.cameras import camera_of_file
-from lavt.build.entropy import MachineEntropy
-from lavt.build.sides import build_client
+from lavt.assembly.cameras import camera_of_file
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.nodes import build_client
 from lavt.cli.main import app
 from lavt.cli.pictures import write_video
 from lavt.clock import MachineClock

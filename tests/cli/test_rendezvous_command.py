@@ -12,8 +12,8 @@ from contextlib import contextmanager
 import pytest
 
 from lavt.config_file import shipped
-from lavt.transport.clock_probe import encode_request
-from lavt.transport.rendezvous import wrap, write_registration
+from lavt.transport.clock_sync.probe import encode_request
+from lavt.transport.rendezvous.forwarder import wrap, write_registration
 
 HERE = "127.0.0.1"
 ENDS_S = 30.0

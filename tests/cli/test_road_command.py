@@ -8,9 +8,9 @@ from tests.support.command_line import Run
 from lavt.config import RunConfig, VehicleConfig
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.experiment.plan import plan_run
-from lavt.vehicle.sim.drawing import VIEWS, draw_road
-from lavt.vehicle.sim.road import load_road
+from lavt.experiment.runs.plan import plan_run
+from lavt.vehicle.sim.rendering.drawing import VIEWS, draw_road
+from lavt.vehicle.sim.road.road import load_road
 
 BEND = """
 title: Test bend

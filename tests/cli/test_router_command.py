@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lavt.config_file import shipped
-from lavt.experiment.processes import Processes
+from lavt.experiment.runs.processes import Processes
 
 TGKILL = 234
 """Linux's system call that sends a signal to one thread (x86-64)."""

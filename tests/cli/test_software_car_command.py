@@ -23,10 +23,10 @@ from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import Frame, HeardFrame
 from lavt.vehicle.dbw.bus import CanPort
+from lavt.vehicle.ground_truth_wire import MAX_BYTES, TruthReceiver
 from lavt.vehicle.software_car.frames import unpack
 from lavt.vehicle.software_car.generation_1 import STEERING_REPORT
 from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS
-from lavt.vehicle.truth import MAX_BYTES, TruthReceiver
 
 SERVER = str(shipped("configs/server.yaml"))
 GROUP = "239.74.163.2"

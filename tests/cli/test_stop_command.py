@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from lavt.cli import stop
-from lavt.cli.words import NO_STATE_YET
+from lavt.cli.session_log import NO_STATE_YET
 from lavt.domain import SessionReply, SessionRequest
 from lavt.errors import WorkError
 from lavt.node import Send

@@ -18,10 +18,10 @@ from tests.support.ports import free_port
 
 from lavt.cli import watch
 from lavt.clock import MachineClock
-from lavt.transport.h264 import Encoder
-from lavt.transport.rtp import Packetizer
-from lavt.transport.stamp import rtp_timestamp, write_stamp
-from lavt.transport.stamp_check import LEARNED_AFTER
+from lavt.transport.rtp.rtp import Packetizer
+from lavt.transport.video.h264 import Encoder
+from lavt.transport.video.stamp import rtp_timestamp, write_stamp
+from lavt.transport.video.stamp_check import LEARNED_AFTER
 
 pytestmark = [pytest.mark.realtime, pytest.mark.judges_times]
 

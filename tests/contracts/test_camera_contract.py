@@ -14,8 +14,8 @@ from tests.vehicle.moving_video import write_video
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, CameraModel, Pose
 from lavt.vehicle.camera import Camera, CapturedFrame
-from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.rendering.camera import SimCamera
+from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.video_device import VideoDevice
 
 ROAD = load_road("a_key")

@@ -14,7 +14,7 @@ SOURCE = Path(lavt.__file__).parent.parent
 SHARED = {
     "lavt.vehicle.can_frame",  # frames, and what they come and go by
     "lavt.vehicle.vehicle", "lavt.domain", "lavt.errors", "lavt.value", "lavt.clock",  # the words of the design
-    "lavt.vehicle.truth",  # which does not go over the bus
+    "lavt.vehicle.ground_truth_wire",  # which does not go over the bus
 }  # fmt: skip
 """All that both sides may use: nothing of it knows what the bits of a frame mean."""
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, StandingVehicle
 
-from lavt.build.by_wire import inside
+from lavt.assembly.by_wire import inside
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Now
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.vehicle import Vehicle
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from lavt.control.drive_controller import PRESETS, make_controller
+from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.control.lane_watch import LaneState, LaneWatch
-from lavt.control.limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, CameraModel, Picture
 from lavt.perception.lane_detector import LaneDetector
-from lavt.vehicle.sim.renderer import Renderer
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.rendering.renderer import Renderer
+from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.sim.simulator import Simulator
 
 FRAME_NS = NS_PER_S // 30

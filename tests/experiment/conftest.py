@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, Now
-from lavt.experiment.record import RecordWriter
-from lavt.nodes.reports import VideoUnit
-from lavt.transport.clock_probe import ClockProbe
+from lavt.nodes.payloads import VideoUnit
+from lavt.recording.record import RecordWriter
+from lavt.transport.clock_sync.probe import ClockProbe
 
 WALL_NS = 1_700_000_000_000_000_000
 SERVER_MONO_NS = 1_000 * NS_PER_S

@@ -16,8 +16,8 @@ from tests.field.secured import BASE, QUIC, dialled, direct, open_session, start
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.processes import Process, Processes
-from lavt.experiment.record import Record, read_record
+from lavt.experiment.runs.processes import Process, Processes
+from lavt.recording.record import Record, read_record
 from lavt.streams import stream
 from lavt.transport.zenoh_link import CONTROL
 

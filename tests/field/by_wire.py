@@ -23,10 +23,10 @@ from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.plan import plan_run
-from lavt.experiment.processes import LAVT, Processes
-from lavt.experiment.real_run import Loop, start_loop
-from lavt.experiment.sides import server_config
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.processes import LAVT, Processes
+from lavt.experiment.runs.real_run import Loop, start_loop
+from lavt.experiment.runs.side_configs import server_config
 
 GROUP = "239.74.163.2"
 """Of UDP multicast, which is a CAN bus between processes where the kernel has none."""

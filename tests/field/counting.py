@@ -18,8 +18,8 @@ import numpy as np
 from tests.field.driving import Drive, Outage
 
 from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
-from lavt.experiment.record import Record
-from lavt.experiment.table import IntArray
+from lavt.recording.record import Record
+from lavt.recording.table import IntArray
 
 LONG_AGO_NS = 500 * NS_PER_MS
 STANDSTILL_MPS = 0.05

@@ -14,8 +14,8 @@ from tests.field.namespaces import INTERNET, VEHICLE, Field, Way
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.experiment.processes import LAVT, Process, Processes
-from lavt.experiment.record import Record, read_record
+from lavt.experiment.runs.processes import LAVT, Process, Processes
+from lavt.recording.record import Record, read_record
 
 SERVER = ("configs/server.yaml", "vehicle.route=straight", "vehicle.scenery=none", "vehicle.time_limit_s=3600")
 CLIENT = ("configs/client.yaml", f"video.server={VEHICLE}", "controller.rearm=true")

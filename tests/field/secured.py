@@ -18,7 +18,7 @@ import zenoh
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.processes import Process, Processes
+from lavt.experiment.runs.processes import Process, Processes
 from lavt.transport.zenoh_link import CONTROL, STATE
 
 BASE = "lavt/vehicle-1"

@@ -33,11 +33,11 @@ from tests.field.secured import (
 from tests.require import need
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Shared, Stalls
 
-from lavt.control.limits import CLIENT_LIMITS
+from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.processes import Processes
-from lavt.experiment.record import Record
-from lavt.experiment.table import MISSING, IntArray, Table
+from lavt.experiment.runs.processes import Processes
+from lavt.recording.record import Record
+from lavt.recording.table import MISSING, IntArray, Table
 from lavt.streams import stream
 from lavt.transport.zenoh_link import quiet_logs
 

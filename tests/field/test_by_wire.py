@@ -17,8 +17,8 @@ from tests.support.stalls import Stalls
 from lavt.clock import pause
 from lavt.config import RunConfig
 from lavt.domain import NS_PER_S
-from lavt.experiment.processes import LAVT
-from lavt.runtime import precedence
+from lavt.experiment.runs.processes import LAVT
+from lavt.runtime import process_priority
 
 pytest.importorskip("can")
 pytestmark = [pytest.mark.timeout(600)]
@@ -62,7 +62,7 @@ def test_a_route_is_driven_over_can(tell: Tell, drive: Drive) -> None:
         if driven.loop.server.latest["ending"] != "completed":
             raise driven.stopped_wrongly()
         if os.geteuid() == 0:  # others may not have it
-            assert os.getpriority(os.PRIO_PROCESS, driven.actuator_pid) == precedence.OF_THE_CAR
+            assert os.getpriority(os.PRIO_PROCESS, driven.actuator_pid) == process_priority.OF_THE_CAR
         ended_ns = CLOCK.now().mono_ns
         tell(f"parked {driven.car.parked(ended_ns - NS_PER_S):.0f} ms after the end of the drive was seen")
 

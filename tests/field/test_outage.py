@@ -21,8 +21,8 @@ from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_S
-from lavt.experiment.processes import LAVT
-from lavt.experiment.record import read_record
+from lavt.experiment.runs.processes import LAVT
+from lavt.recording.record import read_record
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("namespaces")]
 """The drive, of which a fixture waits for the end, takes two minutes on a quiet machine."""

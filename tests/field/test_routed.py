@@ -23,9 +23,9 @@ from tests.support.stalls import Stalls
 
 from lavt.clock import pause
 from lavt.domain import NS_PER_S, Now
-from lavt.experiment.record import Record
-from lavt.experiment.table import Table
-from lavt.transport.video_path import HELLO_AGAIN_NS
+from lavt.recording.record import Record
+from lavt.recording.table import Table
+from lavt.transport.video.path_validation import HELLO_AGAIN_NS
 
 pytestmark = [pytest.mark.usefixtures("namespaces")]
 

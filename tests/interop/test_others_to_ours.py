@@ -20,12 +20,12 @@ from tests.interop.tools import LIMIT_S, running
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, Picture
 from lavt.streams import stream
-from lavt.transport.h264 import Decoder
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtp import AccessUnit, Depacketizer, RtpPacket, parse_packet, split_nal_units
-from lavt.transport.stamp import read_stamp, rtp_timestamp, write_stamp
-from lavt.transport.stamp_check import LEARNED_AFTER
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, RtpPacket, parse_packet, split_nal_units
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
+from lavt.transport.video.h264 import Decoder
+from lavt.transport.video.stamp import read_stamp, rtp_timestamp, write_stamp
+from lavt.transport.video.stamp_check import LEARNED_AFTER
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 640, 480, 30
 COUNT = 60

@@ -14,16 +14,16 @@ import pytest
 from tests.interop.tools import read_frames, running
 from tests.support.ports import free_pair
 
-from lavt.build.entropy import MachineEntropy
-from lavt.build.sides import build_server
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.nodes import build_server
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import Now
 from lavt.node import Send
 from lavt.runtime.realtime import RealRuntime
-from lavt.transport.stamp import read_stamp
 from lavt.transport.udp_link import UdpLink
+from lavt.transport.video.stamp import read_stamp
 
 SERVER = shipped("configs/server.yaml")
 WIDTH_PX, HEIGHT_PX = 320, 240

@@ -11,8 +11,8 @@ from tests.interop.tools import DEBIANS_PYTHON
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
-from lavt.transport.ntp_time import short_time
-from lavt.transport.rtcp import (
+from lavt.transport.rtp.ntp_time import short_time
+from lavt.transport.rtp.rtcp import (
     ReceptionReport,
     parse_announcement,
     parse_feedback,
@@ -20,7 +20,7 @@ from lavt.transport.rtcp import (
     receiver_report,
     sender_report,
 )
-from lavt.transport.rtp import RtpPacket
+from lavt.transport.rtp.rtp import RtpPacket
 
 CLOCK = MachineClock()
 OURS, THEIRS, RECEIVER = 77, 99, 88

@@ -18,7 +18,7 @@ from tests.support.stalls import Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.chrony import NOT_RUNNING, Chronyc, read_chrony
+from lavt.transport.clock_sync.chrony import NOT_RUNNING, Chronyc, read_chrony
 
 TrueOffset = Callable[[], int]
 NTP_PORT = 11123

@@ -19,7 +19,7 @@ from tests.kernel.lane.verdicts import MEDIAN_SHARE
 from tests.kernel.namespaces import DEVICES, Flight, Flown, command, fly, inside, make_pair, take_pair_away
 from tests.support.stalls import Stalls
 
-from lavt.build.injection import Role, netem_flows
+from lavt.assembly.injection import Role, netem_flows
 from lavt.cli import console
 from lavt.cli.main import app
 from lavt.clock import MachineClock, pause
@@ -27,10 +27,10 @@ from lavt.config import RunConfig
 from lavt.config_file import condition, load_config, shipped
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
-from lavt.experiment.netem_run import NetemRun, netem_reasons
-from lavt.experiment.plan import PlannedRun, plan_run
-from lavt.transport.netem import Flow, Law, Port
-from lavt.transport.netem_control import Netem
+from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
+from lavt.experiment.runs.plan import PlannedRun, plan_run
+from lavt.transport.emulation.impairment import Flow, Law, Port
+from lavt.transport.netem.netem import Netem
 
 CLOCK = MachineClock()
 VIDEO, CONTROL, PROBE = 5600, 7448, 5602

@@ -12,7 +12,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_S, Actuation, CameraModel, GroundTruth, Now, Picture, Pose, VehicleEvent, VehicleState
 from lavt.node import Message, Node, Send
-from lavt.runtime.chain import walk
+from lavt.runtime.pipeline import walk
 from lavt.vehicle.camera import CapturedFrame
 from lavt.vehicle.vehicle import Capabilities, Reached
 

@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
 
-from lavt.control.limiter import Limiter
-from lavt.control.limits import LIMITS
-from lavt.control.safety import SafetyGate
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
 from lavt.nodes.actuator import POSE_AHEAD_NS, ActuatorNode
-from lavt.nodes.reports import Admission, AtWheel, FrameWritten, Route
+from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route
+from lavt.safety.gate import SafetyGate
+from lavt.safety.limiter import Limiter
+from lavt.safety.limits import LIMITS
 from lavt.transport.messages import decode, encode
 from lavt.vehicle.camera import FrameTimes
 from lavt.vehicle.vehicle import Reached

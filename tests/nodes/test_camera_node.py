@@ -11,14 +11,12 @@ from tests.vehicle.moving_video import MODEL as MOVING
 from tests.vehicle.moving_video import number_of, write_video
 
 from lavt.clock import MachineClock
-from lavt.control.written import WrittenStamps
 from lavt.domain import NS_PER_MS, NS_PER_S, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
-from lavt.transport.fec import RepairSender
-from lavt.transport.h264 import Decoder, Encoder
-from lavt.transport.pictures import VideoReceiver, VideoSender
-from lavt.transport.rtcp import (
+from lavt.safety.issued_stamps import WrittenStamps
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.rtcp import (
     ReceptionReport,
     is_rtcp,
     max_bit_rate,
@@ -26,10 +24,12 @@ from lavt.transport.rtcp import (
     picture_loss,
     receiver_report,
 )
-from lavt.transport.rtp import Packetizer, parse_packet
-from lavt.transport.rtp_stream import StreamSender
-from lavt.transport.stamp import rtp_timestamp
-from lavt.transport.video_path import PathClient, PathServer
+from lavt.transport.rtp.rtp import Packetizer, parse_packet
+from lavt.transport.video.frame_codec import VideoReceiver, VideoSender
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.path_validation import PathClient, PathServer
+from lavt.transport.video.stamp import rtp_timestamp
+from lavt.transport.video.stream_sender import StreamSender
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.video_device import VideoDevice
 

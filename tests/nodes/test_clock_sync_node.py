@@ -5,8 +5,8 @@ from tests.nodes.stand_ins import MONO_NS, at, give
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.node import WAKE, Message, Send
 from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
-from lavt.transport.clock_offset import ClockReport
-from lavt.transport.clock_probe import (
+from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.clock_sync.probe import (
     ClockProbe,
     ProbeReply,
     decode_reply,

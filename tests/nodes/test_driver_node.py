@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.nodes.stand_ins import MONO_NS, SMALL, WALL_NS, at, give, noise, of
 
-from lavt.control.limits import CLIENT_LIMITS
+from lavt.channels import CHANNELS
+from lavt.control.driver_limits import CLIENT_LIMITS
 from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
@@ -27,14 +28,13 @@ from lavt.domain import (
 from lavt.node import WAKE, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
+from lavt.nodes.payloads import PathToken, PictureRead, ReceivedUnit, View
 from lavt.nodes.picture_reader import PictureReader
-from lavt.nodes.reports import PathToken, PictureRead, ReceivedUnit, View
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
-from lavt.transport.channels import CHANNELS
-from lavt.transport.h264 import Decoder, Encoder
 from lavt.transport.messages import decode, encode
-from lavt.transport.pictures import RenderedPicture, VideoReceiver
-from lavt.transport.stamp import rtp_timestamp, write_stamp
+from lavt.transport.video.frame_codec import RenderedPicture, VideoReceiver
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.stamp import rtp_timestamp, write_stamp
 
 FRAME_NS = NS_PER_S // 30
 GRANTED = SessionReply(True, "", 5, bytes(range(16)), 5600, "kernel", 0)

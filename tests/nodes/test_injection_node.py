@@ -9,10 +9,10 @@ from tests.nodes.stand_ins import at, give, of
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest
 from lavt.node import WAKE, Send
 from lavt.nodes.injection import LEASE_MS, InjectionClient, InjectionNode
-from lavt.nodes.reports import InjectionSample, Rest
-from lavt.transport.injector import Inject, Injected
+from lavt.nodes.payloads import InjectionSample, Rest
+from lavt.transport.emulation.impairment import Flow, Law
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem import Flow, Law
+from lavt.transport.netem.injector import Inject, Injected
 
 L4 = NetemRequest("alice", 7, "L4", LEASE_MS, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
 VIDEO = Flow("video", "udp", 5600, "source", Law(150.0))

@@ -6,14 +6,14 @@ from tests.nodes.stand_ins import at, give, of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.node import WAKE, Send
+from lavt.nodes.payloads import PathToken
 from lavt.nodes.receiver import ReceiverNode
-from lavt.nodes.reports import PathToken
-from lavt.transport.extended_reports import ReferenceAnswer
-from lavt.transport.fec import RepairSender
-from lavt.transport.reorder import ReorderBuffer
-from lavt.transport.rtcp import parse_feedback, sender_report
-from lavt.transport.rtp import Depacketizer, Packetizer
-from lavt.transport.video_path import HELLO_INTERVAL_NS, PathServer, is_path_datagram
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtcp import parse_feedback, sender_report
+from lavt.transport.rtp.rtcp_xr import ReferenceAnswer
+from lavt.transport.rtp.rtp import Depacketizer, Packetizer
+from lavt.transport.video.path_validation import HELLO_INTERVAL_NS, PathServer, is_path_datagram
 
 TOKEN = bytes(range(16))
 PORT = 5600

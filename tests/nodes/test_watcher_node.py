@@ -7,12 +7,12 @@ import pytest
 from tests.nodes.stand_ins import MONO_NS, WALL_NS, at, give, of
 
 from lavt.domain import NS_PER_S
+from lavt.nodes.payloads import PictureRead, ReceivedUnit
 from lavt.nodes.picture_reader import PictureReader
-from lavt.nodes.reports import PictureRead, ReceivedUnit
 from lavt.nodes.watcher import WatcherNode
-from lavt.transport.h264 import Decoder, Encoder
-from lavt.transport.pictures import VideoReceiver
-from lavt.transport.stamp import read_clear_stamp, rtp_timestamp, write_stamp
+from lavt.transport.video.frame_codec import VideoReceiver
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.stamp import read_clear_stamp, rtp_timestamp, write_stamp
 
 SIZES = [(128, 96), (320, 240)]
 

@@ -20,10 +20,10 @@ from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.metrics import measure
-from lavt.experiment.plan import PlannedRun, plan_run
-from lavt.experiment.real_run import relay_reasons
-from lavt.experiment.record import read_record
+from lavt.experiment.analysis.metrics import measure
+from lavt.experiment.runs.plan import PlannedRun, plan_run
+from lavt.experiment.runs.real_run import relay_reasons
+from lavt.recording.record import read_record
 
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS

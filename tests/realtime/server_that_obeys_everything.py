@@ -5,8 +5,8 @@ from __future__ import annotations
 from unittest.mock import patch
 
 from lavt.cli.main import main
-from lavt.control.safety import SafetyGate
-from lavt.control.written import WrittenStamps
+from lavt.safety.gate import SafetyGate
+from lavt.safety.issued_stamps import WrittenStamps
 
 
 def no_objection(*_: object) -> str:

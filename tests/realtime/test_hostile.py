@@ -14,11 +14,11 @@ from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Shared, Stalls
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Command, SessionRequest
-from lavt.experiment.plan import PlannedRun
-from lavt.experiment.processes import Process, Processes
-from lavt.experiment.real_run import start_loop
-from lavt.experiment.record import Record, read_record
-from lavt.experiment.table import MISSING
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.processes import Process, Processes
+from lavt.experiment.runs.real_run import start_loop
+from lavt.recording.record import Record, read_record
+from lavt.recording.table import MISSING
 from lavt.streams import stream
 from lavt.transport.messages import encode
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 from tests.realtime.conftest import Demo
 from tests.support.stalls import BUSY_SHARE, LONG_STALL_MS, Stalls
 
-from lavt.experiment.record import read_record
+from lavt.recording.record import read_record
 
 VIDEO_MS, CONTROL_MS = 225.0, 100.0
 """What L5 injects (netem/conditions.yaml); L0 injects nothing."""

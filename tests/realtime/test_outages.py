@@ -12,11 +12,11 @@ from tests.support.stalls import Shared, Stalls
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.experiment.plan import PlannedRun
-from lavt.experiment.processes import LAVT, Process, Processes
-from lavt.experiment.real_run import start_client_router, start_loop
-from lavt.experiment.record import Record, read_record
-from lavt.experiment.table import Table
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.processes import LAVT, Process, Processes
+from lavt.experiment.runs.real_run import start_client_router, start_loop
+from lavt.recording.record import Record, read_record
+from lavt.recording.table import Table
 
 Wait = Callable[[str, Callable[[], bool], float], None]
 Plan = Callable[..., PlannedRun]

@@ -19,11 +19,11 @@ from tests.support.stalls import LONG_STALL_MS, Shared, Stalls
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
-from lavt.experiment.plan import PlannedRun
-from lavt.experiment.processes import Process, Processes
-from lavt.experiment.real_run import start_client_router
-from lavt.experiment.record import Record, read_record
-from lavt.experiment.sides import client_config, server_config
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.processes import Process, Processes
+from lavt.experiment.runs.real_run import start_client_router
+from lavt.experiment.runs.side_configs import client_config, server_config
+from lavt.recording.record import Record, read_record
 
 Wait = Callable[[str, Callable[[], bool], float], None]
 

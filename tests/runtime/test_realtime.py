@@ -12,7 +12,7 @@ from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.runtime.realtime import RealRuntime
-from lavt.transport.clock_offset import ClockReport
+from lavt.transport.clock_sync.clock_report import ClockReport
 
 pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("own_switch_interval")]
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
+from lavt.channels import CHANNELS
 from lavt.domain import Now, SessionReply
 from lavt.node import Message, Send
-from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import UNRECORDED, WIRE, QueuedRecorder, record
-from lavt.transport.channels import CHANNELS
+from lavt.runtime.pipeline import walk
+from lavt.runtime.recorder import UNRECORDED, WIRE, QueuedRecorder, record
 from lavt.transport.messages import encode
 
 NOW = Now(1000, 5000)

@@ -12,7 +12,7 @@ from lavt.cli.progress import progress
 from lavt.config import BoundaryConfig
 from lavt.config_file import load_config
 from lavt.errors import WorkError
-from lavt.experiment.directory import prepare_directory
+from lavt.recording.output_directory import prepare_directory
 
 
 def register(app: typer.Typer) -> None:
@@ -31,8 +31,8 @@ def boundary(
 
     Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
     """
-    from lavt.experiment.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.boundary.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.boundary.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     asked = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(asked)
@@ -56,9 +56,9 @@ def boundary(
 
 def lines(found: dict[str, Any]) -> list[str]:
     """Say for each route and preset the medians with their intervals."""
-    from lavt.experiment.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
-    from lavt.experiment.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.tabular import number  # noqa: PLC0415 (with them)
+    from lavt.experiment.report.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.experiment.report.table_format import number  # noqa: PLC0415 (with them)
+    from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)
 
     table = [("route", "preset", "seeds", "theory", *CRITERIA)]
     for group in found["groups"]:

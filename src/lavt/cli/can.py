@@ -11,9 +11,9 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.dbw import load_profile, read_profile
-from lavt.build.dbw_bus import expected_traffic, find_dbw
-from lavt.build.dbw_check import disagreements, hindrances_on_a_real_bus
+from lavt.assembly.dbw import load_profile, read_profile
+from lavt.assembly.dbw_bus import expected_traffic, find_dbw
+from lavt.assembly.dbw_check import disagreements, hindrances_on_a_real_bus
 from lavt.cli import console
 from lavt.cli.can_prove import prove
 from lavt.cli.can_view import View

@@ -10,16 +10,16 @@ from typing import Annotated, Final
 
 import typer
 
-from lavt.build.dbw import load_profile
-from lavt.build.dbw_check import hindrances_on_a_real_bus
-from lavt.build.dbw_proof import proof_of
+from lavt.assembly.dbw import load_profile
+from lavt.assembly.dbw_check import hindrances_on_a_real_bus
+from lavt.assembly.dbw_proof import proof_of
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError, WorkError
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 from lavt.vehicle.can_frame import BusGone
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import OwnBrake, Profile
@@ -55,7 +55,7 @@ def prove(
     dbw = settings.vehicle.dbw
     file = out or Path(dbw.watchdog_proof or "watchdog_proof.json")
     profile, watchdog = _provable(dbw)
-    precedence.take()
+    process_priority.take()
     with closing(CanPort(dbw.interface, dbw.channel, dbw.options, clock=MachineClock())) as port:
         if not yes:
             _ask(dbw)

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.entropy import MachineEntropy
-from lavt.build.sides import build_client
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.nodes import build_client
 from lavt.cli import console
 from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig
 from lavt.config_file import load_config
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 
 
 def register(app: typer.Typer) -> None:
@@ -38,7 +38,7 @@ def client(
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    precedence.take()
+    process_priority.take()
     settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

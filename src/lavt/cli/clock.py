@@ -10,17 +10,17 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from lavt.build.clock_source import clock_source, interpreter
+from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.cli import console
 from lavt.clock import MachineClock, pause
 from lavt.config import ClockConfig
 from lavt.config_file import parse_config
+from lavt.doctor.clock_checks import check_host, compare
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadMessage, WorkError
-from lavt.experiment.clock_check import check_host, compare
 from lavt.node import Send
-from lavt.transport.clock_offset import ClockReport
-from lavt.transport.clock_probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
+from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.clock_sync.probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
 from lavt.transport.udp_link import UdpLink, look_up
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS

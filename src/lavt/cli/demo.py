@@ -14,10 +14,10 @@ from lavt.cli.live_view import LiveView
 from lavt.cli.progress import progress
 from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config, parse_config, shipped
-from lavt.experiment.directory import prepare_directory
-from lavt.experiment.plan import plan_run, plan_sweep
-from lavt.experiment.results import read_json
-from lavt.experiment.run import run_once
+from lavt.experiment.analysis.results import read_json
+from lavt.experiment.runs.plan import plan_run, plan_sweep
+from lavt.experiment.runs.run import run_once
+from lavt.recording.output_directory import prepare_directory
 
 REAL_CONDITIONS = ("L0", "L5")
 VIRTUAL_CONDITIONS = ("L0", "L1", "L2", "L3", "L4", "L5")
@@ -39,7 +39,7 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
     with console.interruptible():
         _drive_real(config, out)
         failed, speed = _drive_virtual(config, out)
-    from lavt.experiment.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     page = write_report(out, speed=speed)
     summary = read_json(out / "summary.json")
@@ -66,7 +66,7 @@ def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None
     base = load_config(RunConfig, config, ["time=virtual"])
     axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
     planned = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
-    from lavt.experiment.sweep import run_all  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.sweep import run_all  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     with progress("virtual time, L0 to L5", len(planned)) as tell:
         driven, speed = run_all(planned, out / "runs", jobs=None, tell=tell)

@@ -16,21 +16,21 @@ from typing import Annotated
 import typer
 
 import lavt
-from lavt.build.by_wire import listen
-from lavt.build.cameras import client_camera
-from lavt.cli import console, examine
+from lavt.assembly.by_wire import listen
+from lavt.assembly.cameras import client_camera
+from lavt.cli import console
 from lavt.cli.clock import probe
 from lavt.cli.router import find
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import load_config, read_yaml, split_change
+from lavt.doctor import checks, probes
+from lavt.doctor.checks import Check
+from lavt.doctor.clock_checks import compare
 from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError
-from lavt.experiment import checkup
-from lavt.experiment.checkup import Check
-from lavt.experiment.clock_check import compare
-from lavt.runtime import precedence
-from lavt.transport.clock_offset import ClockReport
+from lavt.runtime import process_priority
+from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import look_up
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
@@ -62,19 +62,19 @@ def doctor(
     Example: lavt doctor configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    precedence.take()
+    process_priority.take()
     if config is None and changes:
         raise UserError("--set changes a config: name one before it")
     settings = None if config is None else _load(config, changes or [])
     quiet_logs()
-    checks = []
+    answers = []
     for check in _checks(settings, MachineClock()):
-        checks.append(check)
+        answers.append(check)
         if not as_json:
             _show(check)
-    problems = sum(check.verdict == "problem" for check in checks)
+    problems = sum(check.verdict == "problem" for check in answers)
     if as_json:
-        console.show_json({"good": problems == 0, "checks": [asdict(check) for check in checks]})
+        console.show_json({"good": problems == 0, "checks": [asdict(check) for check in answers]})
     if problems:
         raise typer.Exit(1)
 
@@ -94,9 +94,9 @@ def _load(path: Path, changes: list[str]) -> Settings:
 def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
     config = ServerConfig() if settings is None else settings
     yield from _machine(config, "" if settings is None else _side(settings), clock)
-    report = examine.clock_report(config.clock, clock)
-    yield checkup.check_clock(report)
-    yield checkup.check_netem(examine.netem_refusal(config.injection.interface), config.injection.interface)
+    report = probes.clock_report(config.clock, clock)
+    yield checks.check_clock(report)
+    yield checks.check_netem(probes.netem_refusal(config.injection.interface), config.injection.interface)
     if settings is None:
         return
     yield from _security(settings, clock)
@@ -110,7 +110,7 @@ def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
     else:
         yield from _zenoh(settings, clock)
         yield _probe(settings, report, clock)
-        yield checkup.check_video(settings.video.server, settings.video.port)
+        yield checks.check_video(settings.video.server, settings.video.port)
 
 
 def _side(settings: Settings) -> str:
@@ -118,14 +118,14 @@ def _side(settings: Settings) -> str:
 
 
 def _machine(config: Settings, side: str, clock: MachineClock) -> Iterator[Check]:
-    found, requirements = examine.packages()
-    yield checkup.check_versions(platform.python_version(), found, requirements)
+    found, requirements = probes.packages()
+    yield checks.check_versions(platform.python_version(), found, requirements)
     yield _codec(config, side, clock)
-    yield checkup.check_buffer(examine.receive_buffer_bytes())
-    yield checkup.check_arrival(examine.arrivals_are_stamped())
-    yield checkup.check_timer(*examine.timer(clock))
-    yield checkup.check_precedence(examine.niceness())
-    yield checkup.check_governor(examine.governors())
+    yield checks.check_buffer(probes.receive_buffer_bytes())
+    yield checks.check_arrival(probes.arrivals_are_stamped())
+    yield checks.check_timer(*probes.timer(clock))
+    yield checks.check_precedence(probes.niceness())
+    yield checks.check_governor(probes.governors())
 
 
 def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
@@ -133,19 +133,19 @@ def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
     server = config if isinstance(config, ServerConfig) else _as_sent(config)
     size = f"{server.camera.width_px}x{server.camera.height_px}"
     try:
-        times = examine.codec_times(server, clock)
+        times = probes.codec_times(server, clock)
     except (LavtError, OSError, ValueError) as error:  # PyAV's own errors are both of these
         do = "see that PyAV has libx264 (`pip install --force-reinstall av`), and that the camera's size is possible"
         return Check("processor", "problem", f"pictures of {size} cannot be encoded and decoded here: {error}", do)
     cores = len(os.sched_getaffinity(0))
-    return checkup.check_codec(times, size=size, rate_hz=server.camera.rate_hz, side=side, cores=cores)
+    return checks.check_codec(times, size=size, rate_hz=server.camera.rate_hz, side=side, cores=cores)
 
 
 def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
     camera = settings.camera
     size = f"{camera.width_px}x{camera.height_px}"
-    seen = examine.camera_seen(settings, clock)
-    return checkup.check_camera(seen, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
+    seen = probes.camera_seen(settings, clock)
+    return checks.check_camera(seen, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
 
 
 def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
@@ -154,7 +154,7 @@ def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
         heard, hindrance = listen(settings.vehicle, clock, LISTEN_NS)
     except UserError as error:
         heard, hindrance = 0, str(error)
-    return checkup.check_by_wire(heard, hindrance, name=bus)
+    return checks.check_by_wire(heard, hindrance, name=bus)
 
 
 def _as_sent(config: ClientConfig) -> ServerConfig:
@@ -165,36 +165,36 @@ def _as_sent(config: ClientConfig) -> ServerConfig:
 
 
 def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
-    files = examine.key_files(settings.security)
-    yield checkup.check_plain(bool(files))
+    files = probes.key_files(settings.security)
+    yield checks.check_plain(bool(files))
     for key, path, private in files:
-        refusal, mode = examine.file_state(path)
-        yield checkup.check_key_file(key, path, refusal=refusal, mode=mode, private=private)
-    refusal = examine.keys_refusal(settings)
+        refusal, mode = probes.file_state(path)
+        yield checks.check_key_file(key, path, refusal=refusal, mode=mode, private=private)
+    refusal = probes.keys_refusal(settings)
     if refusal:
         yield Check("keys", "problem", refusal, "copy what `lavt keys` made for this machine (docs/deployment.md)")
     for folder in sorted({path.parent for _, path, _ in files}):
-        for path, days_left in examine.certificates(folder, clock.now().wall_ns):
-            yield checkup.check_certificate(path, days_left)
+        for path, days_left in probes.certificates(folder, clock.now().wall_ns):
+            yield checks.check_certificate(path, days_left)
 
 
 def _ports(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
     host, probe_port = settings.video.bind, settings.clock.probe_port
     ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
-    refusals = {key: examine.bind_refusal(host, port) for _, key, port in ports}
+    refusals = {key: probes.bind_refusal(host, port) for _, key, port in ports}
     served = False
     if any(refusals.values()) and probe_port:
         served = bool(probe(clock, "127.0.0.1" if host == EVERYWHERE else host, probe_port, PROBING_NS // 10)[0])
     for name, key, port in ports:
-        yield checkup.check_port(name, key, host, port, refusal=refusals[key], served=served)
+        yield checks.check_port(name, key, host, port, refusal=refusals[key], served=served)
 
 
 def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
-    if examine.keys_refusal(settings):
+    if probes.keys_refusal(settings):
         yield Check("router", "not checked", "the keys must be put right before")
         return
-    listener = examine.Listener(settings)
+    listener = probes.Listener(settings)
     try:
         link = ZenohLink(
             clock,
@@ -206,16 +206,16 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
             who=WHO,
         )
     except UserError as error:
-        yield checkup.check_router(endpoint, str(error))
+        yield checks.check_router(endpoint, str(error))
         return
     with closing(link):
-        yield checkup.check_router(endpoint, "")
+        yield checks.check_router(endpoint, "")
         if isinstance(settings, ServerConfig):
-            yield checkup.check_link(link.routers(), heard=False)
+            yield checks.check_link(link.routers(), heard=False)
             return
         heard = listener.hear(link, clock)
-        yield checkup.check_vehicle(heard, settings.vehicle_id, lavt.__version__)
-        yield checkup.check_link(link.routers(), heard=bool(heard.states or heard.unreadable))
+        yield checks.check_vehicle(heard, settings.vehicle_id, lavt.__version__)
+        yield checks.check_link(link.routers(), heard=bool(heard.states or heard.unreadable))
 
 
 def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClock) -> Check:
@@ -224,11 +224,11 @@ def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClo
         address = look_up("video.server", host)
     except UserError as error:
         return Check("clock probe", "problem", str(error), "put the vehicle's address into video.server")
-    probes, latest = probe(clock, address, port, PROBING_NS)
-    report = examine.clock_report(settings.clock, clock)
+    probed, latest = probe(clock, address, port, PROBING_NS)
+    report = probes.clock_report(settings.clock, clock)
     if latest is None or report is None:
-        return checkup.check_probe(None, host, port)
-    return checkup.check_probe(compare(before or report, report, probes, latest, address), host, port)
+        return checks.check_probe(None, host, port)
+    return checks.check_probe(compare(before or report, report, probed, latest, address), host, port)
 
 
 def _show(check: Check) -> None:

@@ -17,7 +17,7 @@ from lavt.errors import UserError
 from lavt.transport.messages import NAME
 
 if TYPE_CHECKING:
-    from lavt.transport.certificates import Described, Pair
+    from lavt.transport.security.certificates import Described, Pair
 
 AUTHORITY: Final = "authority"
 DEFAULT_DAYS: Final = 365
@@ -82,7 +82,7 @@ def keys(
 
 def _certificates() -> ModuleType:
     try:
-        from lavt.transport import certificates  # noqa: PLC0415 (an extra)
+        from lavt.transport.security import certificates  # noqa: PLC0415 (an extra)
     except ImportError as error:
         raise UserError(f"lavt keys needs cryptography ({error}): pip install 'lavt[secure]'") from error
     return certificates

@@ -8,16 +8,16 @@ from typing import Annotated, Any
 
 import typer
 
-from lavt.build.injection import Protocol, Role, StateDelay, netem_flows
+from lavt.assembly.injection import Protocol, Role, StateDelay, netem_flows
 from lavt.cli import console
 from lavt.config_file import condition
 from lavt.errors import UserError, WorkError
-from lavt.transport import clock_probe
-from lavt.transport.netem import Port, check_flows
-from lavt.transport.netem_control import Netem, Verified
-from lavt.transport.netem_probe import Measured
-from lavt.transport.netem_state import DIRECTORY
-from lavt.transport.netem_tc import Command, as_typed, first_commands
+from lavt.transport.clock_sync import probe
+from lavt.transport.emulation.impairment import Port, check_flows
+from lavt.transport.netem.netem import Netem, Verified
+from lavt.transport.netem.probe import Measured
+from lavt.transport.netem.state import DIRECTORY
+from lavt.transport.netem.tc import Command, as_typed, first_commands
 
 Interface = Annotated[str, typer.Option(help="The network interface, such as eth0: the one that faces the other side.")]
 ProbePort = Annotated[int, typer.Option(help="UDP port of the clock probe, which is never delayed.", min=1, max=65535)]
@@ -62,7 +62,7 @@ def apply(
         int, typer.Option(help="Port of the server's router, to which the client's dials.", min=1, max=65535)
     ] = 7448,
     protocol: Annotated[Protocol, typer.Option(help="What the routers talk by: udp (also QUIC) or tcp.")] = "udp",
-    probe_port: ProbePort = clock_probe.DEFAULT_PORT,
+    probe_port: ProbePort = probe.DEFAULT_PORT,
     state_delay: Annotated[StateDelay, typer.Option(help="with_video: delay the state like the video.")] = "none",
     hold: Annotated[bool, typer.Option("--hold", help="Stay, and put the interface back at the end (Ctrl-C).")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands for a free interface only.")] = False,
@@ -107,9 +107,7 @@ def apply(
         raise WorkError(f"stopped; {interface} is as it was")
 
 
-def verify(
-    interface: Interface, probe_port: ProbePort = clock_probe.DEFAULT_PORT, as_json: console.Json = False
-) -> None:
+def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_json: console.Json = False) -> None:
     """Verify what was applied to an interface by reading back and by measuring.
 
     Example: lavt netem verify --interface eth0

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.cameras import camera_of_file
+from lavt.assembly.cameras import camera_of_file
 from lavt.cli import console
 from lavt.cli.pictures import check_output, read_pictures, write_picture, write_video
 from lavt.domain import Picture
@@ -17,7 +17,7 @@ from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.lane_detector import GRID, LANE_WIDTH_M, LaneDetector
 from lavt.perception.panel import panel
-from lavt.transport.stamp import holds_stamp
+from lavt.transport.video.stamp import holds_stamp
 
 
 def register(app: typer.Typer) -> None:

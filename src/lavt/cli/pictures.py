@@ -12,8 +12,8 @@ import numpy as np
 
 from lavt.domain import Picture
 from lavt.errors import UserError, WorkError
-from lavt.experiment.record import read_record
-from lavt.transport.h264 import Decoder
+from lavt.recording.record import read_record
+from lavt.transport.video.h264 import Decoder
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mkv")

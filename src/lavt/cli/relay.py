@@ -7,18 +7,18 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.addresses import resolved_address
-from lavt.build.links import injected
+from lavt.assembly.addresses import resolved_address
+from lavt.assembly.links import injected
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
-from lavt.runtime import precedence
-from lavt.transport.delay import DelayLaw, Lognormal
-from lavt.transport.link import Injected
-from lavt.transport.netem import Law
-from lavt.transport.relay import NONE, Flow, Relay, is_delayed_video, video_index
+from lavt.runtime import process_priority
+from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.impairment import Law
+from lavt.transport.emulation.link import Injected
+from lavt.transport.emulation.relay import NONE, Flow, Relay, is_delayed_video, video_index
 
 
 def register(app: typer.Typer) -> None:
@@ -35,7 +35,7 @@ def relay(
 
     Example: lavt relay configs/relay.yaml --set video.constant_ms=75
     """
-    precedence.take()
+    process_priority.take()
     settings = load_config(RelayConfig, config, changes or [])
     opened = Relay(MachineClock(), flows(settings))
     with console.until_told() as told:

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.rendezvous import open_rendezvous
+from lavt.assembly.rendezvous import open_rendezvous
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import RendezvousConfig
 from lavt.config_file import load_config
-from lavt.runtime import precedence
-from lavt.transport.rendezvous import Address, FlowName
+from lavt.runtime import process_priority
+from lavt.transport.rendezvous.forwarder import Address, FlowName
 
 LOOK_S = 0.2
 
@@ -32,7 +32,7 @@ def rendezvous(
 
     Example: lavt rendezvous configs/rendezvous.yaml --set vehicle_key=keys/vehicle-1.sign.pub
     """
-    precedence.take()
+    process_priority.take()
     settings = load_config(RendezvousConfig, config, changes or [])
     opened = open_rendezvous(settings, MachineClock())
     ports = {f"{flow}_port": each.port for flow, each in opened.items()}

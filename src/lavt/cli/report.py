@@ -11,9 +11,9 @@ import typer
 
 from lavt.cli import console
 from lavt.errors import UserError, WorkError
-from lavt.experiment.directory import make_directory
-from lavt.experiment.results import IDENTITY, read_json
-from lavt.experiment.run import RESULT, compute_result
+from lavt.experiment.analysis.results import IDENTITY, read_json
+from lavt.experiment.runs.run import RESULT, compute_result
+from lavt.recording.output_directory import make_directory
 
 BOUNDARY = "boundary.json"
 
@@ -36,7 +36,7 @@ def report(
     out = out or directories[0]
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is not a directory: name another with --out")
-    from lavt.experiment.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
     driven = {directory: _runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
@@ -57,7 +57,7 @@ def report(
 
 def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
     """Tell what the runs of the first sweep's base config have in common; None where all runs are reported alike."""
-    from lavt.experiment.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     if len(directories) == 1:
         return recorded_base(directories[0])

@@ -10,7 +10,7 @@ import typer
 from lavt.cli import console
 from lavt.domain import CameraModel
 from lavt.errors import UserError
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.road.road import load_road
 
 
 def register(app: typer.Typer) -> None:
@@ -39,7 +39,7 @@ def draw(
     out = out or Path("out") / f"road_{Path(name).stem}.png"
     if out.suffix != ".png":
         raise UserError(f"--out {out}: the picture is a PNG, so let the name end with .png")
-    from lavt.vehicle.sim.drawing import draw_road  # noqa: PLC0415 (slow: matplotlib)
+    from lavt.vehicle.sim.rendering.drawing import draw_road  # noqa: PLC0415 (slow: matplotlib)
 
     out.parent.mkdir(parents=True, exist_ok=True)
     draw_road(road, model=CameraModel()).savefig(out)

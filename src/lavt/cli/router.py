@@ -9,7 +9,7 @@ import typer
 
 from lavt.cli import console
 from lavt.config_file import shipped, split_change
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 
 LOOK_S = 0.5
 """A signal that the kernel gives to one of Zenoh's threads does not end the wait of this one, which then looks."""
@@ -30,7 +30,7 @@ def router(
     Example: lavt router zenoh-configs/router-server.json5 --set 'listen.endpoints=[tcp/127.0.0.1:7447]'
     """
     console.keep_stdout_for_results()
-    precedence.take()
+    process_priority.take()
     from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (nobody else should wait for Zenoh)
 
     quiet_logs()

@@ -11,10 +11,10 @@ from lavt.cli import console
 from lavt.cli.live_view import LiveView
 from lavt.config import RunConfig
 from lavt.config_file import load_config
-from lavt.experiment.directory import check_directory
-from lavt.experiment.netem_run import check_netem
-from lavt.experiment.plan import plan_run
-from lavt.experiment.run import run_once
+from lavt.experiment.runs.netem_run import check_netem
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.run import run_once
+from lavt.recording.output_directory import check_directory
 
 
 def register(app: typer.Typer) -> None:

@@ -8,13 +8,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from lavt.build.addresses import resolved_address
-from lavt.build.fidelity import VIDEO
+from lavt.assembly.addresses import resolved_address
+from lavt.assembly.fidelity import VIDEO
 from lavt.cli import console
 from lavt.config import ServerConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
-from lavt.transport.sdp import profile_level_id, session_description
+from lavt.transport.rtp.sdp import profile_level_id, session_description
 
 
 def register(app: typer.Typer) -> None:

@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
-from lavt.build.actuator_process import start_actuator
-from lavt.build.entropy import MachineEntropy
-from lavt.build.sides import build_server
+from lavt.assembly.actuator_process import start_actuator
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.nodes import build_server
 from lavt.cli import console
 from lavt.cli.side import Side, run_side
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
 from lavt.config_file import load_config
-from lavt.runtime import precedence
-from lavt.transport.clock_offset import kernel_identity
+from lavt.runtime import process_priority
+from lavt.transport.clock_sync.clock_report import kernel_identity
 
 
 def register(app: typer.Typer) -> None:
@@ -36,7 +36,7 @@ def server(
     Example: lavt server configs/server.yaml --out out/server
     """
     console.keep_stdout_for_results()
-    precedence.take()
+    process_priority.take()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

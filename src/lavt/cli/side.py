@@ -9,32 +9,32 @@ from typing import Any, Literal
 
 import yaml
 
-from lavt.build.actuator_process import ActuatorProcess
-from lavt.build.clock_source import clock_source, interpreter
-from lavt.build.rendezvous import open_flow
-from lavt.build.security import door_of
+from lavt.assembly.actuator_process import ActuatorProcess
+from lavt.assembly.clock_source import clock_source, interpreter
+from lavt.assembly.rendezvous import open_flow
+from lavt.assembly.security import door_of
 from lavt.cli import console
 from lavt.cli.router import find
-from lavt.cli.words import Narrator, end_words, release_words
+from lavt.cli.session_log import Narrator, end_words, release_words
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
-from lavt.control.limits import LIMITS
-from lavt.control.safety import ACTIVE
 from lavt.domain import NS_PER_S, Now, State
 from lavt.errors import WorkError
-from lavt.experiment.directory import check_directory, prepare_directory
-from lavt.experiment.live import LiveTap
-from lavt.experiment.provenance import provenance
-from lavt.experiment.record import RecordWriter
 from lavt.node import Node
 from lavt.nodes.client_session import ClientSession
+from lavt.recording.live_status import LiveTap
+from lavt.recording.output_directory import check_directory, prepare_directory
+from lavt.recording.provenance import provenance
+from lavt.recording.record import RecordWriter
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.recording import QueuedRecorder
-from lavt.transport.injector import Injector
-from lavt.transport.netem import Port
-from lavt.transport.netem_control import Netem
-from lavt.transport.rendezvous import FlowName
-from lavt.transport.rendezvous_link import RendezvousLink
+from lavt.runtime.recorder import QueuedRecorder
+from lavt.safety.gate import ACTIVE
+from lavt.safety.limits import LIMITS
+from lavt.transport.emulation.impairment import Port
+from lavt.transport.netem.injector import Injector
+from lavt.transport.netem.netem import Netem
+from lavt.transport.rendezvous.forwarder import FlowName
+from lavt.transport.rendezvous.link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from lavt.build.addresses import resolved_address
-from lavt.build.dbw import load_profile
-from lavt.build.software_car import GENERATIONS, build_software_car
+from lavt.assembly.addresses import resolved_address
+from lavt.assembly.dbw import load_profile
+from lavt.assembly.software_car import GENERATIONS, build_software_car
 from lavt.cli import console
 from lavt.clock import MachineClock
 from lavt.config import ServerConfig
@@ -24,11 +24,11 @@ from lavt.config.dbw import DbwConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.sim.road import load_road
-from lavt.vehicle.software_car.news import News
+from lavt.vehicle.sim.road.road import load_road
+from lavt.vehicle.software_car.event_log import News
 from lavt.vehicle.software_car.runner import Runner
 
 LONGEST_LINE: Final = 1000
@@ -51,7 +51,7 @@ def software_car(
 
     Example: lavt software-car configs/server-by-wire.yaml --set vehicle.dbw.channel=vcan0
     """
-    precedence.take(precedence.OF_THE_CAR)
+    process_priority.take(process_priority.OF_THE_CAR)
     settings = load_config(ServerConfig, config, changes or [])
     dbw = settings.vehicle.dbw
     if dbw.interface == INSIDE:

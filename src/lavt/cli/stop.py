@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from lavt.build.entropy import MachineEntropy
-from lavt.build.security import door_of
+from lavt.assembly.entropy import MachineEntropy
+from lavt.assembly.security import door_of
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -19,8 +19,8 @@ from lavt.config_file import load_config
 from lavt.domain import Now, SessionReply, SessionRequest
 from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
-from lavt.transport.door import Carry
 from lavt.transport.messages import decode, encode
+from lavt.transport.security.gateway import Carry
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 AGAIN_S = 0.1

@@ -12,8 +12,8 @@ from lavt.cli.progress import progress
 from lavt.config import SweepConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
-from lavt.experiment.plan import plan_sweep
-from lavt.experiment.results import read_json
+from lavt.experiment.analysis.results import read_json
+from lavt.experiment.runs.plan import plan_sweep
 
 
 def register(app: typer.Typer) -> None:
@@ -37,9 +37,9 @@ def sweep(
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
-    from lavt.experiment.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
+    from lavt.experiment.sweep.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     asked = load_config(SweepConfig, config, changes or [])
     planned = plan_sweep(asked)

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
-from lavt.cli.watched import Sender, Watched
+from lavt.cli.watch_nodes import Sender, Watched
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
-from lavt.runtime import precedence
+from lavt.runtime import process_priority
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.udp_link import UdpLink, look_up
 
@@ -59,7 +59,7 @@ def watch(
 
     Example: lavt watch --port 5004 --sender foreign
     """
-    precedence.take()
+    process_priority.take()
     only_from = None if sent_from is None else look_up("--from", sent_from)
     clock, watched = MachineClock(), Watched(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, watched.nodes, watched, lambda: None)

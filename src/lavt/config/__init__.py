@@ -23,7 +23,7 @@ from lavt.config.rendezvous import ServerRendezvousConfig as ServerRendezvousCon
 from lavt.config.section import Section as Section
 from lavt.config.security import ClientSecurityConfig as ClientSecurityConfig
 from lavt.config.security import ServerSecurityConfig as ServerSecurityConfig
-from lavt.transport import clock_probe
+from lavt.transport.clock_sync import probe
 
 
 class VehicleConfig(Section):
@@ -247,7 +247,7 @@ class ClockConfig(Section):
     """With `external`: reference time less this machine's wall clock."""
     bound_ms: float | None = Field(None, ge=0, le=86_400_000)
     """With `external`: how far the correction can be from the truth."""
-    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=0, le=65535)
+    probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)
     """The server's UDP port for the probe; nothing may delay it."""
 
     @model_validator(mode="after")
@@ -263,7 +263,7 @@ class ClockConfig(Section):
 class ClientClockConfig(ClockConfig):
     """The same on the client, which must know the server's port."""
 
-    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=1, le=65535)
+    probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
 
 
 class ServerVideoConfig(VideoConfig):

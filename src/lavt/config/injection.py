@@ -7,7 +7,7 @@ from typing import Any, Final, Literal
 from pydantic import Field
 
 from lavt.config.section import Section
-from lavt.transport.link import QUEUE_PACKETS
+from lavt.transport.emulation.link import QUEUE_PACKETS
 
 EARLY_SHARE: Final = {"video": 0.0, "control": 0.5}
 """With more packets that overtake, the median need not be delayed: a repair packet brings its frame early."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from lavt.config.section import Section
-from lavt.transport import clock_probe
+from lavt.transport.clock_sync import probe
 
 
 class ServerRendezvousConfig(Section):
@@ -14,7 +14,7 @@ class ServerRendezvousConfig(Section):
     host: str = ""
     """Empty: there is none."""
     video_port: int = Field(5600, ge=1, le=65535)
-    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=1, le=65535)
+    probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
 
 
 class RendezvousConfig(Section):
@@ -26,4 +26,4 @@ class RendezvousConfig(Section):
     bind: str = "0.0.0.0"  # noqa: S104 (it is for whoever wants to reach the vehicle)
     """On a machine with several addresses the one that is dialled: a NAT lets in only what comes from there."""
     video_port: int = Field(5600, ge=0, le=65535)
-    probe_port: int = Field(clock_probe.DEFAULT_PORT, ge=0, le=65535)
+    probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)

@@ -48,10 +48,10 @@ class Preset:
 DESIGNED = Preset("designed", lookahead_s=1.01, lateral_limit_mps2=3.0)
 """The default, found without any drive under delay.
 
-The lookahead is the smallest one with 30 degrees of phase margin in the sampled-data model of `lavt.experiment.theory`,
-at 30 km/h and 81 ms from exposure to wheel command (`paper_wifi5`: 62 + 9 ms, and 10 ms of processing), rounded up:
-`benchmarks/find_designed_preset.py` prints it. 3 m/s2 is the lateral acceleration that a vehicle admits by default.
-Valid for the simulator's default car (steering lag 0.12 s, no dead time).
+The lookahead is the smallest one with 30 degrees of phase margin in the sampled-data model of
+`lavt.experiment.boundary.delay_margin`, at 30 km/h and 81 ms from exposure to wheel command (`paper_wifi5`: 62 + 9 ms,
+and 10 ms of processing), rounded up: `benchmarks/find_designed_preset.py` prints it. 3 m/s2 is the lateral acceleration
+that a vehicle admits by default. Valid for the simulator's default car (steering lag 0.12 s, no dead time).
 """
 
 PAPER_CALIBRATED = Preset("paper_calibrated", lookahead_s=0.74, steering_limit_rad=0.21)

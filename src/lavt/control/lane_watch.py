@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from lavt.control.limits import CLIENT_LIMITS
+from lavt.control.driver_limits import CLIENT_LIMITS
 
 LaneState = Literal["ok", "brake", "stop"]
 

@@ -6,11 +6,11 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-from lavt.control.safety import ACTIVE, SafetyGate, Verdict
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.reports import Admission, AtWheel, Event, FrameWritten, Rest, Route
+from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Rest, Route
+from lavt.safety.gate import ACTIVE, SafetyGate, Verdict
 from lavt.transport.messages import decode, encode
 from lavt.value import value
 from lavt.vehicle.camera import FrameTimes

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from lavt.domain import NS_PER_S, Now, Pose, Sight
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.reports import FrameWritten, VideoUnit
-from lavt.transport.pictures import PictureSender
-from lavt.transport.rtcp import is_rtcp, parse_feedback
-from lavt.transport.rtp_stream import StreamSender
-from lavt.transport.video_path import PathServer
+from lavt.nodes.payloads import FrameWritten, VideoUnit
+from lavt.transport.rtp.rtcp import is_rtcp, parse_feedback
+from lavt.transport.video.frame_codec import PictureSender
+from lavt.transport.video.path_validation import PathServer
+from lavt.transport.video.stream_sender import StreamSender
 from lavt.value import value
 from lavt.vehicle.camera import Camera, CapturedFrame, CountingCamera, FrameTimes, TimedCamera, newest_pose
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.transport.clock_offset import ClockReport
-from lavt.transport.clock_probe import (
+from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.clock_sync.probe import (
     SEQUENCES,
     ClockProbe,
     ProbeReply,

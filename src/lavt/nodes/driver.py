@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar, Literal, Protocol
 
 from lavt.control.drive_controller import DriveController
+from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
-from lavt.control.limits import ClientLimits
 from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
+from lavt.nodes.payloads import LaneSeen, PathToken, View
 from lavt.nodes.picture_reader import PictureReader
-from lavt.nodes.reports import LaneSeen, PathToken, View
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
 from lavt.value import value

@@ -14,10 +14,10 @@ from typing import Literal
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError
 from lavt.node import WAKE, Hop, Message, Peer, Send
-from lavt.nodes.reports import InjectionSample, Rest
-from lavt.transport.injector import Inject, Injected
+from lavt.nodes.payloads import InjectionSample, Rest
+from lavt.transport.emulation.impairment import Flow, Law, check_flows
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem import Flow, Law, check_flows
+from lavt.transport.netem.injector import Inject, Injected
 from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from lavt.domain import Now
 from lavt.errors import BadPacket
 from lavt.node import Hop, Message, Send
-from lavt.nodes.reports import PictureRead, ReceivedUnit, VideoUnit, View
-from lavt.transport.pictures import PictureReceiver, Received
-from lavt.transport.stamp import stamp_agrees
+from lavt.nodes.payloads import PictureRead, ReceivedUnit, VideoUnit, View
+from lavt.transport.video.frame_codec import PictureReceiver, Received
+from lavt.transport.video.stamp import stamp_agrees
 from lavt.value import value
 
 

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.reports import PathToken, ReceivedUnit
-from lavt.transport.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
-from lavt.transport.reception import Reception
-from lavt.transport.reorder import Ordered, ReorderBuffer
-from lavt.transport.rtcp import is_rtcp, max_bit_rate, parse_announcement, picture_loss, receiver_report
-from lavt.transport.rtp import Depacketizer, parse_packet
-from lavt.transport.video_cipher import NewCipher, plain_cipher
-from lavt.transport.video_path import PathClient, is_path_datagram
+from lavt.nodes.payloads import PathToken, ReceivedUnit
+from lavt.transport.rtp.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
+from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.reception_stats import Reception
+from lavt.transport.rtp.rtcp import is_rtcp, max_bit_rate, parse_announcement, picture_loss, receiver_report
+from lavt.transport.rtp.rtp import Depacketizer, parse_packet
+from lavt.transport.video.cipher import NewCipher, plain_cipher
+from lavt.transport.video.path_validation import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
 """Four reports within the 2 s after which the server closes a silent path."""

@@ -25,7 +25,7 @@ from lavt.perception.lane_fit import (
 from lavt.perception.lane_pixels import Mask, lane_pixels
 
 SMOOTHING = 0.6
-"""Weight of the newest picture in the moving average; `lavt.experiment.theory` reckons with it."""
+"""Weight of the newest picture in the moving average; `lavt.experiment.boundary.delay_margin` reckons with it."""
 GRID = GroundGrid()
 """The piece of ground that is looked at."""
 LANE_WIDTH_M = 3.5

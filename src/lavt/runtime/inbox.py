@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
 
+from lavt.channels import CHANNELS
 from lavt.node import Message
-from lavt.transport.channels import CHANNELS
 
 
 class Inbox:

@@ -11,15 +11,15 @@ from itertools import groupby
 from types import MappingProxyType
 from typing import Any, Protocol
 
+from lavt.channels import CHANNELS, Carrier
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
-from lavt.runtime.bell import Bell
-from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import Recorder
-from lavt.transport.channels import CHANNELS, Carrier
-from lavt.transport.clock_offset import ClockReport
+from lavt.runtime.pipeline import walk
+from lavt.runtime.recorder import Recorder
+from lavt.runtime.wakeup import Bell
+from lavt.transport.clock_sync.clock_report import ClockReport
 
 SWITCH_INTERVAL_S = 0.0005
 """Python's default of 5 ms lets one busy thread hold up every other for that long."""

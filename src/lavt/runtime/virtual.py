@@ -12,14 +12,14 @@ from dataclasses import dataclass, field
 from itertools import accumulate, repeat
 from typing import Any
 
+from lavt.channels import CHANNELS
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
-from lavt.runtime.chain import walk
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.recording import UNRECORDED, WIRE, Recorder, record
-from lavt.transport.channels import CHANNELS
-from lavt.transport.clock_offset import ClockReport
-from lavt.transport.delay import DelayLine
+from lavt.runtime.pipeline import walk
+from lavt.runtime.recorder import UNRECORDED, WIRE, Recorder, record
+from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.transport.emulation.delay_line import DelayLine
 
 NS_PER_PPB = 1_000_000_000
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
 
-from lavt.experiment.join import join
-from lavt.experiment.metrics import Measured, measure
-from lavt.experiment.record import Record, read_record
+from lavt.experiment.analysis.metrics import Measured, measure
+from lavt.experiment.runs.join import join
+from lavt.recording.record import Record, read_record
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 SHORT_ROAD = REPOSITORY / "tests/kernel/roads/short.yaml"

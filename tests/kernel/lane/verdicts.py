@@ -16,7 +16,7 @@ from tests.kernel.lane.driving import Drive, reasons_against
 from tests.support.stalls import HostStalled, Stalls, described, stalled_share
 
 from lavt.domain import NS_PER_MS
-from lavt.experiment.metrics import driving_interval
+from lavt.experiment.analysis.metrics import driving_interval
 
 ROOM_MS = 60
 """One period of commands to the kit, or of its reports, and two for a slow machine: a shorter stall explains less."""

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from lavt.build.dbw import load_profile
+from lavt.assembly.dbw import load_profile
 from lavt.domain import NS_PER_MS, Actuation, VehicleEvent
 from lavt.vehicle.can_frame import Frame
 from lavt.vehicle.dbw.adapter import Adapter
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit

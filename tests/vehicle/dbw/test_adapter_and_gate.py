@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from tests.control.rig import new_limiter
+from tests.safety.rig import new_limiter
 from tests.vehicle.dbw.rig import Rig, both, started
 
-from lavt.control.limits import LIMITS
-from lavt.control.safety import SafetyGate
 from lavt.domain import SessionRequest
+from lavt.safety.gate import SafetyGate
+from lavt.safety.limits import LIMITS
 from lavt.vehicle.software_car.state import Gear
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lavt.build.dbw import load_profile, shipped_profiles
+from lavt.assembly.dbw import load_profile, shipped_profiles
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lavt.build.dbw import load_profile
-from lavt.build.dbw_bus import expected_traffic
+from lavt.assembly.dbw import load_profile
+from lavt.assembly.dbw_bus import expected_traffic
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import Frame, HeardFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8

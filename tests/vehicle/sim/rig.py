@@ -6,8 +6,8 @@ import hashlib
 from typing import Any
 
 from lavt.domain import CameraModel, Picture, Pose
-from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.road import Road
+from lavt.vehicle.sim.rendering.camera import SimCamera
+from lavt.vehicle.sim.road.road import Road
 
 MODEL = CameraModel()
 

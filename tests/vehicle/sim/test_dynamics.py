@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import Actuation
-from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, RAIL_FRICTION, Car, CarMotion, CarParameters, Contact
+from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 
 STEP_S = 1 / 240
 CAR = LINCOLN_MKZ

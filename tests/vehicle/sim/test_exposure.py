@@ -13,20 +13,20 @@ from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S, Picture, Pose
-from lavt.experiment.plan import plan_run
-from lavt.experiment.record import read_record
-from lavt.experiment.virtual_run import build_loop, drive, read_costs
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.virtual_run import build_loop, drive, read_costs
 from lavt.node import WAKE
 from lavt.nodes.camera import CameraNode
-from lavt.transport.fec import RepairSender
-from lavt.transport.h264 import Encoder
-from lavt.transport.pictures import VideoSender
-from lavt.transport.rtp import Packetizer
-from lavt.transport.rtp_stream import StreamSender
-from lavt.transport.video_path import PathServer
-from lavt.vehicle.sim.camera import SimCamera
-from lavt.vehicle.sim.camera import pose_at as pose_between
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.recording.record import read_record
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.rtp import Packetizer
+from lavt.transport.video.frame_codec import VideoSender
+from lavt.transport.video.h264 import Encoder
+from lavt.transport.video.path_validation import PathServer
+from lavt.transport.video.stream_sender import StreamSender
+from lavt.vehicle.sim.rendering.camera import SimCamera
+from lavt.vehicle.sim.rendering.camera import pose_at as pose_between
+from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import grid_ns
 
 STEP_NS = NS_PER_S // 240

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import pytest
 from tests.vehicle.software_car.rig import START_NS, Asked, Hand2, with_crc_broken
-from tests.vehicle.software_car.test_inside import port_of
+from tests.vehicle.software_car.test_in_process_bus import port_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.ground_truth_wire import TruthReceiver
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.runner import Runner
 from lavt.vehicle.software_car.state import Gear
-from lavt.vehicle.truth import TruthReceiver
 
 STEP_NS = NS_PER_S // 240 + 1
 

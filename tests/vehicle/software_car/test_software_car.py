@@ -5,7 +5,7 @@ import pytest
 from tests.vehicle.software_car.rig import START_NS, Asked, Hand1, Hand2, both
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.vehicle.sim.road import Road, load_road
+from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit

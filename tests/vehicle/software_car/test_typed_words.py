@@ -13,9 +13,9 @@ from tests.vehicle.software_car.rig import START_NS, Rig, driving
 
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
+from lavt.vehicle.software_car.console_commands import WORDS, act, help_lines
 from lavt.vehicle.software_car.kit import Kit
 from lavt.vehicle.software_car.state import Gear, Reason
-from lavt.vehicle.software_car.words import WORDS, act, help_lines
 
 NO_DEEDS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense"}
 """What a kit does by itself."""

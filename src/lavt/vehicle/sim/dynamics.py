@@ -21,7 +21,7 @@ RAIL_FRICTION = 0.4
 
 @dataclass(frozen=True, slots=True)
 class CarParameters:
-    """A car as numbers; `lavt.vehicle.sim.cars` has named ones, with where each number is from."""
+    """A car as numbers; `lavt.vehicle.sim.rendering.cars` has named ones, with where each number is from."""
 
     wheelbase_m: float
     rear_axle_to_front_m: float

@@ -7,10 +7,10 @@ from collections import deque
 
 from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
 from lavt.streams import stream
-from lavt.vehicle.sim.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.dynamics import Car, CarMotion, CarParameters
-from lavt.vehicle.sim.judge import Judge
-from lavt.vehicle.sim.road import Road
+from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
+from lavt.vehicle.sim.road.road import Road
+from lavt.vehicle.sim.route_monitor import Judge
 from lavt.vehicle.vehicle import Capabilities, Reached
 
 STEPS_PER_S = 240

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame, Port
+from lavt.vehicle.ground_truth_wire import TruthSender
 from lavt.vehicle.software_car.car import SoftwareCar
-from lavt.vehicle.software_car.news import News, Onlooker
-from lavt.vehicle.software_car.words import HELP, act, help_lines
-from lavt.vehicle.truth import TruthSender
+from lavt.vehicle.software_car.console_commands import HELP, act, help_lines
+from lavt.vehicle.software_car.event_log import News, Onlooker
 
 
 class Runner:

@@ -1,0 +1,224 @@
+"""The one place where nodes are made of configs; nothing below it asks whether time is real."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+from lavt.assembly.addresses import resolved_address
+from lavt.assembly.entropy import Entropy
+from lavt.assembly.fidelity import VIDEO, Fidelity
+from lavt.assembly.injection import injection_client, injection_node
+from lavt.assembly.security import cipher_of
+from lavt.assembly.vehicles import check_vehicle, looks_of
+from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
+from lavt.control.drive_controller import DriveController, find_preset, make_controller
+from lavt.control.driver_limits import CLIENT_LIMITS
+from lavt.domain import NS_PER_MS, Now
+from lavt.errors import UserError
+from lavt.node import Node
+from lavt.nodes.actuator import ActuatorNode
+from lavt.nodes.camera import CameraNode
+from lavt.nodes.client_session import ClientSession
+from lavt.nodes.clock_sync import ClockSyncNode, ProbingClockSyncNode
+from lavt.nodes.driver import DriverNode
+from lavt.nodes.injection import InjectionClient, InjectionNode
+from lavt.nodes.payloads import Route
+from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.receiver import ReceiverNode
+from lavt.safety.gate import SafetyGate
+from lavt.safety.limiter import Limiter
+from lavt.safety.limits import LIMITS, Limits
+from lavt.transport.rtp.fec import RepairSender
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtp import Depacketizer, Packetizer
+from lavt.transport.video.path_validation import TOKEN_BYTES, PathServer
+from lavt.transport.video.stream_sender import StreamSender
+from lavt.vehicle.camera import FrameTimes
+from lavt.vehicle.vehicle import Vehicle
+
+
+@dataclass(frozen=True, slots=True)
+class ServerNodes:
+    """The server's nodes; the actuator is None where it is in a process of its own."""
+
+    camera: CameraNode
+    actuator: ActuatorNode | None
+    clock_sync: ClockSyncNode
+    injection: InjectionNode
+
+    @property
+    def all(self) -> Sequence[Node]:
+        """All nodes, for a runtime."""
+        actuator = () if self.actuator is None else (self.actuator,)
+        return (self.camera, *actuator, self.clock_sync, self.injection)
+
+
+@dataclass(frozen=True, slots=True)
+class ClientNodes:
+    """The client's nodes."""
+
+    receiver: ReceiverNode
+    driver: DriverNode
+    clock_sync: ClockSyncNode
+    injection: InjectionClient
+
+    @property
+    def all(self) -> Sequence[Node]:
+        """All nodes, for a runtime."""
+        return (self.receiver, self.driver, self.clock_sync, self.injection)
+
+
+@lru_cache(maxsize=64)  # a sweep asks for each of its runs
+def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
+    """Raise `UserError` for a vehicle, route, controller or preset that does not exist, before any work is begun."""
+    check_vehicle(vehicle)
+    build_controller(controller)
+
+
+def build_controller(config: ControllerConfig) -> DriveController:
+    """Make the configured controller; raises `UserError` naming the known ones and the known presets."""
+    return make_controller(config.kind, replace(find_preset(config.preset), **config.changes), config.wheelbase_m)
+
+
+def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
+    """Take the configured limits; only a simulated vehicle may have wider ones than the default."""
+    limits = replace(
+        LIMITS,
+        lateral_acceleration_mps2=config.lateral_acceleration_mps2,
+        picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
+        sight_m=config.sight_m,
+    )
+    wider = (
+        limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
+        or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
+        or limits.sight_m > LIMITS.sight_m
+    )
+    if wider and not simulated:
+        raise UserError(
+            f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
+            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.sight_m:.0f} m: lower "
+            "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and safety.sight_m"
+        )
+    return limits
+
+
+def build_server(
+    config: ServerConfig,
+    now: Callable[[], Now],
+    entropy: Entropy,
+    *,
+    host: str,
+    video_port: int,
+    fidelity: Fidelity = VIDEO,
+    lives_on_demand: bool = False,
+) -> ServerNodes:
+    """Make the server's nodes; their time begins when everything that is slow has been prepared.
+
+    With `lives_on_demand` a vehicle that catches up lives on only when somebody looks: where no wake is ever late, in
+    virtual time.
+    """
+    plant = fidelity.plant(config)
+    pictures = fidelity.sender(config)
+    start = now()
+    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
+    actuator = None
+    if plant.start is not None:
+        actuator = build_actuator(
+            config, plant.start(start), entropy, start, host=host, video_port=video_port, route=plant.route, looks=looks
+        )
+    return ServerNodes(
+        CameraNode(
+            plant.camera,
+            pictures,
+            StreamSender(
+                Packetizer(entropy.number(32), entropy.number(16)),
+                RepairSender(entropy.number(32), entropy.number(16)),
+                None if config.video.repair_packets == "auto" else config.video.repair_packets,
+            ),
+            PathServer(lambda: entropy.token(32), cipher_of(config)),
+            start_ns=start.mono_ns,
+            send_to=[resolved_address("video.send_to", each) for each in config.video.send_to],
+        ),
+        actuator,
+        ClockSyncNode(start.mono_ns),
+        injection_node(config.injection, simulated=plant.simulated, video_port=video_port),
+    )
+
+
+def build_actuator(
+    config: ServerConfig,
+    vehicle: Vehicle,
+    entropy: Entropy,
+    start: Now,
+    *,
+    host: str,
+    video_port: int,
+    route: Route | None,
+    looks: Sequence[FrameTimes] = (),
+) -> ActuatorNode:
+    """Make the node that drives a vehicle; `looks` are the times for which it lives on, all where there are none."""
+    able = vehicle.capabilities
+    limits = limits_of(config.safety, simulated=able.simulated)
+    limiter = Limiter(
+        limits,
+        wheelbase_m=able.wheelbase_m,
+        max_steering_rad=able.max_steering_rad,
+        max_braking_mps2=able.max_braking_mps2,
+    )
+    gate = SafetyGate(
+        limits,
+        limiter,
+        new_epoch=lambda: entropy.number(64),
+        new_token=lambda: entropy.token(TOKEN_BYTES),
+        host=host,
+        video_port=video_port,
+        instance=entropy.number(64),
+    )
+    return ActuatorNode(
+        vehicle,
+        gate,
+        start_ns=start.mono_ns,
+        route=route,
+        looks=looks,
+        after_collision=config.vehicle.after_collision,
+    )
+
+
+def build_client(
+    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: Fidelity = VIDEO
+) -> ClientNodes:
+    """Make the client's nodes."""
+    controller = config.controller
+    pictures, detector = fidelity.receiver(config), fidelity.detector(config)
+    hold_ms = config.video.reorder_hold_ms
+    drive_controller = build_controller(controller)
+    start = now()
+    instance = entropy.number(64)
+    session = ClientSession(
+        config.who,
+        instance,
+        rearm=controller.rearm,
+        start_ns=start.mono_ns,
+        clear_stop=controller.clear_emergency_stop,
+        waits=config.injection.condition != "",
+        take_over=config.take_over,
+    )
+    return ClientNodes(
+        ReceiverNode(
+            ReorderBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
+            Depacketizer(),
+            config.video.max_bit_rate_bps,
+            cipher_of(config),
+        ),
+        DriverNode(
+            PictureReader(pictures),
+            detector,
+            drive_controller,
+            session,
+            CLIENT_LIMITS,
+        ),
+        ProbingClockSyncNode(start.mono_ns),
+        injection_client(config.injection, config.who, instance, start.mono_ns),
+    )

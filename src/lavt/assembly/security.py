@@ -1,0 +1,53 @@
+"""From the keys that a config names to the ends of what is signed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lavt.config import ClientConfig, ServerConfig
+from lavt.transport.rtp.srtp import check_srtp
+from lavt.transport.security.envelope import NoSeal, OperatorSeal, VehicleSeal
+from lavt.transport.security.gateway import Carry, ClientDoor, Deliver, OpenDoor, ServerDoor
+from lavt.transport.security.keys import load_private, load_public
+from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
+
+
+def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
+    """Say what happens to the video: where messages are signed it is encrypted."""
+    if not config.security.key:
+        return plain_cipher
+    check_srtp()
+    end: End = "server" if isinstance(config, ServerConfig) else "client"
+    return lambda token, challenge: SrtpCipher(end, token, challenge)
+
+
+def door_of(
+    config: ServerConfig | ClientConfig,
+    deliver: Deliver,
+    carry: Carry,
+    in_force: Callable[[], tuple[int, int]] = lambda: (0, -1),
+) -> ServerDoor | ClientDoor | OpenDoor:
+    """Make a side's door; raises `UserError` for a key that cannot be read. Only the server asks what is `in_force`."""
+    if isinstance(config, ServerConfig):
+        return ServerDoor(deliver, carry, in_force, vehicle_seal(config))
+    seal = operator_seal(config)
+    return OpenDoor(deliver, carry) if seal is None else ClientDoor(deliver, carry, seal)
+
+
+def vehicle_seal(config: ServerConfig) -> NoSeal:
+    """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
+    security = config.security
+    if not security.key:
+        return NoSeal()
+    operators = {name: load_public(Path(file)) for name, file in security.operators.items()}
+    return VehicleSeal(config.vehicle_id, load_private(Path(security.key)), operators)
+
+
+def operator_seal(config: ClientConfig) -> OperatorSeal | None:
+    """Make the operator's end; raises `UserError` for a key that cannot be read. None where nothing is signed."""
+    security = config.security
+    if not security.key:
+        return None
+    key = load_private(Path(security.key))
+    return OperatorSeal(config.vehicle_id, config.who, key, load_public(Path(security.vehicle)))

@@ -1,0 +1,31 @@
+"""Software cars of configs: the kit that a profile is for, and the built-in simulator."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from lavt.assembly.simulators import simulator_of
+from lavt.config import ServerConfig
+from lavt.vehicle.dbw.profile import Profile
+from lavt.vehicle.sim.road.road import Road
+from lavt.vehicle.software_car.car import SoftwareCar
+from lavt.vehicle.software_car.kit import Kit
+from lavt.vehicle.software_car.mechanics import Mechanics
+
+GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2": 2}
+"""By a profile's `kit`."""
+
+
+def build_software_car(config: ServerConfig, profile: Profile, road: Road, start_ns: int) -> SoftwareCar:
+    """Make the car with the kit that a profile is for; nothing else of the profile is told to it.
+
+    What the kit makes of a command comes from the facts: a profile that is wrong must show as a car that does not obey.
+    """
+    simulator = simulator_of(config, road, start_ns)
+    kit = Kit(
+        GENERATIONS[profile.kit],
+        start_ns=start_ns,
+        commands=profile.commands or "remote",
+        mechanics=Mechanics(max_braking_mps2=simulator.capabilities.max_braking_mps2),
+    )
+    return SoftwareCar(kit, simulator)

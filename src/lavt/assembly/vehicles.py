@@ -1,0 +1,174 @@
+"""Vehicles of configs, each with its camera and, where one is known, the road it drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import entry_points
+
+import numpy as np
+
+from lavt.assembly.by_wire import check_by_wire, inside, is_simulated
+from lavt.assembly.cameras import build_camera, camera_model, check_own_camera
+from lavt.assembly.simulators import car_of, simulator_of
+from lavt.config import ServerConfig, VehicleConfig
+from lavt.domain import NS_PER_MS, NS_PER_S, Now
+from lavt.errors import UserError
+from lavt.nodes.payloads import Route
+from lavt.perception.lane_detector import GRID
+from lavt.streams import stream
+from lavt.vehicle.camera import Camera, FrameTimes, TimedCamera
+from lavt.vehicle.sim.rendering.camera import SimCamera
+from lavt.vehicle.sim.rendering.lane_camera import LaneCamera
+from lavt.vehicle.sim.road.road import Road, load_road
+from lavt.vehicle.vehicle import Vehicle
+
+CUSTOM_VEHICLES = "lavt.vehicles"
+"""Entry points of this group are functions like `build_simulator`: a user adds a vehicle without touching LAVT."""
+
+
+ROUTE_STEP_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    """A vehicle with its camera, and the road it drives where one is known.
+
+    `start` begins its time: building takes seconds, and a vehicle's time must not run before the loop does. None: the
+    vehicle is in the actuator's own process (`actuator_process.py`).
+    """
+
+    camera: Camera
+    start: Callable[[Now], Vehicle] | None
+    route: Route | None
+    simulated: bool = False
+    catches_up: bool = False
+    """The vehicle loses nothing when `advance` is called later than it asked for."""
+
+
+def build_simulator(config: ServerConfig) -> Plant:
+    """Make the built-in simulator and its camera."""
+    check_own_camera(config)
+    road = load_road(config.vehicle.route)
+    return _simulated(config, road, _sim_camera(config, road))
+
+
+def build_dbw(config: ServerConfig) -> Plant:
+    """Make a by-wire vehicle and its camera: the simulator's, where a software car tells where it is."""
+    check_vehicle(config.vehicle)
+    asked = config.vehicle.dbw
+    if asked.is_inside:
+        return build_simulator(config)
+    if asked.truth:
+        check_own_camera(config)
+        return Plant(_sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(asked))
+    camera = build_camera(config)
+    if camera is None:
+        raise UserError(
+            "a real car needs a real camera: set camera.source device and camera.device; or vehicle.dbw.truth where "
+            "`lavt software-car` drives"
+        )
+    return Plant(camera, None, None)
+
+
+def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
+    camera = SimCamera(
+        model=camera_model(config.camera),
+        rate_hz=config.camera.rate_hz,
+        phase_ns=camera_phase_ns(config),
+        road=road,
+        seed=config.seed,
+        scenery=config.vehicle.scenery,
+        light=config.vehicle.light,
+        exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
+    )
+    camera.prepare()
+    return camera
+
+
+def build_unpictured(config: ServerConfig) -> Plant:
+    """Make the built-in simulator with a camera that gives the lane itself; other vehicles' roads are not known."""
+    kind = config.vehicle.kind
+    if kind != "simulator" and not (kind == "dbw" and config.vehicle.dbw.is_inside):
+        raise UserError(
+            f"fidelity geometry needs the road, which only the built-in simulator tells: choose vehicle.kind simulator "
+            f"instead of {kind!r}, or another fidelity"
+        )
+    road = load_road(config.vehicle.route)
+    camera = LaneCamera(
+        model=camera_model(config.camera),
+        rate_hz=config.camera.rate_hz,
+        phase_ns=camera_phase_ns(config),
+        road=road,
+        near_m=GRID.near_m,
+        far_m=GRID.far_m,
+        half_width_m=GRID.half_width_m,
+        exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
+        sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
+    )
+    return _simulated(config, road, camera)
+
+
+def camera_phase_ns(config: ServerConfig) -> int:
+    """Draw when the camera's first frame is taken after the start: anywhere within its period."""
+    return int(stream(config.seed, "camera phase").integers(round(NS_PER_S / config.camera.rate_hz)))
+
+
+def driven_route(config: ServerConfig) -> Route | None:
+    """Give the road that a software car on a bus drives; None for a real car."""
+    return route_of(config.vehicle.route, load_road(config.vehicle.route)) if config.vehicle.dbw.truth else None
+
+
+def route_of(name: str, road: Road) -> Route:
+    """Give the middle of a road's lane for the record."""
+    x_m, y_m, _, _ = road.point(np.arange(0.0, road.length_m, ROUTE_STEP_M))
+    return Route(name, road.length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
+
+
+def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
+    route = route_of(config.vehicle.route, road)
+    if config.vehicle.kind == "dbw":
+
+        def start_inside(start: Now) -> Vehicle:
+            return inside(config, road, start)
+
+        return Plant(camera, start_inside, route, simulated=True)
+    return Plant(
+        camera, lambda start: simulator_of(config, road, start.mono_ns), route, simulated=True, catches_up=True
+    )
+
+
+VEHICLES: dict[str, Callable[[ServerConfig], Plant]] = {"simulator": build_simulator, "dbw": build_dbw}
+
+
+def build_plant(config: ServerConfig) -> Plant:
+    """Make the configured vehicle with its camera; raises `UserError` naming the known kinds."""
+    return _vehicle(config.vehicle.kind)(config)
+
+
+def _vehicle(kind: str) -> Callable[[ServerConfig], Plant]:
+    if kind in VEHICLES:
+        return VEHICLES[kind]
+    custom = {entry.name: entry for entry in entry_points(group=CUSTOM_VEHICLES)}
+    if kind not in custom:
+        raise UserError(f"there is no vehicle {kind!r}: the known kinds are {', '.join([*VEHICLES, *custom])}")
+    build: Callable[[ServerConfig], Plant] = custom[kind].load()
+    return build
+
+
+def check_vehicle(config: VehicleConfig) -> None:
+    """Raise `UserError` for a vehicle, road or car that does not exist, before any work is begun."""
+    _vehicle(config.kind)
+    if config.kind == "dbw":
+        check_by_wire(config)
+    if config.kind == "simulator" or config.dbw.is_inside or config.dbw.truth:
+        load_road(config.route)
+        car_of(config)
+
+
+def looks_of(camera: Camera, start_ns: int) -> list[FrameTimes]:
+    """Tell when the vehicle's pose is needed: when the shutter opens and, where the camera has an exposure, closes."""
+    opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
+    exposure_ns = camera.exposure_ns if isinstance(camera, TimedCamera) else 0
+    return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]

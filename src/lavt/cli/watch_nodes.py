@@ -1,0 +1,84 @@
+"""The nodes of `lavt watch`, and what it knows of the stream."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from typing import Any, Literal
+
+import numpy as np
+
+from lavt.domain import NS_PER_MS, Now
+from lavt.nodes.payloads import PictureRead
+from lavt.nodes.picture_reader import PictureReader
+from lavt.nodes.receiver import ReceiverNode
+from lavt.nodes.watcher import WatcherNode
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.reception_stats import ReceptionSample
+from lavt.transport.rtp.rtp import Depacketizer
+from lavt.transport.video.frame_codec import VideoReceiver
+from lavt.transport.video.h264 import Decoder
+from lavt.transport.video.stamp import read_clear_stamp
+from lavt.transport.video.stamp_check import LearnedBase
+
+Sender = Literal["lavt", "foreign"]
+
+
+class Watched:
+    """A receiver without a path, so that it sends nothing, a watcher, and the recorder that both report to."""
+
+    def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
+        self._reader = _reader(sender)
+        hold_ns = None if reorder_hold_ms is None else reorder_hold_ms * NS_PER_MS
+        self._receiver = ReceiverNode(ReorderBuffer(hold_ns), Depacketizer())
+        self.nodes = (self._receiver, WatcherNode(self._reader))
+        self._latencies_ms = array("d")
+        self._jitter_us = 0
+        self._because = ""
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
+        """Keep the latency of a picture, or why it has none, and the jitter of a second."""
+        if topic == "picture":
+            self._note(payload)
+        elif topic == "reception":
+            sample: ReceptionSample = payload
+            self._jitter_us = sample.jitter_us
+
+    def _note(self, picture: PictureRead) -> None:
+        if picture.stamp_ns is None:
+            self._because = picture.reason
+        else:
+            self._latencies_ms.append((picture.read_wall_ns - picture.stamp_ns) / NS_PER_MS)
+
+    def totals(self) -> Counter[str]:
+        """Count everything since the beginning."""
+        received, pictures = Counter(self._receiver.counts), self._reader.counts
+        return Counter(
+            pictures=pictures["frames_decoded"],
+            stamps_accepted=len(self._latencies_ms),
+            stamps_unreadable=pictures["frames_unreadable"],
+            packets=received["packets"],
+            lost=received["packets_lost"],
+            reordered=received["packets_reordered"],
+            datagrams_unreadable=received["packets_unreadable"] + received["challenges_unreadable"],
+        )
+
+    def between(self, before: Counter[str], after: Counter[str]) -> dict[str, Any]:
+        """Say what happened between two totals: latency from stamp to reading, None where no stamp was accepted."""
+        latencies_ms = self._latencies_ms[before["stamps_accepted"] : after["stamps_accepted"]]
+        median_ms, p95_ms = np.percentile(latencies_ms, (50, 95)).tolist() if latencies_ms else (None, None)
+        return {
+            **{name: count - before[name] for name, count in after.items()},
+            "last_unreadable_because": self._because,
+            "latency_median_ms": median_ms,
+            "latency_p95_ms": p95_ms,
+            "jitter_ms": self._jitter_us / 1000,
+        }
+
+
+def _reader(sender: Sender) -> PictureReader:
+    """Give what the stamps of a sender are read with: of a foreign one only what its weaker check may be shown."""
+    if sender == "lavt":
+        return PictureReader(VideoReceiver(Decoder(), None))
+    pictures = VideoReceiver(Decoder(), None, read_clear_stamp)
+    return PictureReader(pictures, LearnedBase().agrees, reads_doubtful=False)

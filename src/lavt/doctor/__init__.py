@@ -1,0 +1,1 @@
+"""What `lavt doctor` checks on a machine, and how it finds out."""

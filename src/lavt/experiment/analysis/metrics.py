@@ -1,0 +1,145 @@
+"""Everything `result.json` says of how a run went, computed from its two records and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.analysis.clocks import Clocks, clocks
+from lavt.experiment.analysis.latency import (
+    ages_at_actuation_ns,
+    closure_ns,
+    control_latency_ns,
+    decoded_pictures,
+    frames_within,
+    loops,
+    percentiles_ms,
+    picture_age,
+    pictures_of,
+    video_latency_ns,
+)
+from lavt.experiment.analysis.stage_latency import hop_percentiles
+from lavt.experiment.analysis.steering import steering
+from lavt.experiment.analysis.tracking import cross_track, distance_m, heading, p95_by_10m, per_km, route_length_m
+from lavt.recording.record import Record
+from lavt.recording.table import MISSING, Table
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was measured in a run.
+
+    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of how far the
+    parts of the loop are from the whole, None where it is not known.
+    """
+
+    entry: Mapping[str, Any]
+    closure_p95_ms: float | None
+    clocks: Clocks
+
+
+def driving_interval(server: Record) -> tuple[int, int, str | None]:
+    """When the drive began and ended, on the server's monotonic clock, and how.
+
+    Without an event `drive_began` nothing was driven: the interval is empty. Without an event `ending` (a crash) it
+    reaches to the last message of the record, and the ending is None.
+    """
+    began_ns: int | None = None
+    ended_ns, ending = server.last_ns, None
+    for kind, mono_ns, detail in _events(server.table("event")):
+        if kind == "drive_began" and began_ns is None:
+            began_ns = mono_ns
+        if kind == "ending" and began_ns is not None and ending is None:
+            ended_ns, ending = mono_ns, detail
+    return (ended_ns + 1 if began_ns is None else began_ns), ended_ns, ending
+
+
+def _events(events: Table) -> list[tuple[str, int, str]]:
+    return list(zip(events.texts("kind"), events.ints("mono_ns").tolist(), events.texts("detail"), strict=True))
+
+
+def measure(server: Record, client: Record) -> Measured:
+    """Compute every metric of a run. What cannot be known (no truth, no clock samples, no picture) is None."""
+    began_ns, ended_ns, ending = driving_interval(server)
+    drove = began_ns <= ended_ns
+    on_one_scale = clocks(server, client, began_ns, ended_ns)
+    latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, on_one_scale)
+    entry = {
+        "ending": ending,
+        **_tracking(server, began_ns, ended_ns),
+        "duration_s": (ended_ns - began_ns) / NS_PER_S if drove else None,
+        **latencies,
+        "delta": on_one_scale.entry,
+    }
+    return Measured(entry, closure_p95_ms, on_one_scale)
+
+
+def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
+    truth = server.table("truth")
+    truth_ns = truth.ints("mono_ns")
+    truth = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
+    kinds = [kind for kind, mono_ns, _ in _events(server.table("event")) if began_ns <= mono_ns <= ended_ns]
+    driven_m, collisions, invasions = distance_m(truth), kinds.count("collision"), kinds.count("lane_invasion")
+    return {
+        "route_length_m": route_length_m(server.table("route")),
+        "distance_m": driven_m,
+        **cross_track(truth),
+        "p95_by_10m": p95_by_10m(truth),
+        **heading(truth),
+        **steering(truth),
+        "collisions": collisions,
+        "lane_invasions": invasions,
+        "collisions_per_km": per_km(collisions, driven_m),
+        "lane_invasions_per_km": per_km(invasions, driven_m),
+    }
+
+
+def _latencies(
+    server: Record, client: Record, began_ns: int, ended_ns: int, on_one_scale: Clocks
+) -> tuple[dict[str, Any], float | None]:
+    all_frames, admissions = server.table("frame"), server.table("admission")
+    frames = frames_within(all_frames, began_ns, ended_ns)
+    pictures = decoded_pictures(pictures_of(client.table("picture"), frames))
+    paired = loops(frames, admissions, ended_ns)
+    age = picture_age(all_frames, admissions, began_ns, ended_ns)
+    nothing = np.zeros(0, np.int64)
+    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = nothing, nothing, on_one_scale.bound_ms, None
+    if on_one_scale.offset is not None:
+        tau_v_ns = video_latency_ns(pictures, on_one_scale.offset)
+        tau_c_ns = control_latency_ns(admissions, on_one_scale.offset, began_ns, ended_ns)
+        closures_ns = closure_ns(pictures, paired, on_one_scale.offset)
+        if len(closures_ns):
+            closure_p95_ms = float(np.percentile(np.abs(closures_ns), 95)) / NS_PER_MS
+    entry = {
+        "loop_ms": percentiles_ms(paired.loop_ns),
+        "picture_age_ms": {"mean": age.mean_ms, "p95": age.p95_ms},
+        "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, admissions, began_ns, ended_ns)),
+        "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
+        "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
+        "hops_ms": hop_percentiles(server, client, frames, tau_c_ns, on_one_scale.offset),
+        "frames_sent": len(frames),
+        "frames_decoded": len(pictures),
+        "frames_unreadable": int(np.sum(~pictures.flags("readable"))),
+    }
+    return entry, closure_p95_ms
+
+
+def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, Any]:
+    return {
+        "p5": summary["p5"],
+        "p50": summary["p50"],
+        "p95": summary["p95"],
+        "bound": bound_ms if summary["n"] else None,
+        "n": summary["n"],
+    }
+
+
+def count(record: Record, name: str) -> int | None:
+    """Last value of a counter on the channel `counts`; None where it was never recorded."""
+    values = record.table("counts").ints(name)
+    known = values[values != MISSING]
+    return int(known[-1]) if len(known) else None

@@ -1,0 +1,87 @@
+"""How well the lane was kept: pure functions of the recorded ground truth. `docs/metrics.md` has the formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.recording.table import Table
+
+STEP_M = 0.25
+"""Errors are sampled by distance, so that a car that creeps or waits does not count more than one that drives."""
+
+PLACES_M = 10
+"""Of every so many metres driven, the error up to there is kept: runs that ended early are compared by it."""
+
+
+def sampled_by_distance(truth: Table, name: str) -> FloatArray:
+    """Column `name` every `STEP_M` of new progress along the route, interpolated linearly.
+
+    Where the car went back, the first passage counts.
+    """
+    progress_m = truth.floats("progress_m")
+    values = truth.floats(name)
+    known = np.isfinite(progress_m) & np.isfinite(values)
+    progress_m, values = progress_m[known], values[known]
+    if len(progress_m) == 0:
+        return np.zeros(0)
+    farthest_m = np.maximum.accumulate(progress_m)
+    new = np.concatenate([[True], progress_m[1:] > farthest_m[:-1]])
+    places_m = np.arange(progress_m[0], farthest_m[-1] + 1e-9, STEP_M)
+    return np.asarray(np.interp(places_m, progress_m[new], values[new]), np.float64)
+
+
+def cross_track(truth: Table) -> dict[str, float | None]:
+    """Mean, root mean square, 95th percentile and maximum of the distance from the lane's centre, in metres."""
+    error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
+    if len(error_m) == 0:
+        return {"mae_m": None, "rms_m": None, "p95_m": None, "max_m": None}
+    return {
+        "mae_m": float(error_m.mean()),
+        "rms_m": root_mean_square(error_m),
+        "p95_m": float(np.percentile(error_m, 95)),
+        "max_m": float(error_m.max()),
+    }
+
+
+def p95_by_10m(truth: Table) -> list[float]:
+    """95th percentile of the distance from the lane's centre, from the start to 10 m, 20 m, .. of progress.
+
+    Whole tens only: nothing where less than 10 m were driven.
+    """
+    error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
+    a_place = round(PLACES_M / STEP_M)
+    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(a_place, len(error_m), a_place)]
+
+
+def heading(truth: Table) -> dict[str, float | None]:
+    """Mean, root mean square and 95th percentile of the angle between the car and the lane, in radians."""
+    error_rad = np.abs(sampled_by_distance(truth, "heading_error_rad"))
+    return {
+        "heading_mae_rad": float(error_rad.mean()) if len(error_rad) else None,
+        "heading_rms_rad": root_mean_square(error_rad),
+        "heading_p95_rad": float(np.percentile(error_rad, 95)) if len(error_rad) else None,
+    }
+
+
+def root_mean_square(values: FloatArray) -> float | None:
+    """Root of the mean square; None of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def distance_m(truth: Table) -> float | None:
+    """Progress along the route from the first to the farthest row."""
+    progress_m = truth.floats("progress_m")
+    progress_m = progress_m[np.isfinite(progress_m)]
+    return float(progress_m.max() - progress_m[0]) if len(progress_m) else None
+
+
+def per_km(count: int, driven_m: float | None) -> float | None:
+    """Give how often something happened per kilometre driven; None where nothing was driven."""
+    return count / (driven_m / 1000) if driven_m else None
+
+
+def route_length_m(route: Table) -> float | None:
+    """How far it is from the route's start to its goal, as the server recorded it; None where it did not."""
+    lengths_m = route.floats("length_m")
+    return float(lengths_m[0]) if len(lengths_m) and np.isfinite(lengths_m[0]) else None

@@ -1,0 +1,249 @@
+"""Figures of latency: injected against measured, what it does to driving, where the loop goes. Nothing reads a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from lavt.experiment.report.figure_style import (
+    SMALL,
+    Colours,
+    Conditions,
+    Point,
+    beside,
+    kind_handles,
+    legend_below,
+    marker,
+    near_each_other,
+    new_figure,
+    tidy,
+)
+
+NODE_COLOURS = {"camera": "Blues", "network": "Greys", "receiver": "Purples", "driver": "Greens", "actuator": "Oranges"}
+OTHER_COLOURS = "Reds"
+
+PAPER_MARKER: dict[str, Any] = {"marker": "^", "color": "0.55", "label": "the paper", "zorder": 1}
+
+DIAMOND: dict[str, Any] = {"marker": "D", "markersize": 4, "markerfacecolor": "white"}
+"""The error up to the common distance."""
+
+ERROR_LABEL = "P95 of cross-track error,\nmean of runs (m)"
+
+Place = tuple[str, str]
+"""Where a condition has a latency: key, and key in that."""
+
+LOOP: Place = ("loop_ms", "p50")
+
+SCALES: Mapping[str, Place] = {
+    "loop latency, median (ms)": LOOP,
+    "picture age, mean (ms)": ("picture_age_ms", "mean"),
+}
+"""What degradation is drawn over."""
+
+
+def degradation_figure(kinds: Mapping[str, Conditions], paper: Conditions, colours: Colours) -> Figure:
+    """Completion and cross-track error over loop latency and, where it is known, picture age: one point a condition.
+
+    `paper` has the paper's conditions, drawn over its tau_v + tau_c beside our loop latency. Diamonds are the error up
+    to the common distance, of all runs.
+    """
+    scales = {label: place for label, place in SCALES.items() if any(_known(kinds, place))}
+    named: list[tuple[Axes, str, list[Point]]] = []
+    figure = new_figure(5.6)
+    panels = figure.subplots(2, len(scales), sharex="col", sharey="row", squeeze=False)
+    for column, (label, place) in enumerate(scales.items()):
+        completion, error = panels[:, column]
+        for kind, conditions in {"paper": _with_totals(paper), **kinds}.items():
+            shown = {
+                completion: _over(conditions, place, "completion_rate", "completion_interval", 100.0),
+                error: _over(conditions, place, "p95_m", "p95_interval"),
+            }
+            for axes, points in shown.items():
+                for point in points:
+                    _draw(axes, point, PAPER_MARKER if kind == "paper" else marker(kind, colours[point[0]]))
+                named.append((axes, kind, points))
+            for point in _over(conditions, place, "p95_common_m", "p95_common_interval"):
+                _draw(error, point, {**DIAMOND, "color": colours[point[0]], "zorder": 4})
+        completion.margins(x=0.16)
+        error.margins(x=0.16)
+        tidy(completion, "", "runs completed (%)" if column == 0 else "")
+        tidy(error, label, ERROR_LABEL if column == 0 else "")
+    panels[0, 0].set_ylim(-9, 112)  # names of points stand below them, or above
+    panels[1, 0].set_ylim(bottom=-0.09 * panels[1, 0].get_ylim()[1])
+    for axes, kind, points in named:
+        _name(axes, near_each_other(points, axes), kind)
+    handles: list[Any] = kind_handles(kinds)
+    if any("p95_common_m" in entry for conditions in kinds.values() for entry in conditions.values()):
+        said = "error up to the common distance"
+        handles.append(Line2D([], [], label=said, color="0.4", linestyle="none", **DIAMOND))
+    if paper:
+        handles.append(Line2D([], [], linestyle="none", **PAPER_MARKER))
+    legend_below(figure, handles)
+    return figure
+
+
+def _known(kinds: Mapping[str, Conditions], place: Place) -> list[bool]:
+    key, part = place
+    return [
+        (entry.get(key) or {}).get(part) is not None for conditions in kinds.values() for entry in conditions.values()
+    ]
+
+
+def _over(conditions: Conditions, place: Place, value: str, bounds: str, unit: float = 1.0) -> list[Point]:
+    """Points of the conditions that know both."""
+    key, part = place
+    points: list[Point] = []
+    for name, entry in conditions.items():
+        x, y, interval = (entry.get(key) or {}).get(part), entry.get(value), entry.get(bounds)
+        if x is not None and y is not None:
+            points.append((name, x, y * unit, [bound * unit for bound in interval] if interval else None))
+    return points
+
+
+def _with_totals(paper: Conditions) -> Conditions:
+    """Put the paper's points where its two latencies sum to."""
+    return {name: {**entry, "loop_ms": {"p50": entry["tau_v_ms"] + entry["tau_c_ms"]}} for name, entry in paper.items()}
+
+
+def _draw(axes: Axes, point: Point, style: Mapping[str, Any]) -> None:
+    """Draw a point with its interval, where it has one."""
+    _, x, y, interval = point
+    reach = None if interval is None else [[max(y - interval[0], 0)], [max(interval[1] - y, 0)]]
+    axes.errorbar(x, y, yerr=reach, capsize=3, linestyle="none", elinewidth=1, **style)
+
+
+def _name(axes: Axes, places: Sequence[Sequence[Point]], kind: str) -> None:
+    """Write the names of points that are near each other together, the upper point's above."""
+    for place in places:
+        middle = (sum(x for _, x, _, _ in place) / len(place), sum(y for _, _, y, _ in place) / len(place))
+        axes.annotate("\n".join(name for name, _, _, _ in place), middle, **beside(kind))
+
+
+def presets_figure(groups: Mapping[str, Conditions], colours: Colours) -> Figure:
+    """Completion and cross-track error over loop latency: one line a group, one colour a condition.
+
+    Conditions at one place, of which one hides another, are named.
+    """
+    figure = new_figure(3.8)
+    completion, error = figure.subplots(1, 2)
+    lines: list[tuple[Axes, list[Point]]] = []
+    symbols = dict(zip(groups, "osD^vP", strict=False))
+    for title, conditions in groups.items():
+        for axes, key, unit in ((completion, "completion_rate", 100.0), (error, "p95_m", 1.0)):
+            points = sorted(_over(conditions, LOOP, key, "", unit), key=lambda point: point[1])
+            lines.append((axes, points))
+            dashes = (0, (1 + 2 * list(groups).index(title), 1)) if list(groups).index(title) else "solid"
+            axes.plot([x for _, x, _, _ in points], [y for _, _, y, _ in points], color="0.6", linestyle=dashes)
+            for name, x, y, _ in points:
+                axes.plot(x, y, marker=symbols[title], color=colours[name], linestyle="none")
+    tidy(completion, "loop latency, median (ms)", "runs completed (%)", "Completion")
+    completion.set_ylim(-5, 112)
+    tidy(error, "loop latency, median (ms)", ERROR_LABEL, "Error of completed runs")
+    error.set_ylim(0, 1.1 * error.get_ylim()[1])
+    for axes, points in lines:
+        _name(axes, [place for place in near_each_other(points, axes) if len(place) > 1], "group")
+    groups_shown = [
+        Line2D([], [], color="0.4", marker=symbols[title], label=title, linestyle="none") for title in groups
+    ]
+    names = dict.fromkeys(name for conditions in groups.values() for name in conditions)
+    legend_below(figure, [*groups_shown, *(Patch(color=colours[name], label=name) for name in names)])
+    return figure
+
+
+def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure:
+    """Injected against measured delay of video and of control.
+
+    Above: medians, bars from p5 to p95, and lines for the injected delay on top of the latency without any. Below: how
+    far the medians are from those lines; bars are the bound of the clocks.
+    """
+    figure = new_figure(5.2)
+    panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
+    for column, (direction, key) in enumerate((("video", "tau_v_ms"), ("control", "tau_c_ms"))):
+        above, below = panels[:, column]
+        for kind, conditions in kinds.items():
+            points = _injected_points(conditions, direction, key)
+            _draw_injected(above, below, points, kind, colours)
+        symbol = "τ video" if direction == "video" else "τ control"
+        tidy(above, "", f"{symbol}, measured (ms)", direction.capitalize())
+        above.set_ylim(bottom=min(0.0, above.get_ylim()[0]))
+        tidy(below, f"injected {direction} delay (ms)", "off the line (ms)")
+        low, high = below.get_ylim()
+        below.set_ylim(min(low, -1.2), max(high, 1.2))
+        below.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+    legend_below(figure, list(kind_handles(kinds)))
+    return figure
+
+
+def _injected_points(conditions: Conditions, direction: str, key: str) -> list[tuple[str, float, Mapping[str, Any]]]:
+    """Conditions of which both are known, least injected first."""
+    points = [
+        (name, float(condition["injected_ms"][direction]), condition[key])
+        for name, condition in conditions.items()
+        if condition["injected_ms"][direction] is not None and condition[key]["p50"] is not None
+    ]
+    return sorted(points, key=lambda point: point[1])
+
+
+def _draw_injected(
+    above: Axes,
+    below: Axes,
+    points: Sequence[tuple[str, float, Mapping[str, Any]]],
+    kind: str,
+    colours: Colours,
+) -> None:
+    if not points:
+        return
+    base_ms = points[0][2]["p50"] - points[0][1]
+    farthest_ms = points[-1][1]
+    above.plot([0, farthest_ms], [base_ms, base_ms + farthest_ms], color="0.6", linewidth=0.8, zorder=0)
+    together: dict[float, list[str]] = {}
+    for name, injected_ms, latency in points:
+        together.setdefault(injected_ms, []).append(name)
+        reach = [[latency["p50"] - latency["p5"]], [latency["p95"] - latency["p50"]]]
+        style = {"capsize": 3, "linestyle": "none", **marker(kind, colours[name])}
+        above.errorbar(injected_ms, latency["p50"], yerr=reach, **style)
+        below.errorbar(injected_ms, latency["p50"] - injected_ms - base_ms, yerr=latency["bound"] or 0.0, **style)
+    medians_ms = {injected_ms: latency["p50"] for _, injected_ms, latency in points}
+    for injected_ms, names in together.items():
+        above.annotate(", ".join(names), (injected_ms, medians_ms[injected_ms]), **beside(kind))
+    above.margins(x=0.15)
+
+
+def hops_figure(hops: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Where the time of the median loop goes: a bar a condition, a colour a node, a shade a hop of `hops_ms`."""
+    figure = new_figure(0.42 * len(hops) + 1.6)
+    axes = figure.subplots()
+    colours = _hop_colours(hops)
+    for row, every in enumerate(hops.values()):
+        left_ms = 0.0
+        for share in every:
+            colour = colours[share["node"], share["hop"]]
+            axes.barh(row, share["p50"] or 0.0, left=left_ms, color=colour, edgecolor="white", linewidth=0.3)
+            left_ms += share["p50"] or 0.0
+        text: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": SMALL}
+        axes.annotate(f"{left_ms:.0f} ms", (left_ms, row), **text)
+    axes.set_yticks(range(len(hops)), list(hops))
+    axes.invert_yaxis()
+    axes.margins(x=0.1)
+    tidy(axes, "median of each hop, one after the other (ms)", "")
+    axes.grid(visible=False, axis="y")
+    legend = {hop if node == "network" else node: colour for (node, hop), colour in colours.items()}
+    legend_below(figure, [Patch(color=colour, label=name) for name, colour in legend.items()])
+    return figure
+
+
+def _hop_colours(every_condition: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
+    """Give each hop a shade of its node's colour."""
+    names = list(dict.fromkeys((hop["node"], hop["hop"]) for hops in every_condition.values() for hop in hops))
+    colours = {}
+    for node, hop in names:
+        hops = [name for of, name in names if of == node]
+        shades = colormaps[NODE_COLOURS.get(node, OTHER_COLOURS)]
+        colours[node, hop] = shades(0.35 + 0.45 * hops.index(hop) / max(len(hops) - 1, 1))
+    return colours

@@ -1,0 +1,129 @@
+"""The report of runs: `summary.json`, and `report/index.html` with its figures and tables beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+from lavt.errors import WorkError
+from lavt.experiment.analysis.drive_data import Drive
+from lavt.experiment.analysis.results import FAILED, read_json, write_json
+from lavt.experiment.report import html_page
+from lavt.experiment.report.boundary_section import boundary_parts
+from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.run_sections import (
+    DriveSets,
+    captured_ms,
+    drawn_runs,
+    machine_parts,
+    read_drives,
+    single_run_parts,
+    trajectory_parts,
+)
+from lavt.experiment.report.sections import (
+    Report,
+    axis_parts,
+    clock_parts,
+    conditions_parts,
+    contrast_parts,
+    degradation_parts,
+    difference_parts,
+    group_parts,
+    head,
+    hop_parts,
+    injected_parts,
+    route_parts,
+    run_parts,
+    survival_parts,
+)
+from lavt.experiment.statistics.summary import summarize
+
+TITLE = "LAVT: latency and driving"
+
+
+def write_report(
+    sweep_dir: Path,
+    *,
+    run_dirs: Sequence[Path] | None = None,
+    base: Mapping[str, Any] | None = None,
+    speed: Mapping[str, Any] | None = None,
+    drives: Mapping[Path, Drive] | None = None,
+    sweeps: Mapping[Path, str] | None = None,
+    boundaries: Sequence[Mapping[str, Any]] = (),
+    failed: Sequence[Mapping[str, str]] = (),
+) -> Path:
+    """Write `summary.json` and `report/` into `sweep_dir`, and return the page's path.
+
+    `run_dirs` are the runs to report, by default those under `sweep_dir/runs`. `base` is that of
+    `summary.summarize`; `speed`, where it is not given, is kept from the summary that is already there. `drives` are
+    those that were read already, by run directory. `sweeps` names, by run directory, the sweep a run is of, where runs
+    of several are reported together. `boundaries` are contents of `boundary.json`. `failed` are runs that
+    failed, as in `FAILED`; they and those whose result cannot be read are left out, and the page says so. Raises
+    `WorkError` where no run is left.
+    """
+    if run_dirs is None:
+        run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
+    results, unfinished = _read_results(run_dirs, sweeps or {})
+    known = {each["run"] for each in failed}
+    left_out = [*failed, *({"run": name, "because": "it has no result"} for name in unfinished if name not in known)]
+    if not results:
+        raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
+    summary_path = sweep_dir / "summary.json"
+    if speed is None and summary_path.is_file():
+        speed = read_json(summary_path).get("speed")
+    summary = summarize([result for _, result in results], speed, base=base, failed=left_out)
+    write_json(summary_path, summary)
+    report_dir = sweep_dir / "report"
+    report_dir.mkdir(parents=True, exist_ok=True)
+    report = Report(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
+    sets = read_drives(drawn_runs(report, results), drives or {})
+    with mpl.rc_context({"text.parse_math": False}):  # a name with a dollar is no formula
+        sections = _sections(report, sets, boundaries)
+    index = report_dir / "index.html"
+    index.write_text(html_page.page(TITLE, sections), encoding="utf-8")
+    return index
+
+
+def _sections(report: Report, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]) -> list[html_page.Section]:
+    """Make the page's sections in their order."""
+    return [
+        ("Summary", head(report)),
+        ("Conditions", conditions_parts(report)),
+        ("Planned contrasts", contrast_parts(report)),
+        ("Where this differs from the paper, and why", difference_parts(report)),
+        ("Trajectories", trajectory_parts(report, sets)),
+        ("Injected and measured latency", injected_parts(report)),
+        ("Driving against latency", degradation_parts(report)),
+        ("How far the runs came", survival_parts(report)),
+        ("Boundaries", boundary_parts(boundaries, report.directory)),
+        ("Where the latency comes from", hop_parts(report, captured_ms(sets))),
+        ("Presets and settings compared", group_parts(report)),
+        ("Axes of the sweep", axis_parts(report)),
+        ("Route by route", route_parts(report)),
+        ("Single runs", single_run_parts(report, sets)),
+        ("Every run", run_parts(report)),
+        ("Clocks of two machines", clock_parts(report)),
+        ("Versions and machine", machine_parts(report, sets)),
+    ]
+
+
+def read_failed(sweep_dir: Path) -> list[dict[str, str]]:
+    """Read which runs of a sweep failed, and why."""
+    return list(read_json(sweep_dir / FAILED)) if (sweep_dir / FAILED).is_file() else []
+
+
+def _read_results(
+    run_dirs: Sequence[Path], sweeps: Mapping[Path, str]
+) -> tuple[list[tuple[Path, dict[str, Any]]], list[str]]:
+    results: list[tuple[Path, dict[str, Any]]] = []
+    left_out: list[str] = []
+    for directory in run_dirs:
+        named = {"sweep": sweeps[directory]} if directory in sweeps else {}
+        try:
+            results.append((directory, {**read_json(directory / "result.json"), **named}))
+        except WorkError:
+            left_out.append(directory.name)
+    return results, left_out

@@ -1,0 +1,147 @@
+"""Figures of single drives: where they went, how they steered, what was seen. Nothing here reads a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lavt.domain import NS_PER_S, FloatArray, Picture
+from lavt.experiment.analysis.drive_data import Drive
+from lavt.experiment.report.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
+
+DRAWN_EVERY_M = 0.5
+"""Nearer points of a drive cannot be told apart on paper, and would make the figure of 90 drives too large."""
+
+CROSS: dict[str, Any] = {
+    "color": "red",
+    "marker": "x",
+    "markersize": 6,
+    "markeredgewidth": 1.5,
+    "linestyle": "none",
+    "zorder": 5,
+}
+
+
+def drawn_points(progress_m: FloatArray) -> list[int]:
+    """Choose the rows of a drive that are drawn: one every `DRAWN_EVERY_M` of its way, and the last."""
+    if not len(progress_m):
+        return []
+    bins = np.floor(progress_m / DRAWN_EVERY_M)
+    changed = np.flatnonzero(np.diff(bins) != 0) + 1
+    return sorted({0, *changed.tolist(), len(progress_m) - 1})
+
+
+def trajectories_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) -> Figure:
+    """Draw all drives of each route from above, one panel a route.
+
+    The reference is thick and black, each drive a thin line in the colour of its condition, and a red cross is where
+    one ended before its goal.
+    """
+    references = {route: max((drive.reference_m for drive in drives), key=len) for route, drives in routes.items()}
+    turned = {route: _turned(reference_m) for route, reference_m in references.items()}
+    extents = {route: _extent(turned[route](reference_m)) for route, reference_m in references.items()}
+    heights = [min(max(high / width, 0.12), 0.7) for width, high in extents.values()]
+    figure = new_figure(7.2 * sum(heights) + 0.75 * len(heights) + 0.4)
+    panels = figure.subplots(len(routes), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (route, drives) in zip(panels, routes.items(), strict=True):
+        turn, reference_m = turned[route], turned[route](references[route])
+        axes.plot(reference_m[:, 0], reference_m[:, 1], color="black", linewidth=3.5, solid_capstyle="butt")
+        ends = []
+        for drive in drives:
+            rows = drawn_points(drive.truth.floats("progress_m"))
+            way_m = turn(np.column_stack([drive.truth.floats("x_m")[rows], drive.truth.floats("y_m")[rows]]))
+            axes.plot(way_m[:, 0], way_m[:, 1], color=colours[drive.condition], linewidth=0.7)
+            if drive.result["ending"] != "completed":
+                ends.append(way_m[-1])
+        if ends:
+            axes.plot(*np.transpose(ends), **CROSS)
+        tidy(axes, "", "m", f"Route {route}, {len(drives)} runs")
+        axes.set_aspect("equal", adjustable="datalim")
+    panels[-1].set_xlabel("m")
+    _legend(figure, routes, colours)
+    return figure
+
+
+def _turned(reference_m: FloatArray) -> Any:
+    """Give what moves and turns points (n, 2) so that the reference lies along x: a narrow panel shows more of it."""
+    if len(reference_m) < 2:
+        return lambda points_m: points_m
+    middle_m = reference_m.mean(axis=0)
+    axes = np.linalg.svd(reference_m - middle_m, full_matrices=False)[2]
+    axes[0] *= np.sign(axes[0] @ (reference_m[-1] - reference_m[0])) or 1.0
+    rotation = np.array([axes[0], [-axes[0, 1], axes[0, 0]]])
+    first_m = reference_m[0]
+    return lambda points_m: (points_m - first_m) @ rotation.T
+
+
+def _extent(points_m: FloatArray) -> tuple[float, float]:
+    if len(points_m) < 2:
+        return 1.0, 0.5
+    width_m, height_m = np.ptp(points_m, axis=0) + 12.0
+    return float(width_m), float(height_m)
+
+
+def cross_track_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) -> Figure:
+    """Draw how far each drive was from the lane's centre over the distance along its route, one panel a route."""
+    columns = min(2, len(routes))
+    rows = -(-len(routes) // columns)
+    figure = new_figure(1.9 * rows + 0.6)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes in panels.flat[len(routes) :]:
+        axes.axis("off")
+    for axes, (route, drives) in zip(panels.flat, routes.items(), strict=False):
+        axes.axhline(0, color="black", linewidth=2)
+        ends = []
+        for drive in drives:
+            progress_m, error_m = drive.truth.floats("progress_m"), drive.truth.floats("cross_track_m")
+            shown = drawn_points(progress_m)
+            axes.plot(progress_m[shown], error_m[shown], color=colours[drive.condition], linewidth=0.7)
+            if drive.result["ending"] != "completed":
+                ends.append((progress_m[-1], error_m[-1]))
+        if ends:
+            axes.plot(*np.transpose(ends), **CROSS)
+        tidy(axes, "", "", f"Route {route}")
+    for axes in panels.flat[max(len(routes) - columns, 0) : len(routes)]:
+        axes.set_xlabel("distance along the route (m)")
+    figure.supylabel("left of lane centre (m)", fontsize=10)
+    _legend(figure, routes, colours)
+    return figure
+
+
+def _legend(figure: Figure, routes: Mapping[str, Sequence[Drive]], colours: Colours) -> None:
+    names = sorted({drive.condition for drives in routes.values() for drive in drives})
+    reference = Line2D([], [], color="black", linewidth=3.5, label="lane centre")
+    legend_below(figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **CROSS)])
+
+
+def time_figure(drives: Sequence[Drive], colours: Colours) -> Figure:
+    """Steering and cross-track error over time, one row a drive."""
+    figure = new_figure(1.35 * len(drives) + 0.6)
+    rows = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)
+    for row, drive in zip(rows, drives, strict=True):
+        time_s = (drive.truth.ints("mono_ns") - drive.began_ns) / NS_PER_S
+        colour = colours[drive.condition]
+        row[0].plot(time_s, np.degrees(drive.truth.floats("steering_rad")), color=colour, linewidth=1)
+        row[1].plot(time_s, drive.truth.floats("cross_track_m"), color=colour, linewidth=1)
+        tidy(row[0], "", "steering (°)", f"{drive.condition}, {drive.result['ending']}")
+        tidy(row[1], "", "left (m)")
+    for axes in rows[-1]:
+        axes.set_xlabel("time (s)")
+    return figure
+
+
+def frames_figure(pictures: Sequence[tuple[str, Picture]]) -> Figure:
+    """Received pictures side by side, each with a line of text."""
+    columns = min(2, len(pictures))
+    rows = -(-len(pictures) // columns)
+    figure = new_figure(3.1 * rows)
+    for axes in figure.subplots(rows, columns, squeeze=False).flat:
+        axes.axis("off")
+    for axes, (text, picture) in zip(figure.axes, pictures, strict=False):
+        axes.imshow(picture[:, :, ::-1])
+        axes.set_title(text, fontsize=9, loc="left")
+    return figure

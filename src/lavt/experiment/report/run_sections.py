@@ -1,0 +1,169 @@
+"""The sections of a report that are made of single runs: where they went, what was seen, on what machine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from lavt.domain import Picture
+from lavt.experiment.analysis.drive_data import Drive, capture_to_stamp_ms, one_of_each_condition, read_drive
+from lavt.experiment.report import html_page
+from lavt.experiment.report.files import save_figure, save_table
+from lavt.experiment.report.groups import differing, is_of, title_of
+from lavt.experiment.report.run_figures import cross_track_figure, frames_figure, time_figure, trajectories_figure
+from lavt.experiment.report.sections import Parts, Report
+from lavt.experiment.report.table_format import html_of
+from lavt.experiment.report.tables import machine_table
+from lavt.experiment.statistics.conditions import road_of, stem_of
+from lavt.recording.record import read_record
+
+SHOWN_FRAMES = 4
+
+DRAWN_GROUPS = 4
+"""Of more groups than these only the runs of the base config are drawn, or of the first group where there are none."""
+
+PANELS = 3
+"""Routes in one figure of trajectories: the paper's three key parts, and its three whole routes."""
+
+
+DriveSets = Mapping[tuple[str, str], Sequence[Drive]]
+"""Drives by kind of time and title of their group: what may be drawn into one figure."""
+
+Runs = Sequence[tuple[Path, Mapping[str, object]]]
+
+
+def drawn_runs(report: Report, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
+    """Choose the runs whose drives are drawn, by kind of time and title of their group.
+
+    `runs` has directories, and entries of the summary's `runs`.
+    """
+    groups, names = report.groups, differing(report.groups)
+    if len(groups) > DRAWN_GROUPS:
+        groups = report.base or groups[:1]
+    recorded = [run for run in runs if (run[0] / "server.mcap").is_file()]
+    chosen = {("virtual", title_of(group, names)): group for group in groups}
+    virtual = [run for run in recorded if run[1]["time"] == "virtual"]
+    sets = {key: [run for run in virtual if is_of(run[1], group)] for key, group in chosen.items()}
+    sets["real", ""] = [run for run in recorded if run[1]["time"] == "real"]
+    return {key: members for key, members in sets.items() if members}
+
+
+def read_drives(
+    sets: Mapping[tuple[str, str], Runs], known: Mapping[Path, Drive]
+) -> dict[tuple[str, str], list[Drive]]:
+    """Read the drives that are not `known` yet."""
+    return {
+        key: [known.get(directory) or read_drive(directory, run) for directory, run in members]
+        for key, members in sets.items()
+    }
+
+
+def trajectory_parts(report: Report, sets: DriveSets) -> Parts:
+    """Draw all drives: key parts of routes in one figure, whole routes in another, and their error over the way."""
+    parts = []
+    for (kind, title), drives in sets.items():
+        routes: dict[str, list[Drive]] = {}
+        for drive in sorted(drives, key=lambda drive: str(drive.result["route"])):
+            if len(drive.truth):
+                routes.setdefault(str(drive.result["route"]), []).append(drive)
+        which = f"{kind} time{f', {title}' if title else ''}"
+        suffix = "_".join(word for word in (kind, html_page.slug(title)) if word)
+        for name, shown in _figures_of(list(routes)):
+            figure = trajectories_figure({route: routes[route] for route in shown}, report.colours)
+            caption = f"Every run from above, turned to fit; {which}. A red cross is where one ended before its goal."
+            alternative = f"trajectories on the routes {', '.join(shown)}"
+            parts.append(save_figure(report.directory, f"trajectories_{name}_{suffix}", figure, alternative, caption))
+        if routes:
+            caption = f"Distance from the lane's centre over the way, {which}."
+            figure = cross_track_figure(routes, report.colours)
+            parts.append(save_figure(report.directory, f"cross_track_{suffix}", figure, "cross-track error", caption))
+    return parts
+
+
+def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
+    """Say which routes share a figure: key parts first, `PANELS` in each."""
+    kinds = {
+        "key": [route for route in routes if road_of(route) != stem_of(route)],
+        "whole": [route for route in routes if road_of(route) == stem_of(route)],
+    }
+    return [
+        (f"{name}{begin // PANELS + 1 if begin else ''}", members[begin : begin + PANELS])
+        for name, members in kinds.items()
+        for begin in range(0, len(members), PANELS)
+    ]
+
+
+def single_run_parts(report: Report, sets: DriveSets) -> Parts:
+    """Show one run of each condition over time, and the pictures that the client received; a kind of time each."""
+    parts = []
+    for kind, drives in _first_sets(sets).items():
+        chosen = one_of_each_condition(drives)
+        driven = [drive for drive in chosen if len(drive.truth)]
+        if driven:
+            names = ", ".join(str(drive.result["run"]) for drive in driven)
+            caption = (
+                f"Road wheel angle and distance from the lane's centre over time, left positive; {kind} time, one run "
+                f"of each condition: {names}."
+            )
+            figure = time_figure(driven, report.colours)
+            parts.append(save_figure(report.directory, f"time_{kind}", figure, "steering over time", caption))
+        pictures = received_pictures(chosen[0].directory / "client.mcap")
+        if pictures:
+            caption = (
+                f"Pictures as the client received them, run {chosen[0].result['run']}; the stamp is at the top left."
+            )
+            figure = frames_figure(pictures)
+            parts.append(save_figure(report.directory, f"frames_{kind}", figure, "received pictures", caption))
+    return parts
+
+
+def _first_sets(sets: DriveSets) -> dict[str, Sequence[Drive]]:
+    """Give the first set of either kind of time."""
+    first: dict[str, Sequence[Drive]] = {}
+    for (kind, _), drives in sets.items():
+        first.setdefault(kind, drives)
+    return first
+
+
+def captured_ms(sets: DriveSets) -> dict[str, dict[str, float | None]]:
+    """Tell by kind of time and condition how long a frame's stamp came after its exposure, of one run each."""
+    return {
+        kind: {
+            drive.condition: capture_to_stamp_ms(drive.directory / "server.mcap")
+            for drive in one_of_each_condition(drives)
+        }
+        for kind, drives in _first_sets(sets).items()
+    }
+
+
+def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
+    """Decode the video as the client received it, and choose `SHOWN_FRAMES` pictures, evenly spread; [] without one."""
+    units = read_record(client_record, channels=()).video() if client_record.is_file() else []
+    if not units:
+        return []
+    from lavt.transport.video.h264 import Decoder  # noqa: PLC0415 (a report without pictures needs no codec)
+
+    shown = {len(units) * (2 * index + 1) // (2 * SHOWN_FRAMES) for index in range(SHOWN_FRAMES)}
+    decoder = Decoder()
+    pictures: list[tuple[str, Picture]] = []
+    for index, (stamp_ns, unit) in enumerate(units):
+        decoded = decoder.decode(unit)
+        if index in shown and decoded is not None:
+            pictures.append((f"{(stamp_ns - units[0][0]) / 1e9:.1f} s", decoded.picture))
+    return pictures
+
+
+def machine_parts(report: Report, sets: DriveSets) -> Parts:
+    """Show versions and machine as the drawn runs recorded them; runs that agree share a table."""
+    drives = [drive for members in sets.values() for drive in members]
+    by_text: dict[str, tuple[Drive, int]] = {}
+    for drive in drives:
+        html = html_of(machine_table(drive.annotations))
+        first, many = by_text.get(html, (drive, 0))
+        by_text[html] = (first, many + 1)
+    parts = []
+    for number, (first, many) in enumerate(by_text.values(), start=1):
+        text = f"{many} of the {len(report.summary['runs'])} runs, the first of them {first.result['run']}:"
+        table = machine_table(first.annotations)
+        parts += [html_page.paragraph(text, note=True), save_table(report.directory, f"machine_{number}", table)]
+    return parts

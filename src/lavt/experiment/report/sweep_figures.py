@@ -1,0 +1,164 @@
+"""Figures of many runs: how far they came, how they ended, and what an axis of the sweep does. Nothing reads a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lavt.experiment.report.figure_style import Colours, Conditions, condition_handles, legend_below, new_figure, tidy
+from lavt.experiment.report.groups import Group, short
+
+ENDING_DASHES: Mapping[str, Any] = {
+    "collision": "solid",
+    "off_road": (0, (4, 2)),
+    "safe_stop": (0, (1, 1.5)),
+    "timeout": (0, (6, 1.5, 1, 1.5)),
+}
+
+MOST_BANDS = 2
+MOST_TICKS = 8
+
+AXIS_ROWS = (
+    ("runs completed (%)", "completion_rate", 100.0),
+    ("error, mean P95 (m)", "p95_m", 1.0),
+    ("picture age (ms)", "picture_age_ms", 1.0),
+)
+"""What is drawn over an axis of a sweep: label, key of a condition, unit."""
+
+
+def routes_with_survival(conditions: Conditions) -> list[str]:
+    """Name the routes of which any condition knows how far its runs came."""
+    return sorted({route for entry in conditions.values() for route in entry.get("survival") or {}})
+
+
+def survival_figure(conditions: Conditions, colours: Colours) -> Figure:
+    """How many runs are still driving after each distance: a panel a route, a line a condition.
+
+    Of a few conditions the 95 % intervals are drawn, too; those of more would hide each other.
+    """
+    routes = routes_with_survival(conditions)
+    figure, panels = _panels(len(routes))
+    for axes, route in zip(panels, routes, strict=True):
+        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
+            curve = (entry.get("survival") or {}).get(route)
+            if not curve or not curve["distance_m"]:
+                continue
+            distance_m = curve["distance_m"]
+            low, high, surviving = (np.array(curve[key], np.float64) * 100 for key in ("low", "high", "surviving"))
+            if len(conditions) <= MOST_BANDS:
+                axes.fill_between(distance_m, low, high, step="post", color=colours[name], alpha=0.15, linewidth=0)
+            axes.step(distance_m, surviving, where="post", color=colours[name], linewidth=width)
+        tidy(axes, "", "", f"Route {route}")
+        axes.set_ylim(-4, 104)
+    _label_lowest(panels, "distance driven (m)")
+    figure.supylabel("runs still driving (%)", fontsize=10)
+    legend_below(figure, list(condition_handles(conditions, colours)))
+    return figure
+
+
+def incidence_figure(conditions: Conditions, colours: Colours) -> Figure:
+    """What share of the runs has ended in each way by each distance: a panel a route, a dash an ending."""
+    routes = routes_with_survival(conditions)
+    figure, panels = _panels(len(routes))
+    shown: dict[str, Any] = {}
+    for axes, route in zip(panels, routes, strict=True):
+        for (name, entry), width in zip(conditions.items(), _widths(len(conditions)), strict=True):
+            curve = (entry.get("survival") or {}).get(route) or {"incidence": {}}
+            for ending, incidence in (curve.get("incidence") or {}).items():
+                if any(incidence):
+                    shown[ending] = ENDING_DASHES.get(ending, "solid")
+                    style = {"color": colours[name], "linestyle": shown[ending], "linewidth": width}
+                    axes.step(curve["distance_m"], np.array(incidence, np.float64) * 100, where="post", **style)
+        tidy(axes, "", "", f"Route {route}")
+        axes.set_ylim(-4, 104)
+    _label_lowest(panels, "distance driven (m)")
+    figure.supylabel("runs that ended so (%)", fontsize=10)
+    endings = [Line2D([], [], color="0.3", linestyle=dash, label=ending) for ending, dash in shown.items()]
+    legend_below(figure, [*condition_handles(conditions, colours), *endings])
+    return figure
+
+
+def _widths(many: int) -> list[float]:
+    """Give the width of each line: those drawn first are wider, so that one under another can be seen."""
+    return [float(width) for width in np.linspace(4.0 if many > 1 else 1.2, 1.2, many)]
+
+
+def _label_lowest(panels: Sequence[Axes], label: str) -> None:
+    for axes in panels[-3:]:
+        axes.set_xlabel(label)
+
+
+def _panels(many: int) -> tuple[Figure, list[Axes]]:
+    """Begin a figure of small panels of one scale, three beside each other."""
+    columns = min(3, many)
+    rows = -(-many // columns)
+    figure = new_figure(2.0 * rows + 0.7)
+    every = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    for axes in every[many:]:
+        axes.axis("off")
+    return figure, every[:many]
+
+
+def axis_figure(groups: Sequence[Group], axes_names: Sequence[str], colours: Colours) -> Figure:
+    """What one or two axes of a sweep do: the first on x, a column of panels for each value of the second.
+
+    Lines are conditions; the rows are completion, error and picture age, as far as they are known.
+    """
+    along, *second = axes_names
+    places, labels = _places([group.get(along) for group in groups])
+    columns = list(dict.fromkeys(str(group.get(second[0])) for group in groups)) if second else [""]
+    names = sorted({name for group in groups for name in group["conditions"]})
+    rows = [
+        row
+        for row in AXIS_ROWS
+        if any(_has(entry, row[1]) for group in groups for entry in group["conditions"].values())
+    ]
+    figure = new_figure(1.9 * len(rows) + 0.8, width_in=max(5.5, min(2.6 * len(columns) + 0.6, 13)))
+    panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey="row")
+    for column, value in enumerate(columns):
+        members = [group for group in groups if not second or str(group.get(second[0])) == value]
+        title = f"{short(second[0])} {value}" if second else ""
+        for row, (label, key, unit) in enumerate(rows):
+            axes = panels[row, column]
+            for name, width in zip(names, _widths(len(names)), strict=True):
+                points = sorted(
+                    (places[str(group.get(along))], _value(group["conditions"][name], key) * unit)
+                    for group in members
+                    if name in group["conditions"] and _has(group["conditions"][name], key)
+                )
+                if points:
+                    x, y = zip(*points, strict=True)
+                    axes.plot(x, y, marker="o", markersize=width + 2.5, linewidth=width, color=colours[name])
+            tidy(axes, "", label if column == 0 else "", title if row == 0 else "")
+            if labels or len(places) <= MOST_TICKS:
+                axes.set_xticks(list(places.values()), labels or list(places))
+    for axes in panels[:, 0]:
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    panels[0, 0].set_ylim(-5, 105)
+    for axes in panels[-1]:
+        axes.set_xlabel(short(along))
+    legend_below(figure, list(condition_handles(names, colours)))
+    return figure
+
+
+def _has(entry: Mapping[str, Any], key: str) -> bool:
+    value = entry.get(key)
+    return (value.get("mean") if isinstance(value, Mapping) else value) is not None
+
+
+def _value(entry: Mapping[str, Any], key: str) -> float:
+    value = entry[key]
+    return float(value["mean"] if isinstance(value, Mapping) else value)
+
+
+def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[str]]:
+    """Say where each value stands on x: numbers at themselves, others side by side, with these labels."""
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return {str(value): float(value) for value in values}, []
+    labels = list(dict.fromkeys(str(value) for value in values))
+    return {label: float(index) for index, label in enumerate(labels)}, labels

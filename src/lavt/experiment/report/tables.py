@@ -1,0 +1,394 @@
+"""The tables of a report, as data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lavt.experiment.analysis.stage_latency import AFTER_LOOP
+from lavt.experiment.report.figure_style import Conditions
+from lavt.experiment.report.groups import Group, short
+from lavt.experiment.report.table_format import (
+    NOTHING,
+    UNBROKEN,
+    Column,
+    TableData,
+    intervals,
+    latencies,
+    number,
+    numbers,
+    percent,
+    probabilities,
+    share_intervals,
+    shares,
+    with_bound,
+    words,
+)
+
+FLOWS = ("video", "control")
+
+COMPLETED_P95 = "p95 m, completed runs"
+COMMON_P95 = "p95 m, to the common distance"
+
+AFTERWARDS = ", after the loop"
+
+ENDED_EARLY = "ended early"
+"""What a quantile is over all runs where it lies among those that were not completed."""
+
+FIDELITY_SAYS = {
+    "video": "network and clocks are modelled, pictures, codec and packets are real",
+    "pixels": "network, clocks and codec are modelled, pictures are real",
+    "geometry": "network, clocks, codec, camera and perception are modelled, the lane is seen without fault",
+}
+
+
+def how_it_was_driven(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Say in words whether time was real, what was modelled, and who injected the delay."""
+    ways = {(run["time"], run.get("fidelity") or "video", run["injection"]) for run in runs}
+    return "; ".join(
+        f"virtual time, fidelity {fidelity}: {FIDELITY_SAYS[fidelity]}"
+        if time == "virtual"
+        else f"real time, {'nothing injected' if injection == 'none' else f'injected by {injection}'}"
+        for time, fidelity, injection in sorted(ways, key=str)
+    )
+
+
+def paper_beside(conditions: Conditions, paper: Conditions) -> Conditions:
+    """Choose the paper's conditions that are ours, too: same name, and the same delay injected."""
+    return {
+        name: paper[name]
+        for name, entry in conditions.items()
+        if name in paper and all(entry["injected_ms"][flow] == paper[name]["injected_ms"][flow] for flow in FLOWS)
+    }
+
+
+def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
+    """What was injected and what was measured, ours and the paper's: one row a condition."""
+    columns = [
+        words("condition"),
+        numbers("injected into video ms", 0),
+        numbers("into control ms", 0),
+        latencies("τ video ms", bounded=True),
+        numbers("the paper's τ video ms", 0),
+        latencies("τ control ms", bounded=True),
+        numbers("the paper's τ control ms", 0),
+        latencies("loop ms"),
+        numbers("the paper's τ video + τ control ms", 0),
+        numbers("picture age, mean ms", 0),
+        numbers("picture age, p95 ms", 0),
+        latencies("age when a command is applied ms"),
+    ]
+    rows = []
+    for name, entry in conditions.items():
+        its = paper.get(name, {})
+        total_ms = its["tau_v_ms"] + its["tau_c_ms"] if its else None
+        age_ms = entry.get("picture_age_ms") or {}
+        rows.append(
+            [
+                name,
+                entry["injected_ms"]["video"],
+                entry["injected_ms"]["control"],
+                entry["tau_v_ms"],
+                its.get("tau_v_ms"),
+                entry["tau_c_ms"],
+                its.get("tau_c_ms"),
+                entry["loop_ms"],
+                total_ms,
+                age_ms.get("mean"),
+                age_ms.get("p95"),
+                entry.get("age_at_actuation_ms"),
+            ]
+        )
+    return TableData(columns, rows).without_empty()
+
+
+def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
+    """How the runs ended, ours and the paper's: one row a condition."""
+    columns = [
+        words("condition"),
+        numbers("runs", 0),
+        shares("completed"),
+        share_intervals("95 %, these routes"),
+        share_intervals("range over such roads"),
+        shares("the paper's completed"),
+        share_intervals("the paper's 95 %"),
+        numbers("collisions / run", 2),
+        numbers("the paper's collisions / run", 2),
+        numbers("collisions / km", 2),
+        numbers("lane invasions / run", 2),
+        numbers("the paper's lane invasions / run", 2),
+        numbers("lane invasions / km", 1),
+        words("endings"),
+    ]
+    rows = []
+    for name, entry in conditions.items():
+        its = paper.get(name, {})
+        endings = ", ".join(f"{many} {ending}" for ending, many in (entry.get("endings") or {}).items())
+        rows.append(
+            [
+                name,
+                entry["runs"],
+                entry["completion_rate"],
+                entry["completion_interval"],
+                entry.get("completion_such_roads"),
+                its.get("completion_rate"),
+                its.get("completion_interval"),
+                entry["collisions_per_run"],
+                its.get("collisions_per_run"),
+                entry.get("collisions_per_km"),
+                entry["lane_invasions_per_run"],
+                its.get("lane_invasions_per_run"),
+                entry.get("lane_invasions_per_km"),
+                endings or None,
+            ]
+        )
+    return TableData(columns, rows).without_empty()
+
+
+def error_table(conditions: Conditions, paper: Conditions) -> TableData:
+    """How well the lane was kept, P95 three ways, ours and the paper's: one row a condition."""
+    columns = [
+        words("condition"),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        intervals("its 95 % interval m"),
+        numbers("the paper's p95 m", 2),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
+        intervals("95 % interval of that m"),
+        Column("p95 m, all runs ranked", _quartiles, ("p25", "p50", "p75")),
+        numbers("mean error m", 2),
+        numbers("rms m, mean of runs", 2),
+        numbers("maximum m, mean of runs", 2),
+        numbers("heading rms rad", 3),
+        numbers("steering reversals / s", 2),
+        numbers("oscillation Hz", 2),
+    ]
+    measured = ("mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz")
+    rows = [
+        [
+            name,
+            entry["p95_m"],
+            entry["p95_interval"],
+            paper.get(name, {}).get("p95_m"),
+            entry.get("p95_common_m"),
+            entry.get("p95_common_interval"),
+            entry.get("p95_worst_rank_m"),
+            *(entry.get(key) for key in measured),
+        ]
+        for name, entry in conditions.items()
+    ]
+    return TableData(columns, rows).without_empty()
+
+
+def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
+    """Write the median and both quartiles."""
+    if quartiles is None:
+        return NOTHING
+    low, middle, high = (
+        ENDED_EARLY if quartiles[name] is None else number(quartiles[name], 2) for name in ("p25", "p50", "p75")
+    )
+    return middle if low == middle == high else f"{middle} ({low} to {high})".replace(" ", UNBROKEN)
+
+
+def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> TableData:
+    """The planned contrasts, ours by McNemar's test on pairs and the paper's by Fisher's on counts."""
+    columns = [
+        words("contrast"),
+        numbers("pairs", 0),
+        numbers("completed under the first only", 0),
+        numbers("under the second only", 0),
+        probabilities("p"),
+        probabilities("p, Holm"),
+        probabilities("the paper's p"),
+        probabilities("the paper's p, Holm"),
+    ]
+    its = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
+    rows = []
+    for contrast in contrasts:
+        theirs = its.get((contrast["a"], contrast["b"]), {})
+        ours = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
+        rows.append([f"{contrast['a']} – {contrast['b']}", *ours, theirs.get("p"), theirs.get("p_holm")])
+    return TableData(columns, rows).without_empty()
+
+
+def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
+    """One row for each condition of each group, which the settings `names` tell apart."""
+    columns = [
+        *(words(short(name)) for name in names),
+        words("condition"),
+        numbers("runs", 0),
+        shares("completed"),
+        share_intervals("95 % interval"),
+        numbers("collisions / run", 2),
+        numbers("lane invasions / run", 2),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
+        numbers("loop ms, median"),
+        numbers("picture age, mean ms", 0),
+    ]
+    rows = [
+        [
+            *(group.get(key) for key in names),
+            name,
+            entry["runs"],
+            entry["completion_rate"],
+            entry["completion_interval"],
+            entry["collisions_per_run"],
+            entry["lane_invasions_per_run"],
+            entry["p95_m"],
+            entry.get("p95_common_m"),
+            entry["loop_ms"]["p50"],
+            (entry.get("picture_age_ms") or {}).get("mean"),
+        ]
+        for group in groups
+        for name, entry in group["conditions"].items()
+    ]
+    return TableData(columns, rows).without_empty()
+
+
+def route_table(conditions: Conditions) -> TableData:
+    """One row for each condition on each route."""
+    columns = [
+        words("route"),
+        words("condition"),
+        numbers("runs", 0),
+        numbers("completed", 0),
+        shares("share"),
+        share_intervals("95 % interval"),
+        numbers(f"{COMPLETED_P95}, mean of runs", 2),
+        numbers(f"{COMMON_P95}, mean of runs", 2),
+    ]
+    keys = ("runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m")
+    routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
+    rows = [
+        [route, name, *(entry["routes"][route].get(key) for key in keys)]
+        for route in routes
+        for name, entry in conditions.items()
+        if route in (entry.get("routes") or {})
+    ]
+    return TableData(columns, rows)
+
+
+def route_overview(conditions: Conditions) -> TableData:
+    """How many of the runs were completed: one row a route, one column a condition."""
+    routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
+    columns = [words("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
+    rows = [
+        [route, *(_completed((entry.get("routes") or {}).get(route)) for entry in conditions.values())]
+        for route in routes
+    ]
+    return TableData(columns, rows)
+
+
+def _completed(entry: Mapping[str, Any] | None) -> str | None:
+    return None if entry is None else f"{entry['completed']} of {entry['runs']}"
+
+
+def survival_table(conditions: Conditions) -> TableData:
+    """Where each step of each survival curve is: long, for computing and drawing with something else."""
+    columns = [
+        words("route"),
+        words("condition"),
+        numbers("distance m", 1),
+        shares("still driving"),
+        share_intervals("95 % interval"),
+        words("ended so far"),
+    ]
+    rows = []
+    for name, entry in conditions.items():
+        for route, curve in (entry.get("survival") or {}).items():
+            steps = zip(curve["distance_m"], curve["surviving"], curve["low"], curve["high"], strict=True)
+            for index, (distance_m, surviving, low, high) in enumerate(steps):
+                ended = ", ".join(f"{ending} {percent(each[index])}" for ending, each in curve["incidence"].items())
+                rows.append([route, name, distance_m, surviving, (low, high), ended or None])
+    return TableData(columns, rows)
+
+
+def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
+    """One row a run: what it was, how it ended, and whether it may count."""
+    columns = [
+        words("run"),
+        words("sweep"),
+        words("time"),
+        words("route"),
+        words("condition"),
+        words("preset"),
+        words("ending"),
+        numbers("distance m", 0),
+        numbers("loop ms"),
+        numbers("p95 error m", 2),
+        numbers("picture age, mean ms", 0),
+        words("validity", is_long=True),
+    ]
+    rows = [
+        [
+            run["run"],
+            run.get("sweep"),
+            f"{run['time']}, {run.get('fidelity') or 'video'}, {run['injection']}",
+            run["route"],
+            run["condition"],
+            run.get("preset"),
+            run["ending"],
+            run["distance_m"],
+            run["loop_ms"]["p50"],
+            run["p95_m"],
+            (run.get("picture_age_ms") or {}).get("mean"),
+            "valid" if run["valid"] else "not valid: " + "; ".join(run["invalid_because"]),
+        ]
+        for run in runs
+    ]
+    return TableData(columns, rows).without_empty()
+
+
+def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
+    """One row for each run whose two sides had clocks of their own: Delta, who says it, and what the probe says."""
+    parts = ("", "bound")
+    columns = [
+        words("run"),
+        words("Delta by"),
+        Column("Delta ms", lambda cell: with_bound(*cell, digits=3), parts),
+        numbers("drift ppm", 2),
+        Column("by the probe ms", lambda cell: with_bound(*cell, digits=3), parts),
+    ]
+    rows = [
+        [
+            run["run"],
+            run["delta"]["source"],
+            (run["delta"]["ms"], run["delta"]["bound_ms"]),
+            run["delta"]["drift_ppm"],
+            (run["delta"]["probe_ms"], run["delta"]["probe_bound_ms"]),
+        ]
+        for run in runs
+    ]
+    return TableData(columns, rows)
+
+
+def hop_table(
+    hops: Mapping[str, Sequence[Mapping[str, Any]]], captured_ms: Mapping[str, float | None] | None = None
+) -> TableData:
+    """One row a hop in the order of a frame's life, one column a condition: medians in ms.
+
+    `captured_ms` is how long a frame's stamp came after its exposure: the first row, though the loop begins after it.
+    """
+    names = list(dict.fromkeys((hop["node"], hop["hop"]) for every in hops.values() for hop in every))
+    durations = [{(hop["node"], hop["hop"]): hop["p50"] for hop in every} for every in hops.values()]
+    known = captured_ms or {}
+    before: list[Any] = [known.get(name) for name in hops]
+    show = numbers("", 2).show
+    columns = [words("hop, median ms"), *(Column(name, show) for name in hops)]
+    rows = [
+        [f"{node}: {hop}{AFTERWARDS if (node, hop) in AFTER_LOOP else ''}", *(of.get((node, hop)) for of in durations)]
+        for node, hop in names
+    ]
+    return TableData(columns, [["camera: capture to stamp, before the loop", *before], *rows])
+
+
+def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
+    """Show what a run's record says of versions and machine."""
+    columns = [words("of"), words("what", is_long=True), words("value", is_long=True)]
+    rows = [
+        [name, key, value]
+        for name in sorted(annotations)
+        for key, value in annotations[name].items()
+        if key != "condition"  # which is told of each run, and no matter of the machine
+    ]
+    return TableData(columns, rows or [["not recorded", None, None]])

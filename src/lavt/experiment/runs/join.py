@@ -1,0 +1,99 @@
+"""Two machines' directories made into one run directory: what `lavt server` and `lavt client` left of a drive."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from lavt.config import ClientConfig, NetworkConfig, RunConfig, ServerConfig, VideoConfig
+from lavt.config_file import condition, load_config
+from lavt.errors import UserError
+from lavt.experiment.analysis.latency import frames_within
+from lavt.experiment.analysis.metrics import driving_interval
+from lavt.experiment.runs.plan import injected_entry
+from lavt.experiment.runs.run import CONFIG, NETWORK, compute_result
+from lavt.recording.output_directory import check_directory, make_directory
+from lavt.recording.record import read_record
+from lavt.recording.table import MISSING
+
+SIDES = ("server", "client")
+
+
+def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
+    """Make the run directory `out` of what two sides wrote, compute its result, and give that.
+
+    Raises `UserError` where a directory is not that of its side, or the two were not written in the same drive.
+    """
+    check_directory(out)
+    for side, directory in zip(SIDES, (server_dir, client_dir), strict=True):
+        for name in (CONFIG, f"{side}.mcap"):
+            if not (directory / name).is_file():
+                raise UserError(f"{directory} holds no {name}: name the --out of `lavt {side}`")
+    server, client = load_config(ServerConfig, server_dir / CONFIG), load_config(ClientConfig, client_dir / CONFIG)
+    _check_same_drive(server_dir / "server.mcap", client_dir / "client.mcap")
+    run = run_config(server, client)
+    make_directory(out)
+    (out / CONFIG).write_text(yaml.safe_dump(run.model_dump(mode="json"), sort_keys=False))
+    for side, directory in zip(SIDES, (server_dir, client_dir), strict=True):
+        shutil.copyfile(directory / f"{side}.mcap", out / f"{side}.mcap")
+        shutil.copyfile(directory / CONFIG, out / f"{side}.yaml")
+    return compute_result(out, _identity(out.name, run, client), None)
+
+
+def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
+    """Give the config of the run that two sides have driven, as if it had been one machine's."""
+    asked = client.injection
+    return RunConfig(
+        vehicle=server.vehicle,
+        controller=client.controller,
+        camera=server.camera,
+        video=VideoConfig(
+            **{key: getattr(server.video, key) for key in VideoConfig.model_fields}
+            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client's is the one in force
+        ),
+        network=NetworkConfig(
+            condition=asked.condition or "L0",
+            injection="netem" if asked.condition else "none",
+            state_delay=asked.state_delay,
+        ),
+        safety=server.safety,
+        record=server.record,
+        time="real",
+        seed=server.seed,
+    )
+
+
+def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]:
+    asked = condition(run.network.condition)
+    return {
+        "run": name,
+        "time": "real",
+        "fidelity": "video",
+        "injection": run.network.injection,
+        "inherent": NETWORK,
+        "route": run.vehicle.route,
+        "condition": run.network.condition if client.injection.condition else "none",
+        "controller": run.controller.kind,
+        "preset": run.controller.settings,
+        "driver": run.controller.kind,
+        "repetition": 0,
+        "seed": run.seed,
+        **injected_entry(asked),
+    }
+
+
+def _check_same_drive(server: Path, client: Path) -> None:
+    """Raise `UserError` where the client has read no stamp that the server wrote while it was driven."""
+    vehicle = read_record(server, channels=("event", "frame"))
+    began_ns, ended_ns, _ = driving_interval(vehicle)
+    written = frames_within(vehicle.table("frame"), began_ns, ended_ns).ints("stamp_ns")
+    read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
+    if not np.isin(read[read != MISSING], written).any():
+        raise UserError(
+            f"{client} has no picture of {server}: name two directories of the same drive; of a server that was "
+            "driven several times only the first drive is joined"
+        )

@@ -1,0 +1,98 @@
+"""What the network of a run does: the latency that is there anyway, and what is injected, as laws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from lavt.assembly.links import injected
+from lavt.config import Condition, Costs
+from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.link import Injected
+
+US_PER_MS = 1000.0
+
+STAMP_TO_STAMP = (
+    ("camera", "stamp"),
+    ("camera", "encode"),
+    ("camera", "packetize"),
+    ("driver", "wait_access_unit"),
+    ("driver", "decode"),
+    ("driver", "read_stamp"),
+)
+"""Hops that tau_v contains: a profile's link delay is its total less these."""
+SENT_TO_RECEIVED = (("driver", "command"),)
+"""Hops that tau_c contains."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inherent:
+    """A named profile of the latency that is there without injection: the whole of tau_v and tau_c."""
+
+    video_ms: float
+    video_jitter: Lognormal
+    control_ms: float
+
+
+INHERENT = {
+    # The paper's WiFi 5: tau_v with median 62 and 95th percentile 86 ms, tau_c of 8 to 10 ms.
+    "paper_wifi5": Inherent(50.0, Lognormal(12.0, 0.668), 9.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """How long things take: video, state (server to client), control (client to server), and what is never held.
+
+    A constant delay that is injected is part of these. Where more is, all that is injected is beside them.
+    """
+
+    video: DelayLaw
+    control: DelayLaw
+    state: DelayLaw
+    unheld: DelayLaw
+    video_injected: Injected | None = None
+    control_injected: Injected | None = None
+
+
+def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> Network:
+    """Give what must be injected on a loopback to have `condition` on top of the inherent `profile`.
+
+    `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition
+    that contradicts itself, and for a trace that is missing or wrong.
+    """
+    inherent = INHERENT.get(profile)
+    video_ms, jitter, control_ms = 0.0, None, 0.0
+    if inherent is not None:
+        video_ms = inherent.video_ms - costs.links_us["video"] / US_PER_MS - _hops_ms(costs, STAMP_TO_STAMP)
+        jitter = inherent.video_jitter
+        control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _hops_ms(costs, SENT_TO_RECEIVED)
+    state_ms = condition.video_ms if state_delay == "with_video" else 0.0
+    video = injected("video", condition.video_ms, condition.video, seed)
+    control = injected("control", condition.control_ms, condition.control, seed)
+    return Network(
+        DelayLaw(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
+        DelayLaw(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
+        DelayLaw(max(0.0, control_ms) + state_ms),
+        DelayLaw(0.0),
+        video,
+        control,
+    )
+
+
+def virtual_network(asked: Network, costs: Costs) -> Network:
+    """Add what a real loopback has by itself, as measured."""
+    return replace(
+        asked,
+        video=_later(asked.video, costs.links_us["video"]),
+        control=_later(asked.control, costs.links_us["control"]),
+        state=_later(asked.state, costs.links_us["state"]),
+        unheld=_later(asked.unheld, costs.links_us["state"]),
+    )
+
+
+def _later(law: DelayLaw, by_us: float) -> DelayLaw:
+    return DelayLaw(law.constant_ms + by_us / US_PER_MS, law.jitter, law.seed, law.name)
+
+
+def _hops_ms(costs: Costs, hops: tuple[tuple[str, str], ...]) -> float:
+    return sum(costs.hops_us.get(node, {}).get(hop, 0.0) for node, hop in hops) / US_PER_MS

@@ -1,0 +1,148 @@
+"""From a config to the runs it asks for, each with its name, its whole config and its identity."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lavt.assembly.entropy import run_seed
+from lavt.assembly.injection import NO_CONDITION, netem_flows
+from lavt.assembly.links import injected
+from lavt.assembly.nodes import check_names
+from lavt.config import Condition, RunConfig, SweepConfig
+from lavt.config_file import condition, parse_config
+from lavt.errors import UserError
+from lavt.transport.emulation.impairment import check_flows
+
+TAKEN = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
+"""What a sweep varies anyway, by keys of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedRun:
+    """One run: `identity` is what its entry in the summary begins with, `seed` is the run's own."""
+
+    name: str
+    config: RunConfig
+    identity: Mapping[str, Any]
+    seed: int
+    asked: Condition
+    """What is asked of the network."""
+
+
+def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
+    """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
+    asked = config.network.asked(condition(config.network.condition))
+    check_names(config.vehicle, config.controller)
+    _check_injection(config, asked)
+    nothing = config.network.inherent == "loopback" and asked == NO_CONDITION
+    if config.time == "real" and config.network.injection == "none" and not nothing:
+        raise UserError(
+            "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
+            "inherent loopback"
+        )
+    if config.time == "real" and config.fidelity != "video":
+        raise UserError(
+            f"fidelity {config.fidelity} is for virtual time only: choose fidelity video for real time, or time virtual"
+        )
+    seed = run_seed(config.seed, config.vehicle.route, config.repetition)
+    identity = {
+        "run": name,
+        "time": config.time,
+        "fidelity": config.fidelity,
+        "injection": "model" if config.time == "virtual" else config.network.injection,
+        "inherent": config.network.inherent,
+        "route": config.vehicle.route,
+        "condition": config.network.condition,
+        "controller": config.controller.kind,
+        "preset": config.controller.settings,
+        "driver": config.controller.kind,
+        "participant": config.study.participant,
+        "block": config.study.block,
+        "order": config.study.order,
+        "repetition": config.repetition,
+        "seed": seed,
+        **injected_entry(asked),
+        **({"axes": dict(axes)} if axes else {}),
+        **({"changes": config.network.changes} if config.network.changes else {}),
+    }
+    return PlannedRun(name, config, identity, seed, asked)
+
+
+def injected_entry(asked: Condition) -> dict[str, Any]:
+    """Say what is injected (None: a trace's) and, where that is not all, how much of it there must be at least."""
+    least = {} if asked.least_ms == asked.constant_ms else {"injected_least_ms": asked.least_ms}
+    return {"injected_ms": asked.constant_ms, **least}
+
+
+def _check_injection(config: RunConfig, asked: Condition) -> None:
+    """Raise `UserError` where what injects cannot do what the condition or the profile asks, or nobody could."""
+    network = config.network
+    if network.state_delay == "with_video" and asked.video.trace:
+        raise UserError(
+            "network.state_delay with_video delays the state by the video's constant delay, and cannot follow its "
+            f"trace {asked.video.trace!r}: choose none, or a condition without a trace"
+        )
+    if config.time == "real" and network.injection == "netem":
+        if network.inherent != "loopback":
+            raise UserError(
+                f"netem cannot do the lognormal part of network.inherent {network.inherent}: choose loopback, or "
+                "network.injection relay"
+            )
+        check_flows(netem_flows(asked, "both", video_port=1, control_port=2, state_delay=network.state_delay))
+    else:
+        injected("video", asked.video_ms, asked.video, seed=0)
+        injected("control", asked.control_ms, asked.control, seed=0)
+
+
+def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
+    """Plan every route under every condition, repeated, over every combination of the further axes.
+
+    Raises `UserError` for what `plan_run` refuses, for a sweep of nothing, and for one that asks for a run twice.
+    """
+    for key, taken in itertools.product(sweep.axes, TAKEN):
+        if f"{taken}.".startswith(f"{key}."):  # a whole section would change what it holds, too
+            raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[taken]!r} for {taken!r}")
+    base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
+    runs = []
+    for values in itertools.product(*sweep.axes.values()):
+        axes = dict(zip(sweep.axes, values, strict=True))
+        for route, name, repetition in itertools.product(sweep.routes, sweep.conditions, range(sweep.repetitions)):
+            changes = {"vehicle.route": route, "network.condition": name, "repetition": repetition, **axes}
+            config = parse_config(RunConfig, _changed(base, changes), "the sweep")
+            runs.append(plan_run(config, name=_name(route, name, repetition, axes), axes=axes))
+    if not runs:
+        raise UserError("the sweep asks for no run: give routes, conditions and axes at least one value each")
+    twice = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
+    if twice:
+        raise UserError(f"the sweep asks for {twice[0]} more than once: give each route, condition and value once")
+    return runs
+
+
+def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, Any]) -> str:
+    parts = [route, condition_name, f"{repetition:02d}", *(f"{key}={value}" for key, value in axes.items())]
+    return "_".join("".join(c if (c.isascii() and c.isalnum()) or c in "=.-_" else "-" for c in part) for part in parts)
+
+
+def _changed(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy nested sections with some values changed; raises `UserError` for a section that does not exist."""
+    result = dict(base)
+    for key, value in changes.items():
+        _change(result, key.split("."), value, key)
+    return result
+
+
+def _change(section: dict[str, Any], path: Sequence[str], value: Any, key: str) -> None:
+    if len(path) == 1:
+        section[path[0]] = value
+        return
+    inner = section.get(path[0])
+    if not isinstance(inner, Mapping):
+        raise UserError(
+            f"the axis {key!r} names no config value: write it as in the config, such as video.bit_rate_bps"
+        )
+    section[path[0]] = dict(inner)
+    _change(section[path[0]], path[1:], value, key)

@@ -1,0 +1,233 @@
+"""One run in real time on this machine: two routers, a server, a client and a relay, each a process of its own.
+
+Or no relay, where netem on the loopback does its work.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+
+from lavt.assembly.links import trace_digests, trace_path
+from lavt.clock import Clock, MachineClock, pause
+from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.errors import WorkError
+from lavt.experiment.analysis.results import write_json
+from lavt.experiment.analysis.validity import injection_reasons, lateness_reasons
+from lavt.experiment.runs.netem_run import NETEM, NetemRun, by_netem
+from lavt.experiment.runs.network import Network, injected_network
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.processes import LAVT, Process, Processes
+from lavt.experiment.runs.side_configs import client_config, server_config
+from lavt.experiment.runs.virtual_run import read_costs
+from lavt.transport.emulation.delay_line import DelayLaw
+
+RELAY = "relay.json"
+"""In a run directory: the delays asked of the relay, and for how long it held what it carried."""
+WAYS = {"video": "video downstream", "control": "control upstream"}
+"""The direction of a relayed flow that is delayed."""
+LOCAL_TCP = "tcp/127.0.0.1:0"
+SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
+BEGIN_S = 40
+"""The drive has begun by then, or the run has failed."""
+LONGEST_S = 900
+NOTHING = Impairment()
+STATUS_PERIOD_NS = 200 * NS_PER_MS
+
+Progress = Callable[[dict[str, Any], dict[str, Any]], None]
+"""(status of the server, status of the client), several times a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """The processes of a run. With the relay, the client's side knows nothing of the server's ports but through it."""
+
+    server_router: Process
+    server: Process
+    relay: Process | None
+    client_router: Process
+    client: Process
+    router: str
+    """Endpoint of the client's router: for whoever else is on the client's machine."""
+    dialled: str
+    """Endpoint that the client's router dials: the server's router, or the relay in front of it."""
+    server_ready: Mapping[str, Any]
+    """What the server told of itself when it was ready."""
+
+
+def start_loop(
+    processes: Processes,
+    planned: PlannedRun,
+    out: Path,
+    work: Path,
+    *,
+    rearm: bool = False,
+    once: bool = True,
+    server_program: Sequence[str] = LAVT,
+    netem: NetemRun | None = None,
+) -> Loop:
+    """Start everything in order, each part told the ports of those before; records go into `out`.
+
+    Without `once` the server stays after the first drive's end. `netem` holds the flows from before the client starts.
+    """
+    run = planned.config
+    server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
+    server = processes.start(
+        "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)),
+        *(["--once"] if once else []), "--out", str(out / "server"), program=server_program,
+    )  # fmt: skip
+    ready = server.ready()["ready"]
+    video_port, probe_port = ready["video_port"], ready["probe_port"]
+    relay = None
+    control_port = int(remote.partition("?")[0].rpartition(":")[2])
+    if run.network.injection == "relay":
+        relay = processes.start(
+            "relay", "relay", _write(work, "relay", _relay_config(planned, video_port, control_port))
+        )
+        ports = relay.ready()["ports"]
+        video_port, control_port = ports["video"], ports["control"]
+    elif netem is not None:
+        netem.apply(video_port=video_port, control_port=control_port)
+    dialled = f"udp/127.0.0.1:{control_port}?rel=1;mixed_rel=1"
+    client_router, local = start_client_router(processes, dialled)
+    config = client_config(run, router=local, video_port=video_port, probe_port=probe_port)
+    config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
+    client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
+    client.ready()
+    return Loop(server_router, server, relay, client_router, client, local, dialled, ready)
+
+
+def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
+    """Start the client's router and tell its endpoint; naming that in `listen` starts it again where it was."""
+    router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
+    return router, local
+
+
+def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
+    """Drive once, leaving the two records in `out` and, of relay or netem, what was asked of it and what it did.
+
+    Raises `WorkError` where a part ends or nobody gets to drive; what was recorded by then is left in `out` too.
+    """
+    clock = clock or MachineClock()
+    with TemporaryDirectory(prefix="lavt-") as folder:
+        work = Path(folder)
+        try:
+            with ExitStack() as stack:
+                netem = stack.enter_context(NetemRun(planned)) if by_netem(planned) else None
+                processes = stack.enter_context(Processes(work))
+                loop = start_loop(processes, planned, work, work, netem=netem)
+                _wait_for_the_end(processes, loop, clock, progress)
+                for process in reversed(processes.started):
+                    process.end()
+                if loop.relay is not None:
+                    asked = {"asked_ms": _asked_ms(planned), "traces": trace_digests(planned.asked)}
+                    write_json(out / RELAY, {**asked, **loop.relay.last_line()})
+                if netem is not None:
+                    write_json(out / NETEM, netem.report())
+        finally:
+            for record in work.glob("*/*.mcap"):
+                shutil.move(record, out / record.name)
+
+
+def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: Progress | None) -> None:
+    start_ns = clock.now().mono_ns
+    while loop.server.running and loop.server.latest.get("ending") is None:
+        gone_s = (clock.now().mono_ns - start_ns) / NS_PER_S
+        status = loop.server.latest.get("status", {})
+        ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
+        if ended is not None:
+            code = ended.popen.returncode  # negative: the signal that ended it
+            raise WorkError(f"{ended.name} ended in the middle of the run with {code}: {ended.said()}")
+        if gone_s > LONGEST_S or (gone_s > BEGIN_S and status.get("safety") in (None, "disarmed", "arming")):
+            raise WorkError(f"the drive did not begin or end within {gone_s:.0f} s: {loop.client.latest} {status}")
+        if progress is not None:
+            progress(status, loop.client.latest.get("status", {}))
+        pause(STATUS_PERIOD_NS)
+    if loop.server.popen.poll() not in (None, 0):
+        raise WorkError(f"the server failed: {loop.server.said()}")
+
+
+def _asked_ms(planned: PlannedRun) -> dict[str, float | None]:
+    """Tell the median delay asked of the relay in each direction, that of the inherent profile included.
+
+    None where more than a constant delay is asked: its median depends on what else is sent.
+    """
+    laws = _injected(planned)
+    return {
+        "video": laws.video.median_ms() if laws.video_injected is None else None,
+        "control": laws.control.median_ms() if laws.control_injected is None else None,
+    }
+
+
+def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
+    """Compare for how long the relay held what it carried with what was asked of it (the content of `relay.json`).
+
+    Where more than a constant delay was asked, the times at which packets left are compared with what the law gave.
+    """
+    asked_ms = relay.get("asked_ms", {"video": 0.0, "control": 0.0})
+    constant = {flow: delay_ms for flow, delay_ms in asked_ms.items() if delay_ms is not None}
+    held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
+    return [
+        *injection_reasons(constant, {flow: held.get(WAYS[flow]) for flow in constant}),
+        *lateness_reasons({flow: late.get(WAYS[flow]) for flow in asked_ms if flow not in constant}),
+    ]
+
+
+def _injected(planned: PlannedRun) -> Network:
+    network = planned.config.network
+    return injected_network(
+        network.inherent, planned.asked, read_costs(), planned.seed, state_delay=network.state_delay
+    )
+
+
+def _start_router(
+    processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
+) -> tuple[Process, str, str]:
+    """Start a router and tell its local and, for the server's, its remote endpoint."""
+    endpoints = {"listen": listen, "connect": dialled}
+    changes = [part for key, each in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(each)}")]
+    router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
+    locators = router.ready()["locators"]
+    local = next(each for each in locators if each.startswith("tcp/"))
+    return router, local, next((each for each in locators if each.startswith("udp/")), "")
+
+
+def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
+    injected, asked = _injected(planned), planned.asked
+    return RelayConfig(
+        video_server=f"127.0.0.1:{video_port}",
+        control_server=f"127.0.0.1:{control_port}",
+        video=_delay(injected.video, asked.video_ms, asked.video),
+        control=_delay(injected.control, asked.control_ms, asked.control),
+        state=_delay(injected.state),
+        seed=planned.seed,
+    )
+
+
+def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: Impairment = NOTHING) -> DelayConfig:
+    link = LinkConfig()
+    if impairment != NOTHING:
+        asked = impairment.model_dump()
+        asked["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
+        link = LinkConfig(delay_ms=delay_ms, **asked)
+    if law.jitter is None:
+        return DelayConfig(constant_ms=law.constant_ms, link=link)
+    return DelayConfig(
+        constant_ms=law.constant_ms, jitter_median_ms=law.jitter.median_ms, jitter_sigma=law.jitter.sigma, link=link
+    )
+
+
+def _write(work: Path, name: str, config: BaseModel) -> str:
+    path = work / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json")))
+    return str(path)

@@ -1,0 +1,80 @@
+"""Driving one planned run into a run directory: config, records, result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import yaml
+
+from lavt.errors import WorkError
+from lavt.experiment.analysis.drive_data import Drive, drive_of
+from lavt.experiment.analysis.injection_validity import recorded_reasons
+from lavt.experiment.analysis.results import read_json, run_result, write_json
+from lavt.experiment.runs.netem_run import NETEM, netem_reasons
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.real_run import RELAY, Progress, drive_real, relay_reasons
+from lavt.experiment.runs.virtual_run import build_loop, drive
+from lavt.recording.output_directory import check_directory, prepare_directory
+from lavt.recording.record import read_record
+
+CONFIG = "config.yaml"
+RESULT = "result.json"
+NETWORK = "network"
+"""What `inherent` is of a run on two machines: the latency of whatever lies between them."""
+
+
+def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Drive, compute the result, and leave everything in `out`; raises `WorkError` where nobody got to drive."""
+    return dict(drive_once(planned, out, progress=progress).result)
+
+
+def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> Drive:
+    """Do what `run_once` does, and give with the result what a report's figures need: the records were read anyway."""
+    cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
+    check_directory(out)
+    digest = None
+    if planned.config.time == "virtual":
+        loop = build_loop(planned, out)
+        _write_config(planned, out)
+        drive(loop, progress=None if progress is None else lambda _: progress(loop.tap.status(), {}))
+        digest = loop.digest.hexdigest()
+        if not loop.tap.began:
+            raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
+    else:
+        prepare_directory(out)
+        _write_config(planned, out)
+        drive_real(planned, out, progress=progress)
+    return _compute(out, planned.identity, digest)
+
+
+def config_text(planned: PlannedRun) -> str:
+    """Write the whole config of a run as YAML."""
+    return yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False)
+
+
+def _write_config(planned: PlannedRun, out: Path) -> None:
+    (out / CONFIG).write_text(config_text(planned))
+
+
+def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
+    """Compute `result.json` from what the run left in `out`: its records and what the relay or netem said."""
+    return dict(_compute(out, identity, digest).result)
+
+
+def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Drive:
+    server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+    reasons = []
+    if identity["injection"] == "relay":
+        relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
+        reasons = relay_reasons(relay)
+    elif identity["inherent"] == NETWORK:
+        asked = identity["condition"] if identity["injection"] == "netem" else ""
+        reasons = recorded_reasons(server, client, asked, identity["injected_ms"])
+    elif identity["injection"] == "netem":
+        reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
+    result = run_result(identity, server, client, digest=digest, reasons=reasons)
+    write_json(out / RESULT, result)
+    return drive_of(server, out, result)

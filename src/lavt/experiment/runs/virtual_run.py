@@ -1,0 +1,212 @@
+"""One run in virtual time: the two sides of the real thing, joined by simulated links."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lavt.assembly.entropy import SeededEntropy
+from lavt.assembly.fidelity import FIDELITIES
+from lavt.assembly.links import trace_digests
+from lavt.assembly.nodes import ClientNodes, ServerNodes, build_client, build_server
+from lavt.config import Costs, RunConfig
+from lavt.config_file import load_config, shipped
+from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
+from lavt.experiment.runs.network import Network, injected_network, virtual_network
+from lavt.experiment.runs.plan import PlannedRun
+from lavt.experiment.runs.side_configs import client_config, server_config
+from lavt.recording.output_directory import make_directory
+from lavt.recording.provenance import provenance
+from lavt.recording.record import RecordWriter
+from lavt.runtime.recorder import Recorder
+from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
+from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.link import Injected, Link
+from lavt.transport.emulation.relay import video_index
+
+SERVER_MONO_NS = 1_000 * NS_PER_S
+CLIENT_MONO_NS = 7_000 * NS_PER_S
+"""The monotonic clocks of two machines have nothing to do with each other."""
+WALL_NS = 1_790_000_000 * NS_PER_S
+"""True time at the begin of every virtual run: a day of 2026."""
+CLIENT_ADDRESS = ("198.51.100.2", 40_000)
+"""Of the documentation range (RFC 5737): what the server sees the client's datagrams come from."""
+SERVER_VIDEO_PORT = 5600
+ARMING_LIMIT_NS = 30 * NS_PER_S
+LONGEST_NS = 3600 * NS_PER_S
+AFTERWARDS_NS = NS_PER_S // 5
+"""So much is recorded after the ending."""
+
+
+class EndingTap:
+    """A recorder that passes everything on and notes when the drive has begun and ended."""
+
+    def __init__(self, writer: Recorder) -> None:
+        self.began = False
+        self.ending: str | None = None
+        self._truth: GroundTruth | None = None
+        self._write = writer.write
+
+    def status(self) -> dict[str, Any]:
+        """Tell what a person wants to see of a drive while it goes on."""
+        truth = self._truth
+        return {} if truth is None else {"speed_mps": truth.speed_mps, "cross_track_m": truth.cross_track_m}
+
+    def write(self, topic: str, payload: Any, now: Now) -> None:
+        """Write one entry."""
+        if topic == "truth":
+            self._truth = payload
+        elif topic == "event":
+            self.began |= payload.kind == "drive_began"
+            if payload.kind == "ending":
+                self.ending = payload.detail
+        self._write(topic, payload, now)
+
+
+@dataclass(frozen=True, slots=True)
+class VirtualLoop:
+    """Everything of a virtual run, before it is run: tests reach in here."""
+
+    runtime: VirtualRuntime
+    server: ServerNodes
+    client: ClientNodes
+    tap: EndingTap
+    writers: tuple[RecordWriter, RecordWriter]
+    digest: Any
+
+
+@functools.cache
+def read_costs() -> Costs:
+    """Read what the loop costs, once."""
+    return load_config(Costs, shipped("configs/costs.yaml"))
+
+
+def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
+    """Give the clocks of server and client: the client's is true, the server's has an offset and drifts."""
+    return (
+        HostClock(SERVER_MONO_NS, WALL_NS, round(config.clocks.offset_ms * 1e6), round(config.clocks.drift_ppm * 1000)),
+        HostClock(CLIENT_MONO_NS, WALL_NS),
+    )
+
+
+def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
+    """Make both sides of a run and the links between them, recording into `out`, which is made where it is not there.
+
+    Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
+    """
+    config, seed, costs = planned.config, planned.seed, read_costs()
+    asked = planned.asked
+    server_clock, client_clock = clocks or host_clocks(config)
+    fidelity = FIDELITIES[config.fidelity]()
+    server = build_server(
+        server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
+        host="virtual-server", video_port=SERVER_VIDEO_PORT, fidelity=fidelity, lives_on_demand=True,
+    )  # fmt: skip
+    client = build_client(
+        client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
+    )
+    make_directory(out)
+    digest = hashlib.sha256()
+    left_out = config.left_out
+    writers = (
+        RecordWriter(out / "server.mcap", "server", digest, left_out=left_out),
+        RecordWriter(out / "client.mcap", "client", digest, left_out=left_out),
+    )
+    for writer in writers:
+        for name, entries in provenance().items():
+            writer.annotate(name, entries)
+        writer.annotate(
+            "model",
+            {
+                "costs": costs.model_dump_json(),
+                "condition": asked.model_dump_json(),
+                "traces": json.dumps(trace_digests(asked)),
+            },
+        )
+    tap = EndingTap(writers[0])
+    costs_ns = {
+        (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()
+    }
+    error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
+    hosts = [
+        VirtualHost(
+            "server", server_clock, server.all, tap, costs_ns,
+            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s), left_out=left_out,
+        ),
+        VirtualHost(
+            "client", client_clock, client.all, writers[1], costs_ns,
+            modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s), CLIENT_ADDRESS,
+            left_out=left_out,
+        ),
+    ]  # fmt: skip
+    injected = injected_network(
+        config.network.inherent,
+        asked,
+        costs,
+        seed,
+        state_delay=config.network.state_delay,
+    )
+    runtime = VirtualRuntime(hosts, virtual_links(virtual_network(injected, costs)))
+    return VirtualLoop(runtime, server, client, tap, writers, digest)
+
+
+def virtual_links(network: Network) -> dict[str, VirtualLink]:
+    """Make the links of all channels that cross the network.
+
+    Commands and requests for the session share a path in reality; here each has a line and streams of its own, so that
+    neither changes what happens to the other.
+    """
+
+    def counted(_payload: bytes, count: int) -> int:
+        return count
+
+    def link(
+        law: DelayLaw, injected: Injected | None = None, index: Callable[[bytes, int], int] = counted
+    ) -> VirtualLink:
+        return VirtualLink(DelayLine(law, None if injected is None else Link(injected)), index)
+
+    session = None if network.control_injected is None else replace(network.control_injected, name="session")
+    return {
+        "rtp": link(network.video, network.video_injected, lambda payload, _count: video_index(payload)),
+        "control": link(network.control, network.control_injected),
+        "state": link(network.state),
+        "feedback": link(network.unheld),
+        "session": link(network.control, session),
+        "session_reply": link(network.state),
+        "probe_request": link(network.unheld),
+        "probe_reply": link(network.unheld),
+    }
+
+
+def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS, progress: Callable[[int], None] | None = None) -> None:
+    """Run until the drive has ended and a little longer, until nobody has armed in time, or to the limit.
+
+    `progress` is told every second of virtual time, in nanoseconds.
+    """
+    runtime, tap = loop.runtime, loop.tap
+    if progress is not None:
+        _tell_every_second(runtime, progress)
+    gc.freeze()  # what was built stays to the end: to look through it again and again took 3 % of the time and more
+    try:
+        armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: tap.began)
+        if armed and runtime.run(limit_ns, lambda: tap.ending is not None):
+            runtime.run(runtime.true_ns + AFTERWARDS_NS, lambda: False)
+        runtime.close()
+    finally:
+        gc.unfreeze()
+        for writer in loop.writers:
+            writer.close()
+
+
+def _tell_every_second(runtime: VirtualRuntime, progress: Callable[[int], None]) -> None:
+    def tell() -> None:
+        progress(runtime.true_ns)
+        runtime.at(runtime.true_ns + NS_PER_S, tell)
+
+    runtime.at(NS_PER_S, tell)

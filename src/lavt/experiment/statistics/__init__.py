@@ -1,0 +1,1 @@
+"""Summaries of runs: means with confidence intervals, contrasts between conditions, survival."""

@@ -1,0 +1,61 @@
+"""Planned contrasts between conditions: McNemar's exact test for paired runs, Fisher's for counts alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from scipy.stats import binomtest, fisher_exact
+
+from lavt.experiment.statistics.intervals import holm
+
+PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"), ("L3", "L5"))
+"""Chosen before any run was driven: each step of the injected delay, and L3 with L4, whose total delays are equal."""
+
+PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
+"""What two runs of a pair have in common: all but the condition."""
+
+
+def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Compare completion between conditions, pair by pair, with Holm's correction over all contrasts of the list.
+
+    A contrast is there where both its conditions were driven. Invalid runs make no pair, and neither do runs that
+    nothing tells apart under one condition. `p` is null without any pair.
+    """
+    driven = {str(run["condition"]) for run in runs}
+    completed = {name: _completed(runs, name) for name in driven}
+    contrasts = []
+    for a, b in PLANNED:
+        if a in driven and b in driven:
+            pairs = [(completed[a][key], completed[b][key]) for key in completed[a] if key in completed[b]]
+            only_a, only_b = pairs.count((True, False)), pairs.count((False, True))
+            p = mcnemar(only_a, only_b) if pairs else None
+            contrasts.append({"a": a, "b": b, "pairs": len(pairs), "only_a": only_a, "only_b": only_b, "p": p})
+    return with_holm(contrasts)
+
+
+def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Add `p_holm` to contrasts that were planned together."""
+    corrected = holm([contrast["p"] for contrast in contrasts])
+    return [{**contrast, "p_holm": p} for contrast, p in zip(contrasts, corrected, strict=True)]
+
+
+def mcnemar(only_a: int, only_b: int) -> float:
+    """McNemar's exact p value, two-sided: of the pairs that differ, each way has the chance of a coin's side."""
+    differing = only_a + only_b
+    return float(binomtest(only_a, differing, 0.5).pvalue) if differing else 1.0
+
+
+def fisher(a_completed: int, a_runs: int, b_completed: int, b_runs: int) -> float:
+    """Fisher's exact p value, two-sided, of two counts that are not paired."""
+    table = [[a_completed, a_runs - a_completed], [b_completed, b_runs - b_completed]]
+    return float(fisher_exact(table)[1])
+
+
+def _completed(runs: Sequence[Mapping[str, Any]], condition: str) -> dict[tuple[Any, ...], bool]:
+    """Tell of each valid run of a condition whether it was completed, by what makes it one of a pair."""
+    valid = [run for run in runs if run["valid"] and run["condition"] == condition]
+    keys = [tuple(run.get(name) for name in PAIRED_BY) for run in valid]
+    alike = Counter(keys)
+    return {key: run["ending"] == "completed" for key, run in zip(keys, valid, strict=True) if alike[key] == 1}

@@ -1,0 +1,1 @@
+"""The clock offset between two machines: chrony, PTP and our own probe."""

@@ -1,0 +1,1 @@
+"""Emulated links: delay, jitter and loss in process, recorded traces and the relay."""

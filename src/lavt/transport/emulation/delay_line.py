@@ -1,0 +1,93 @@
+"""Delay as a law and as a queue; the relay and the virtual runtime use the same two.
+
+A law says how long the thing with a given index takes; its randomness is a named stream indexed by that number, so that
+runs with one seed stay paired whatever else is drawn. A line keeps order: nothing overtakes, unless a `Link` does more
+than delay.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from lavt.domain import NS_PER_MS
+from lavt.streams import IndexedStream
+from lavt.transport.emulation.link import Link
+
+
+@dataclass(frozen=True, slots=True)
+class Lognormal:
+    """A delay that is lognormal: its median, and the standard deviation of its logarithm."""
+
+    median_ms: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class DelayLaw:
+    """A constant delay and, on top, one drawn for each index from the stream `name` of `seed`."""
+
+    constant_ms: float
+    jitter: Lognormal | None = None
+    seed: int = 0
+    name: str = ""
+
+    def median_ms(self) -> float:
+        """Give the median delay."""
+        return max(0.0, self.constant_ms + (0.0 if self.jitter is None else self.jitter.median_ms))
+
+    def delay_ns(self, index: int) -> int:
+        """Delay of the thing with number `index`, in nanoseconds; never negative."""
+        jitter_ms = 0.0 if self.jitter is None else _lognormal_ms(self.seed, self.name, index, self.jitter)
+        return max(0, round((self.constant_ms + jitter_ms) * NS_PER_MS))
+
+
+@lru_cache(maxsize=256)
+def _lognormal_ms(seed: int, name: str, index: int, law: Lognormal) -> float:
+    """The packets of one frame ask for the same index one after the other, hence the cache."""
+    return law.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, law.sigma))
+
+
+@lru_cache(maxsize=4)
+def _jitter(seed: int, name: str) -> IndexedStream:
+    return IndexedStream(seed, name)
+
+
+class DelayLine:
+    """A queue in which everything waits for its delay and nothing overtakes; with a `Link`, what that says happens."""
+
+    def __init__(self, law: DelayLaw, link: Link | None = None) -> None:
+        self.law = law
+        self.link = link
+        self._waiting: list[tuple[int, int, Any]] = []
+        self._number = 0
+        self._last_ns = 0
+
+    def push(self, item: Any, now_ns: int, index: int, size_bytes: int = 0) -> int | None:
+        """Let `item` in at `now_ns` and tell when it is due; None: it is lost.
+
+        Without a link that is after its delay, and not before what came in earlier.
+        """
+        delay_ns = self.law.delay_ns(index)
+        if self.link is None:
+            due_ns = self._last_ns = max(now_ns + delay_ns, self._last_ns)
+        elif (left_ns := self.link.leaves_ns(now_ns, delay_ns, size_bytes)) is None:
+            return None
+        else:
+            due_ns = left_ns
+        self._number += 1
+        heapq.heappush(self._waiting, (due_ns, self._number, item))
+        return due_ns
+
+    def next_due_ns(self) -> int | None:
+        """When the first item is due; None when nothing waits."""
+        return self._waiting[0][0] if self._waiting else None
+
+    def pop_due(self, now_ns: int) -> list[Any]:
+        """Take out all that is due at `now_ns`, in order."""
+        due = []
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            due.append(heapq.heappop(self._waiting)[2])
+        return due

@@ -1,0 +1,1 @@
+"""Delay by the Linux kernel: tc netem applied, verified and cleared."""

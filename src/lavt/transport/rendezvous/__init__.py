@@ -1,0 +1,1 @@
+"""The rendezvous: forward datagrams between a vehicle and an operator behind NAT."""

@@ -1,0 +1,1 @@
+"""RTP and RTCP: packets, reports, the jitter buffer and forward error correction."""

@@ -1,0 +1,307 @@
+"""RTCP: what the sender and the receiver of a video tell each other beside it.
+
+Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
+receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
+time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the highest bit rate that the
+receiver wants (RFC 5104, section 4.2.1). So both can know the round trip without a clock in common.
+
+Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
+with RTP; which of the two a datagram is shows in its second byte (RFC 5761).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from lavt.errors import BadPacket
+from lavt.transport.rtp.ntp_time import delay_ns_of, ntp_of_wall, short_delay
+from lavt.transport.rtp.rtcp_xr import (
+    ReferenceAnswer,
+    ReferenceTime,
+    read_answers,
+    read_reference_times,
+    write_answers,
+    write_reference_time,
+)
+from lavt.value import value
+
+RECEIVER_CNAME: Final = "receiver@lavt"
+OVERHEAD_BYTES: Final = 40
+"""Of each packet before its payload: IPv4 20, UDP 8, RTP 12."""
+
+_HEADER = struct.Struct("!BBH")
+_SSRC = struct.Struct("!I")
+_REPORT = struct.Struct("!IIIIII")
+_SENDER_INFORMATION = struct.Struct("!IQIII")
+_FEEDBACK = struct.Struct("!II")
+_BIT_RATE = struct.Struct("!II")
+
+_VERSION_2: Final = 0x80
+_PADDING: Final = 0x20
+_COUNT: Final = 0x1F
+
+_SENDER_REPORT: Final = 200
+_RECEIVER_REPORT: Final = 201
+_SOURCE_DESCRIPTION: Final = 202
+_TRANSPORT_FEEDBACK: Final = 205
+_PAYLOAD_FEEDBACK: Final = 206
+_EXTENDED_REPORT: Final = 207
+
+_CNAME: Final = 1
+_MAX_BIT_RATE: Final = 3
+_PICTURE_LOSS: Final = 1
+
+_BEFORE_BLOCKS: Final = {_SENDER_REPORT: _SENDER_INFORMATION.size, _RECEIVER_REPORT: _SSRC.size}
+"""Bytes of a report's body before its report blocks."""
+_MAX_LOST: Final = 2**23 - 1
+_MAX_WORD: Final = 2**32 - 1
+_MAX_BIT_RATE_BPS: Final = (2**17 - 1) << 63
+_RTP_HEADER_BYTES: Final = 12
+_RTCP_HEADER_BYTES: Final = 8
+
+
+@value
+class SenderReport:
+    """When a sender wrote its report, and what it had sent until then (RFC 3550, section 6.4.1)."""
+
+    ssrc: int
+    ntp_time: int
+    """64 bits, by the sender's wall clock."""
+    rtp_timestamp: int
+    """Of the same moment."""
+    packets: int
+    octets: int
+    """Of payload."""
+
+
+@value
+class ReceptionReport:
+    """How a stream arrives at one receiver (RFC 3550, section 6.4.1)."""
+
+    media_ssrc: int
+    highest_sequence: int
+    """Extended by the number of wraps, modulo 2^32."""
+    lost_fraction: float
+    """Share of packets lost since the report before, in [0, 1), in steps of 1/256."""
+    cumulative_lost: int
+    """Packets lost since the beginning; duplicates can make it negative."""
+    jitter: int
+    """Mean deviation of the arrival spacing, in ticks of the RTP clock (90 kHz)."""
+    last_report: int = 0
+    """Middle 32 bits of the NTP time in the last sender report that came; 0: none came."""
+    last_report_age_ns: int = 0
+    """How long before this report that one had come, in steps of 1/65536 s."""
+
+
+@value
+class BitRateLimit:
+    """The highest bit rate that a receiver wants of one stream (RFC 5104, section 4.2.1.1)."""
+
+    media_ssrc: int
+    bit_rate_bps: int
+    """With `overhead_bytes` of headers before each packet's payload."""
+    overhead_bytes: int
+
+
+@value
+class Feedback:
+    """What one RTCP datagram says that a sender hears."""
+
+    reports: tuple[ReceptionReport, ...] = ()
+    picture_loss: bool = False
+    """The receiver asks for a keyframe."""
+    limits: tuple[BitRateLimit, ...] = ()
+    reference_times: tuple[ReferenceTime, ...] = ()
+
+
+@value
+class Announcement:
+    """What one RTCP datagram says that a receiver hears."""
+
+    reports: tuple[SenderReport, ...] = ()
+    answers: tuple[ReferenceAnswer, ...] = ()
+
+
+def sender_report(
+    ssrc: int,
+    *,
+    wall_ns: int,
+    rtp_timestamp: int,
+    packets: int,
+    octets: int,
+    cname: str,
+    answered: Sequence[ReferenceAnswer] = (),
+) -> bytes:
+    """Write a sender report, with the reference times of receivers that it answers.
+
+    `rtp_timestamp` is that of the moment `wall_ns` (ns since 1970). Counts wrap at 2^32.
+    """
+    information = _SENDER_INFORMATION.pack(
+        ssrc, ntp_of_wall(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32
+    )  # fmt: skip
+    datagram = _packet(_SENDER_REPORT, 0, information) + _description(ssrc, cname)
+    if answered:
+        datagram += _packet(_EXTENDED_REPORT, 0, write_answers(ssrc, answered))
+    return datagram
+
+
+def receiver_report(ssrc: int, report: ReceptionReport, *, clock_ns: int, cname: str = RECEIVER_CNAME) -> bytes:
+    """Write the receiver report of receiver `ssrc` with its reference time; values beyond their field are cut.
+
+    `clock_ns` is any clock of the receiver that is never set: `answered_round_trip_ns` is asked with the same.
+    """
+    fraction = min(max(int(report.lost_fraction * 256), 0), 255)
+    lost = min(max(report.cumulative_lost, -_MAX_LOST - 1), _MAX_LOST) % 2**24
+    block = _REPORT.pack(
+        report.media_ssrc, fraction << 24 | lost, report.highest_sequence % 2**32, min(report.jitter, _MAX_WORD),
+        report.last_report, short_delay(report.last_report_age_ns),
+    )  # fmt: skip
+    return (
+        _packet(_RECEIVER_REPORT, 1, _SSRC.pack(ssrc) + block)
+        + _description(ssrc, cname)
+        + _packet(_EXTENDED_REPORT, 0, write_reference_time(ssrc, clock_ns))
+    )
+
+
+def picture_loss(ssrc: int, media_ssrc: int, *, cname: str = RECEIVER_CNAME) -> bytes:
+    """Write the request of receiver `ssrc` for a keyframe of the stream `media_ssrc` (RFC 4585, section 6.3.1)."""
+    return _empty_report(ssrc, cname) + _packet(_PAYLOAD_FEEDBACK, _PICTURE_LOSS, _FEEDBACK.pack(ssrc, media_ssrc))
+
+
+def max_bit_rate(
+    ssrc: int,
+    media_ssrc: int,
+    bit_rate_bps: int,
+    *,
+    overhead_bytes: int = OVERHEAD_BYTES,
+    cname: str = RECEIVER_CNAME,
+) -> bytes:
+    """Write the request of receiver `ssrc` that `media_ssrc` be sent with at most `bit_rate_bps` (RFC 5104, 4.2.1).
+
+    The bit rate counts `overhead_bytes` (at most 511) for each packet. It travels with 17 significant bits, rounded
+    down; values beyond their field are cut.
+    """
+    rate = min(max(bit_rate_bps, 0), _MAX_BIT_RATE_BPS)
+    exponent = max(rate.bit_length() - 17, 0)
+    word = exponent << 26 | rate >> exponent << 9 | min(overhead_bytes, 511)
+    # The stream is named with its limit, and not in the header (RFC 5104, section 4.2.1.2).
+    body = _FEEDBACK.pack(ssrc, 0) + _BIT_RATE.pack(media_ssrc, word)
+    return _empty_report(ssrc, cname) + _packet(_TRANSPORT_FEEDBACK, _MAX_BIT_RATE, body)
+
+
+def parse_feedback(datagram: bytes) -> Feedback:
+    """Read an RTCP datagram as a sender does; what says nothing of interest to it is passed over.
+
+    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
+    """
+    reports: list[ReceptionReport] = []
+    limits: list[BitRateLimit] = []
+    references: list[ReferenceTime] = []
+    lost = False
+    for count, kind, body in _packets(datagram):
+        if kind in _BEFORE_BLOCKS:
+            reports += _report_blocks(kind, count, body)
+        elif (kind, count) == (_PAYLOAD_FEEDBACK, _PICTURE_LOSS):
+            _check(len(body) == _FEEDBACK.size, "picture-loss indication of a wrong length")
+            lost = True
+        elif (kind, count) == (_TRANSPORT_FEEDBACK, _MAX_BIT_RATE):
+            limits += _limits(body)
+        elif kind == _EXTENDED_REPORT:
+            references += read_reference_times(body)
+    return Feedback(tuple(reports), lost, tuple(limits), tuple(references))
+
+
+def parse_announcement(datagram: bytes) -> Announcement:
+    """Read an RTCP datagram as a receiver does; what says nothing of interest to it is passed over.
+
+    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
+    """
+    reports: list[SenderReport] = []
+    answers: list[ReferenceAnswer] = []
+    for count, kind, body in _packets(datagram):
+        if kind in _BEFORE_BLOCKS:
+            _report_blocks(kind, count, body)  # for their lengths
+        if kind == _SENDER_REPORT:
+            reports.append(SenderReport(*_SENDER_INFORMATION.unpack_from(body)))
+        elif kind == _EXTENDED_REPORT:
+            answers += read_answers(body)
+    return Announcement(tuple(reports), tuple(answers))
+
+
+def is_rtcp(datagram: bytes) -> bool:
+    """Tell whether a datagram on a port of RTP and RTCP is RTCP (RFC 5761, section 4)."""
+    return len(datagram) >= _RTCP_HEADER_BYTES and datagram[0] >> 6 == 2 and 192 <= datagram[1] <= 223
+
+
+def is_rtp(datagram: bytes) -> bool:
+    """Tell whether a datagram on a port of RTP and RTCP is RTP: payload types 64 to 95 cannot be (RFC 5761)."""
+    return len(datagram) >= _RTP_HEADER_BYTES and datagram[0] >> 6 == 2 and not 64 <= datagram[1] & 0x7F <= 95
+
+
+def _packet(kind: int, count: int, body: bytes) -> bytes:
+    """Put a header before the body of an RTCP packet; its length is in words of four bytes, less one."""
+    return _HEADER.pack(_VERSION_2 | count, kind, len(body) // 4) + body
+
+
+def _empty_report(ssrc: int, cname: str) -> bytes:
+    """Write what stands before a request, since every RTCP datagram begins so (RFC 4585, section 3.1)."""
+    return _packet(_RECEIVER_REPORT, 0, _SSRC.pack(ssrc)) + _description(ssrc, cname)
+
+
+def _description(ssrc: int, cname: str) -> bytes:
+    """Write the source description with the CNAME, its first 255 bytes (RFC 3550, section 6.5)."""
+    text = cname.encode()[:255]
+    item = bytes([_CNAME, len(text)]) + text
+    return _packet(_SOURCE_DESCRIPTION, 1, _SSRC.pack(ssrc) + item + bytes(4 - len(item) % 4))
+
+
+def _check(right: bool, wrong: str) -> None:
+    if not right:
+        raise BadPacket(wrong)
+
+
+def _packets(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Give count, type and body without padding of each RTCP packet in a datagram (RFC 3550, A.2)."""
+    begins_with_report = len(datagram) >= _RTCP_HEADER_BYTES and datagram[1] in {_SENDER_REPORT, _RECEIVER_REPORT}
+    _check(begins_with_report, "an RTCP datagram begins with a report")
+    begin = 0
+    while begin < len(datagram):
+        _check(begin + _HEADER.size <= len(datagram), "RTCP header cut off")
+        first, kind, words = _HEADER.unpack_from(datagram, begin)
+        end = begin + _HEADER.size + 4 * words
+        _check(first >> 6 == 2 and end <= len(datagram), "not RTCP version 2, or cut off")
+        body = datagram[begin + _HEADER.size : end]
+        if first & _PADDING:
+            _check(end == len(datagram), "padding before the last RTCP packet")
+            padding = datagram[-1]
+            _check(padding % 4 == 0 and 0 < padding <= len(body), "padding of a wrong length")
+            body = body[:-padding]
+        yield first & _COUNT, kind, body
+        begin = end
+
+
+def _report_blocks(kind: int, count: int, body: bytes) -> list[ReceptionReport]:
+    """Read the `count` report blocks of a report; extensions may follow them."""
+    begin = _BEFORE_BLOCKS[kind]
+    end = begin + count * _REPORT.size
+    _check(end <= len(body), "fewer report blocks than announced")
+    reports = []
+    for media_ssrc, loss, highest, jitter, last, age in _REPORT.iter_unpack(body[begin:end]):
+        lost = loss & 0xFF_FFFF
+        signed = lost - 2**24 if lost > _MAX_LOST else lost
+        reports.append(
+            ReceptionReport(media_ssrc, highest, (loss >> 24) / 256, signed, jitter, last, delay_ns_of(age))
+        )  # fmt: skip
+    return reports
+
+
+def _limits(body: bytes) -> list[BitRateLimit]:
+    """Read the entries of a request for a bit rate: exponent 6 bits, mantissa 17, overhead 9."""
+    entries = body[_FEEDBACK.size :]
+    _check(bool(entries) and len(entries) % _BIT_RATE.size == 0, "bit rate limits of a wrong length")
+    return [
+        BitRateLimit(media_ssrc, (word >> 9 & 0x1_FFFF) << (word >> 26), word & 0x1FF)
+        for media_ssrc, word in _BIT_RATE.iter_unpack(entries)
+    ]

@@ -1,0 +1,1 @@
+"""The camera of the built-in simulator, rendered on the CPU."""

@@ -1,0 +1,96 @@
+"""What years have done to the asphalt: repairs, seams, cracks and the bitumen poured into them.
+
+Their places along a road are the world's, the same in every run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.streams import stream
+from lavt.vehicle.sim.road.road import Road
+from lavt.vehicle.sim.road.strips import Strips, along, join, pieces, strips
+
+_WORLD_SEED = 0
+_REPAIR_EVERY_M = 16.0
+_CRACK_EVERY_M = 7.0
+_SEAM_M = 0.03
+_PAVER_M = 3.5
+"""Asphalt is laid in widths of this much, with a seam between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Strips of one kind, how wide they are (m), and how many grey levels the asphalt is darker there."""
+
+    places: Strips
+    width_m: float
+    grey: int
+
+
+def damages(road: Road) -> list[Damage]:
+    """All of one road, in the order of painting."""
+    repairs, edges = _repairs(road)
+    seams = [
+        along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
+        for strip in road.paved
+        for offset_m in np.arange(strip.right_m + _PAVER_M, strip.left_m - 1.0, _PAVER_M)
+    ]
+    return [
+        *(Damage(join(found), 2.0, grey) for grey, found in repairs.items()),
+        Damage(join(seams), _SEAM_M, 12),
+        Damage(edges, 0.05, 30),
+        Damage(_cracks(road, "cracks", 0.018), 0.018, 34),
+        Damage(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
+    ]
+
+
+def _repairs(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
+    """Rectangles of newer asphalt with the seams around them; newer is darker."""
+    random = stream(_WORLD_SEED, "repairs")
+    found: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
+    edges = []
+    count = int((road.last_m - road.first_m) / _REPAIR_EVERY_M * len(road.paved))
+    for _ in range(count):
+        strip = road.paved[int(random.integers(len(road.paved)))]
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        begin_m = random.uniform(first_m, last_m)
+        end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
+        right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
+        left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
+        found[sorted(found)[int(random.integers(len(found)))]].append(along(road, left_m, right_m, begin_m, end_m))
+        edges += [along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]
+        cuts = np.array([begin_m, end_m])
+        edges.append(pieces(road, left_m, right_m, cuts - 0.025, cuts + 0.025))
+    return found, join(edges)
+
+
+def _cracks(road: Road, name: str, width_m: float) -> Strips:
+    """Lines that wander along or across the road, in steps of about a third of a metre."""
+    random = stream(_WORLD_SEED, name)
+    found = []
+    for _ in range(int((road.last_m - road.first_m) / _CRACK_EVERY_M * len(road.paved))):
+        strip = road.paved[int(random.integers(len(road.paved)))]
+        steps = int(random.integers(8, 30))
+        if random.uniform() < 0.5:
+            ahead, left = random.uniform(0.15, 0.45, steps), random.normal(0.0, 0.10, steps)
+        else:
+            ahead, left = random.normal(0.0, 0.10, steps), random.uniform(0.15, 0.40, steps)
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        station = random.uniform(first_m, last_m) + np.cumsum(ahead)
+        offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
+        inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
+        if inside.sum() > 2:
+            found.append(_line(road.across(station[inside], offset[inside]), width_m))
+    return join(found)
+
+
+def _line(points_m: FloatArray, width_m: float) -> Strips:
+    """Lay a quadrilateral of a width along each step of a way (n, 2)."""
+    begin, end = points_m[:-1], points_m[1:]
+    step = end - begin
+    side = np.column_stack([-step[:, 1], step[:, 0]]) * (width_m / 2 / np.hypot(step[:, :1], step[:, 1:]))
+    return strips(np.stack([begin + side, begin - side, end - side, end + side], axis=1))

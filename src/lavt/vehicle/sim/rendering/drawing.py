@@ -1,0 +1,150 @@
+"""One picture of a road: from above, to scale, and from the driver's seat."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+
+from lavt.domain import CameraModel, FloatArray, Pose
+from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
+from lavt.vehicle.sim.road.cross_section import Along, Paved, Rail, RoadMark
+from lavt.vehicle.sim.road.road import Road
+
+VIEWS = 4
+"""From the driver's seat: at the start, at the end, and evenly between."""
+
+DETAIL_M = 40.0
+"""How much of the road the detail shows: enough to see single marks."""
+
+_STEP_M = 1.0
+_STATION_STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
+_STATIONS = 12
+_LABEL_PT = 24.0
+_ASPHALT, _LANE, _GRASS = "#8d9096", "#7f9fc4", "#dfe8d5"
+_PAINT = {"white": "#ffffff", "yellow": "#f2c14e"}
+_RAILS = {"rail": "#b5541c", "barrier": "#222222"}
+_FROM_ABOVE_PT = 0.3
+"""Thinnest line: from far above, marks are thinner than paper shows."""
+
+
+def draw_road(road: Road, *, model: CameraModel, scenery: SceneryKind = "full") -> Figure:
+    """Draw `road` from above, whole and in detail at its start, its curvature, and views of the camera `model`."""
+    figure = Figure(figsize=(14.0, 11.5), dpi=110, layout="constrained")
+    figure.suptitle(f"{road.title}: {road.length_m:.1f} m", fontsize=14, fontweight="bold")
+    rows = figure.add_gridspec(3, VIEWS, height_ratios=[3.4, 0.8, 1.6])
+    whole, detail = figure.add_subplot(rows[0, :3]), figure.add_subplot(rows[0, 3])
+    _draw_whole(whole, road)
+    _draw_detail(detail, road)
+    _draw_curvature(figure.add_subplot(rows[1, :]), road)
+    renderer = Renderer(road, model, seed=1, scenery=scenery)
+    for column, s_m in enumerate(np.linspace(0.0, road.length_m, VIEWS).tolist()):
+        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(s_m))
+        axes = figure.add_subplot(rows[2, column])
+        axes.imshow(renderer.render(Pose(0, x_m, y_m, heading_rad), column)[..., ::-1])
+        axes.set_title(f"from the driver's seat at {s_m:.0f} m", fontsize=9, loc="left")
+        axes.set_axis_off()
+    return figure
+
+
+def _draw_whole(axes: Axes, road: Road) -> None:
+    first_m, last_m = max(road.first_m, -60.0), min(road.last_m, road.length_m + 120.0)
+    _draw_ground(axes, road, first_m, last_m)
+    spacing_m = next((each for each in _STATION_STEPS_M if road.length_m / each <= _STATIONS), _STATION_STEPS_M[-1])
+    outer_m = min(strip.right_m for strip in road.paved)
+    for s_m in np.arange(0.0, road.length_m, spacing_m).tolist():
+        edge, beyond = road.across(s_m, [outer_m, outer_m - 1.0])
+        label: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "center", "va": "center"}
+        line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 0.0}
+        axes.annotate(f"{s_m:.0f} m", edge, xytext=(beyond - edge) * _LABEL_PT, arrowprops=line, **label)
+    edges_m = road.lanes.edges_m
+    for s_m, colour, name in ((0.0, "#1a7f37", "start"), (road.length_m, "#c1121f", "end")):
+        axes.plot(*road.across(s_m, [edges_m[0], edges_m[-1]]).T, color=colour, linewidth=2.5, label=name)
+    axes.legend(fontsize=8, loc="best")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title("from above", fontsize=10, loc="left")
+    axes.set_xlabel("x / m")
+    axes.set_ylabel("y / m")
+
+
+def _draw_detail(axes: Axes, road: Road) -> None:
+    """Show the first metres upright, as the driver goes: along upwards, left to the left."""
+    last_m = min(DETAIL_M, road.length_m)
+    for strip in _within(road.paved, 0.0, last_m):
+        axes.fill_between([strip.right_m, strip.left_m], _low(strip, 0.0), _high(strip, last_m), color=_ASPHALT)
+    half_m = road.lanes.widths_m[road.lanes.driven] / 2
+    axes.fill_between([-half_m, half_m], 0.0, last_m, color=_LANE, alpha=0.5)
+    for mark in _within(road.marks, 0.0, last_m):
+        for begin_m, end_m in _painted(mark, 0.0, last_m):
+            right_m = mark.offset_m - mark.width_m / 2
+            axes.fill_between([right_m, right_m + mark.width_m], begin_m, end_m, color=_PAINT[mark.colour])
+    for rail in _within(road.rails, 0.0, last_m):
+        axes.vlines(rail.offset_m, _low(rail, 0.0), _high(rail, last_m), color=_RAILS[rail.kind], linewidth=2.0)
+    axes.set_facecolor(_GRASS)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title(f"the first {last_m:.0f} m, unrolled", fontsize=10, loc="left")
+    axes.invert_xaxis()
+    axes.set_xlabel("offset / m, left positive")
+    axes.set_ylabel("station / m")
+
+
+def _draw_curvature(axes: Axes, road: Road) -> None:
+    stations_m = np.linspace(0.0, road.length_m, 2001)
+    axes.plot(stations_m, road.point(stations_m)[3], color="#1f4e79")
+    axes.set_xlim(0.0, road.length_m)
+    axes.grid(visible=True, alpha=0.25)
+    axes.set_xlabel("station / m")
+    axes.set_ylabel("curvature / (1/m)\nleft positive")
+
+
+def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
+    axes.set_facecolor(_GRASS)
+    half_m = road.lanes.widths_m[road.lanes.driven] / 2
+    for strip in _within(road.paved, first_m, last_m):
+        _fill(axes, road, strip, (_low(strip, first_m), _high(strip, last_m)), _ASPHALT)
+    _fill(axes, road, Paved(half_m, -half_m), (0.0, road.length_m), _LANE)
+    axes.plot(*road.across(_along(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)  # seen from any height
+    for colour, paint in _PAINT.items():
+        lines = [
+            road.across(_along(*piece), mark.offset_m)
+            for mark in _within(road.marks, first_m, last_m)
+            if mark.colour == colour
+            for piece in _painted(mark, first_m, last_m)
+        ]
+        axes.add_collection(LineCollection(lines, colors=paint, linewidths=_FROM_ABOVE_PT))
+    for rail in _within(road.rails, first_m, last_m):
+        along = _along(_low(rail, first_m), _high(rail, last_m))
+        axes.plot(*road.across(along, rail.offset_m).T, color=_RAILS[rail.kind], linewidth=0.9)
+    axes.margins(0.12)  # room for the stations' labels
+    axes.autoscale_view()
+
+
+def _fill(axes: Axes, road: Road, strip: Paved, ends_m: tuple[float, float], colour: str) -> None:
+    along = _along(*ends_m)
+    outline = np.concatenate([road.across(along, strip.left_m), road.across(along[::-1], strip.right_m)])
+    axes.add_collection(PolyCollection([outline], facecolors=colour, edgecolors="none"))
+
+
+def _within(all_of_them: tuple[Along, ...], first_m: float, last_m: float) -> list[Along]:
+    return [each for each in all_of_them if each.from_m < last_m and each.to_m > first_m]
+
+
+def _painted(mark: RoadMark, first_m: float, last_m: float) -> list[tuple[float, float]]:
+    if mark.kind == "solid":
+        return [(_low(mark, first_m), _high(mark, last_m))]
+    return [(begin_m, begin_m + mark.dash_m) for begin_m in mark.dashes_m(first_m, last_m).tolist()]
+
+
+def _low(each: Paved | RoadMark | Rail, first_m: float) -> float:
+    return max(each.from_m, first_m)
+
+
+def _high(each: Paved | RoadMark | Rail, last_m: float) -> float:
+    return min(each.to_m, last_m)
+
+
+def _along(begin_m: float, end_m: float) -> FloatArray:
+    return np.linspace(begin_m, end_m, max(2, round((end_m - begin_m) / _STEP_M) + 1))

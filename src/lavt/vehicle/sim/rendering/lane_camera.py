@@ -1,0 +1,141 @@
+"""A camera that gives the lane itself: what a faultless detector would make of the picture from a pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from lavt.domain import CameraModel, Lane, Pose, SeenLane
+from lavt.vehicle.camera import CapturedFrame, newest_pose
+from lavt.vehicle.sim.road.road import Road
+
+LINEAR_BELOW_M = 6.0
+"""Of length seen: as with pixels, less gives no curvature."""
+POINTS_AT_LEAST = 3
+_ABEAM_RAD = math.radians(89.9)
+"""Edges of the view that look farther aside, or back, see nothing of what lies ahead."""
+
+STATION_M = 1.0
+"""So far apart are the places of the lane's lines that are looked at."""
+
+
+class LaneCamera:
+    """A `lavt.vehicle.camera.Camera` without pixels: its pictures are `SeenLane`, fitted to the road's true centre.
+
+    The ground it looks at is that of the detector: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to
+    both sides, as far as the camera's field of view has it: its place, its yaw and its width count, pitch and roll do
+    not. Confidence is the share of the lane's two lines in there. A car that has turned by more than 90 degrees sees
+    none.
+    """
+
+    def __init__(
+        self,
+        *,
+        model: CameraModel,
+        rate_hz: float,
+        phase_ns: int,
+        road: Road,
+        near_m: float,
+        far_m: float,
+        half_width_m: float,
+        exposure_ns: int = 0,
+        sensor_delay_ns: int = 0,
+    ) -> None:
+        self.model = model
+        self.rate_hz = rate_hz
+        self.phase_ns = phase_ns
+        self.exposure_ns = exposure_ns
+        self.sensor_delay_ns = sensor_delay_ns
+        self._road = road
+        self._near_m, self._far_m, self._half_width_m = near_m, far_m, half_width_m
+        half_rad = model.field_of_view_rad / 2
+        self._left_slope, self._right_slope = (
+            math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
+        )
+        self._width_m = road.lanes.widths_m[road.lanes.driven]
+        self._ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
+        stations_m = np.arange(road.length_m / STATION_M + 2 * self._ahead) * STATION_M
+        lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
+        self._stations: list[list[float]] = np.concatenate(lines, axis=1).tolist()
+        """World x and y of the lane's centre, of its left line and of its right one: six numbers each."""
+        self._near_s_m = 0.0
+
+    def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
+        """Give the lane as it is seen from `pose`; None without a pose."""
+        if pose is None:
+            return None
+        return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.lane_from(pose)))
+
+    def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+        """Give the lane as it is seen half-way between the poses at the shutter's opening and at its closing."""
+        first, last = newest_pose(poses, begin_ns), newest_pose(poses, begin_ns + self.exposure_ns)
+        if first is None or last is None:
+            return None
+        turned_rad = math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi)
+        middle_ns = begin_ns + self.exposure_ns // 2
+        x_m, y_m = (first.x_m + last.x_m) / 2, (first.y_m + last.y_m) / 2
+        return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turned_rad / 2))
+
+    def lane_from(self, pose: Pose) -> Lane:
+        """Fit the driven lane's centre as far as its lines are in view; confidence 0 where nothing of them is."""
+        self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
+        first = max(math.ceil(self._near_s_m / STATION_M), 0)
+        cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+        x_m, y_m = pose.x_m, pose.y_m
+        near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
+        left_slope, right_slope = self._left_slope, self._right_slope
+        lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
+        centre, lines_seen = [], 0
+        # The two lines are written out: a loop over them would take half of the time here.
+        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._stations[first : first + self._ahead]:
+            seen = 0
+            dx, dy = left_x - x_m, left_y - y_m
+            ahead_m = dx * cosine + dy * sine
+            if near_m <= ahead_m <= far_m:
+                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
+                if in_view and -wide_m <= left_m <= wide_m:
+                    seen = 1
+            dx, dy = right_x - x_m, right_y - y_m
+            ahead_m = dx * cosine + dy * sine
+            if near_m <= ahead_m <= far_m:
+                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
+                if in_view and -wide_m <= left_m <= wide_m:
+                    seen += 1
+            if seen:
+                lines_seen += seen
+                dx, dy = centre_x - x_m, centre_y - y_m
+                centre.append((dx * cosine + dy * sine, dy * cosine - dx * sine))
+        if len(centre) < POINTS_AT_LEAST:
+            return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
+        share = lines_seen * STATION_M / (2 * (far_m - near_m))
+        near_m, far_m = min(centre)[0], max(centre)[0]
+        return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
+
+
+def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
+    """Least squares for c0, c1 and, where `curved`, c2; two dozen points are too few for arrays to be faster.
+
+    x is taken from its mean, so that the normal equations are well conditioned.
+    """
+    n = len(points)
+    mean = sum(x for x, _ in points) / n
+    x2 = x3 = x4 = y0 = y1 = y2 = 0.0
+    for x, y in points:
+        u = x - mean
+        uu = u * u
+        x2 += uu
+        x3 += uu * u
+        x4 += uu * uu
+        y0 += y
+        y1 += y * u
+        y2 += y * uu
+    bend = 0.0
+    if curved:
+        bend = (y2 - y0 * x2 / n - y1 * x3 / x2) / (x4 - x2 * x2 / n - x3 * x3 / x2)
+    slope = (y1 - bend * x3) / x2
+    height = (y0 - bend * x2) / n
+    return height - slope * mean + bend * mean * mean, slope - 2 * bend * mean, bend

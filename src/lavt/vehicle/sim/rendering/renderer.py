@@ -1,0 +1,230 @@
+"""Pictures of a road for a camera on a car, made on the CPU.
+
+The ground is warped from tiles seen from above, in five bands of rows (`bands`); sky and hills are cut from a panorama;
+what stands upright is drawn from far to near; the sensor adds its noise. A frame depends on the poses, the frame's
+number and the seed alone: equal to the byte for equal versions and processor features.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from lavt.domain import CameraModel, FloatArray, Picture, Pose
+from lavt.streams import stream
+from lavt.vehicle.sim.rendering.bands import Band, bands_of
+from lavt.vehicle.sim.rendering.ground import Ground
+from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
+from lavt.vehicle.sim.rendering.panorama import Panorama
+from lavt.vehicle.sim.rendering.pinhole import View, levelled, principal_point, rolled, view_from
+from lavt.vehicle.sim.rendering.roadside_objects import standing
+from lavt.vehicle.sim.rendering.scenery import HAZE_M, Scenery
+from lavt.vehicle.sim.rendering.shadows import Shadows
+from lavt.vehicle.sim.road.road import Road
+
+SceneryKind = Literal["full", "light", "none"]
+"""full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails and no shadows either."""
+
+MOST_PARTS, MOST_INSTANTS = 8, 16
+"""An exposure is drawn in so many parts at most, the near ground in each from so many instants at most."""
+
+_STEP_PX = 3.0
+_NEAR_BANDS = 2
+_NOISE_DEVIATION = 2.2
+_NOISE_MARGIN_PX = 64
+_CLEAR_M = 11.0
+_KEPT_FROM_LEVEL = 2
+_SWERVE_M = 6.0
+_SWERVE_RAD = 0.6
+
+
+class Renderer:
+    """Draws one road in one light for one camera model."""
+
+    def __init__(
+        self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
+    ) -> None:
+        cv2.setNumThreads(1)  # with more the split of the work, and with it the last bit, may change
+        self._road, self._model, self._seed = road, model, seed
+        self._level = levelled(model)
+        self._ground, self._scenery = world(road, scenery, light)
+        self._bands = bands_of(self._level)
+        self._panorama = Panorama(self._level, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
+        self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
+        self._canvas = np.empty((self._level.height_px, self._level.width_px, 4), dtype=np.uint8)
+        self._kept, self._haze = _haze(self._level, self._bands, LIGHTS[light].haze)
+        self._noise = _noise(model)
+
+    def prepare(self) -> None:
+        """Do beforehand what would make a frame late: the coarse ground along the route, and the first picture."""
+        for s_m in np.arange(0.0, self._road.length_m + 16.0, 16.0):
+            heading_rad = float(self._road.point(s_m)[2])
+            for lateral_m in (-_SWERVE_M, 0.0, _SWERVE_M):
+                x_m, y_m = self._road.across(s_m, lateral_m).tolist()
+                for turned_rad in (-_SWERVE_RAD, 0.0, _SWERVE_RAD):
+                    self._prepare_ground(view_from(self._level, Pose(0, x_m, y_m, heading_rad + turned_rad)))
+        if self._scenery is not None:
+            self._scenery.prepare()
+        self.render(Pose(0, *self._road.start), 0)
+
+    def render(self, pose: Pose, number: int) -> Picture:
+        """Draw frame `number` as seen in one moment by a vehicle at `pose`; a new array each time."""
+        picture = self._drawn(pose)
+        self._add_noise(picture, number)
+        return picture
+
+    def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
+        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open.
+
+        The exposure is cut into parts, within which nothing but the near ground moves much; in each part that is seen
+        from several instants.
+        """
+        parts = _count(self._moved_px(begin, end, self._bands[_NEAR_BANDS].end_row), MOST_PARTS)
+        instants = _count(self._moved_px(begin, end, self._level.height_px - 1) / parts, MOST_INSTANTS)
+        light = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
+        for part in range(parts):
+            shares = (part + (np.arange(instants) + 0.5) / instants) / parts
+            near = [_between(begin, end, share) for share in shares.tolist()]
+            light += self._drawn(_between(begin, end, (part + 0.5) / parts), near)
+        picture = ((light + parts // 2) // parts).astype(np.uint8)
+        self._add_noise(picture, number)
+        return picture
+
+    def _drawn(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
+        """Draw the world without noise, from `pose`; the near ground as the mean of what is seen from `near`."""
+        view = view_from(self._level, pose)
+        self._panorama.cut(view.heading_rad, self._canvas[: self._bands[-1].first_row])
+        blurred = len(near) > 1
+        homography = view.ground_from_picture()
+        for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
+            self._warp(band, view, homography)
+        if blurred:
+            self._blur_near([view_from(self._level, each) for each in near])
+        self._add_haze()
+        picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
+        if self._scenery is not None:
+            self._scenery.draw(view, picture)
+        return picture if self._level is self._model else self._rolled(picture)
+
+    def _warp(self, band: Band, view: View, homography: FloatArray) -> None:
+        rows = self._canvas[band.first_row : band.end_row]
+        if not len(rows):
+            return
+        low = band.low_tile(view)
+        matrix = band.texel_from_ground(low) @ homography @ band.picture_from_lines
+        flags, size = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR, (rows.shape[1], rows.shape[0] * band.lines)
+        window = self._window(band, low)
+        if band.lines == 1:
+            cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
+            return
+        lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        # In NumPy: OpenCV's reduction by area takes longer than the warp.
+        light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
+        rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
+
+    def _window(self, band: Band, low: tuple[int, int]) -> Picture:
+        held = self._windows[band.level]
+        if held is None or held[0] != low:
+            held = (low, self._ground.window(band.level, low, band.tiles))
+            self._windows[band.level] = held
+        return held[1]
+
+    def _prepare_ground(self, view: View) -> None:
+        for band in self._bands[_KEPT_FROM_LEVEL:]:
+            low = band.low_tile(view)
+            for index in range(band.tiles**2 if self._ground.room(band.level) else 0):
+                self._ground.tile(band.level, low[0] + index % band.tiles, low[1] + index // band.tiles)
+
+    def _add_haze(self) -> None:
+        rows = self._canvas[self._bands[-1].first_row :][: len(self._kept)]
+        if len(rows):
+            cv2.multiply(rows, self._kept, rows, 1 / 255)
+            cv2.add(rows, self._haze, rows)
+
+    def _rolled(self, level: Picture) -> Picture:
+        model = self._model
+        level_from_picture = np.empty((2, 3))
+        level_from_picture[:, :2] = rolled(-model.roll_rad)
+        level_from_picture[:, 2] = np.array(principal_point(self._level)) - level_from_picture[:, :2] @ np.array(
+            principal_point(model)
+        )
+        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+        turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
+        return np.asarray(turned, dtype=np.uint8)
+
+    def _blur_near(self, views: Sequence[View]) -> None:
+        rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
+        light = np.zeros(rows.shape, dtype=np.uint16)
+        for view in views:
+            homography = view.ground_from_picture()
+            for band in self._bands[:_NEAR_BANDS]:
+                self._warp(band, view, homography)
+            light += rows
+        rows[:] = (light + len(views) // 2) // len(views)
+
+    def _moved_px(self, begin: Pose, end: Pose, row: int) -> float:
+        """How far the ground in the corners of a row moves in the picture, or the horizon if that is more."""
+        model = self._level
+        first, last = view_from(model, begin), view_from(model, end)
+        pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
+        ground = pixels @ first.ground_from_picture().T
+        turned_px = model.focal_px * abs(math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi))
+        if (ground[:, 2] <= 0.0).any():
+            return turned_px  # the row is above the horizon
+        places = np.column_stack([ground[:, :2] / ground[:, 2:], np.zeros(2)])
+        return max(float(np.hypot(*(last.project(places) - pixels)[:, :2].T).max()), turned_px)
+
+    def _add_noise(self, picture: Picture, number: int) -> None:
+        down, right = stream(self._seed, "sensor noise", number).integers(0, _NOISE_MARGIN_PX, 2).tolist()
+        part = np.s_[down : down + self._model.height_px, right : right + self._model.width_px]
+        cv2.add(picture, self._noise[0][part], picture)
+        cv2.subtract(picture, self._noise[1][part], picture)
+
+
+@lru_cache(maxsize=1)  # up to a gigabyte, for 600 m driven
+def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
+    """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
+    light = LIGHTS[light_name]
+    if scenery == "none":
+        return Ground(road, light, None), None
+    things = standing(road, trees=scenery == "full")
+    shadows = Shadows(things, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
+    return Ground(road, light, shadows), Scenery(things, light)
+
+
+def _count(moved_px: float, most: int) -> int:
+    return min(max(math.ceil(moved_px / _STEP_PX), 1), most)
+
+
+def _between(begin: Pose, end: Pose, share: float) -> Pose:
+    turn_rad = math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi)
+    return Pose(
+        begin.mono_ns + round((end.mono_ns - begin.mono_ns) * share),
+        begin.x_m + (end.x_m - begin.x_m) * share,
+        begin.y_m + (end.y_m - begin.y_m) * share,
+        begin.heading_rad + turn_rad * share,
+    )
+
+
+def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
+    """What haze leaves of the ground's far rows (255ths), and what it adds: (rows, columns, 4) each."""
+    rows = np.arange(bands[-1].first_row, bands[1].first_row)
+    angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
+    depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
+    share = np.broadcast_to(
+        (1.0 - np.exp(-np.maximum(depth_m - _CLEAR_M, 0.0) / HAZE_M))[:, None, None], (len(rows), model.width_px, 4)
+    )
+    added = share * np.array([*colour, 0.0])
+    return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
+
+
+def _noise(model: CameraModel) -> tuple[Picture, Picture]:
+    """Make what the sensor adds and what it takes away, larger than a picture; a frame gets a part of it."""
+    size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
+    noise = np.rint(stream(0, "sensor noise bank").standard_normal(size) * _NOISE_DEVIATION)
+    return np.clip(noise, 0, 255).astype(np.uint8), np.clip(-noise, 0, 255).astype(np.uint8)

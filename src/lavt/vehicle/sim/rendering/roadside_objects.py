@@ -1,0 +1,251 @@
+"""What stands beside a road: rails and barriers, lamp posts, trees and buildings.
+
+Their places and shapes are the world's, the same in every run and every light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.streams import stream
+from lavt.vehicle.sim.rendering.sprites import TREE_KINDS
+from lavt.vehicle.sim.road.cross_section import Rail
+from lavt.vehicle.sim.road.road import Road
+
+FAR_M = 160.0
+"""Nothing is seen beyond."""
+
+_WORLD_SEED = 0
+_DETAIL_M = 45.0
+_POST_SPACING_M = 4.0
+_LAMP_SPACING_M = 36.0
+_STOREY_M = 3.2
+_AROUND_M = 110.0
+_TREE_EVERY_M2 = 480.0
+_BUILDING_EVERY_M2 = 6200.0
+
+_BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] = {
+    "barrier": (
+        (0.0, 0.86, (164, 170, 172), FAR_M),
+        (0.0, 0.22, (132, 138, 140), _DETAIL_M),
+        (0.78, 0.86, (190, 196, 198), _DETAIL_M),
+    ),
+    "rail": (
+        (0.44, 0.76, (160, 158, 153), FAR_M),
+        (0.53, 0.62, (108, 108, 106), _DETAIL_M),
+        (0.62, 0.76, (178, 176, 170), _DETAIL_M),
+    ),
+}
+"""The faces of a rail in the order of painting: from and to which height (m), blue green red, how far it is seen."""
+
+_FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
+
+
+@dataclass(frozen=True, slots=True)
+class Faces:
+    """Upright quadrilaterals: corners (n, 4, 3) in m (begin low, end low, end high, begin high), colours (n, 3).
+
+    `normals` (n, 2) are level unit vectors towards who drives on the road, `seen_to_m` (n,) how far each is seen.
+    """
+
+    corners_m: FloatArray
+    colours: FloatArray
+    normals: FloatArray
+    seen_to_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Walls:
+    """Walls of buildings: outlines (n, 4, 3) as of `Faces`, colours, outward normals, and each one's windows."""
+
+    outlines_m: FloatArray
+    colours: FloatArray
+    normals: FloatArray
+    windows_m: tuple[FloatArray, ...]
+
+
+_NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Everything that stands along one road.
+
+    `poles` are (n, 5): x, y, foot, top, width in metres; `trees` (n, 4): x, y, height (m), kind; `tree_road_rad` (n,)
+    the heading of the road beside each tree.
+    """
+
+    faces: Faces
+    poles: FloatArray
+    trees: FloatArray
+    tree_road_rad: FloatArray
+    walls: Walls
+
+
+def standing(road: Road, *, trees: bool) -> Standing:
+    """Place everything along a road; `trees` says whether trees, lamp posts and buildings are there too."""
+    runs = [_stations(road, rail) for rail in road.rails]
+    planted = _plant(road) if trees else np.empty((0, 4))
+    return Standing(
+        faces=_join_faces([*_rail_faces(road, runs), *_lamp_faces(road, runs if trees else [])]),
+        poles=_poles(road, runs, lamps=trees),
+        trees=planted,
+        tree_road_rad=_road_heading(road, planted[:, :2]),
+        walls=_build(road) if trees else _NO_WALLS,
+    )
+
+
+def _stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
+    first_m, last_m = max(rail.from_m, road.first_m), min(rail.to_m, road.last_m)
+    return rail, np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _POST_SPACING_M) + 1))
+
+
+def _lamp_stations(stations: FloatArray) -> FloatArray:
+    return np.arange(stations[0] + 6.0, stations[-1], _LAMP_SPACING_M)
+
+
+def _rail_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
+    found = []
+    for rail, stations in runs:
+        line = road.across(stations, rail.offset_m)
+        # Every piece a little different, so that the eye can see them pass.
+        tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
+        normals = _beside(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
+        for low_m, high_m, colour, seen_to_m in _BANDS[rail.kind]:
+            corners = _upright(line[:-1], line[1:], low_m, high_m)
+            found.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), seen_to_m)))
+    return found
+
+
+def _lamp_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
+    """Make the arms of lamp posts, to both sides."""
+    found = []
+    for rail, stations in runs:
+        if rail.kind == "barrier":
+            places = _lamp_stations(stations)
+            begin, end = road.across(places, rail.offset_m - 1.8), road.across(places, rail.offset_m + 1.8)
+            corners = _upright(begin, end, 9.35, 9.55)
+            normals = _beside(begin, end)
+            found.append(Faces(corners, np.full((len(corners), 3), 104.0), normals, np.full(len(corners), FAR_M)))
+    return found
+
+
+def _beside(begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Level unit vectors to the left of the way from `begin` to `end`, (n, 2)."""
+    along = end - begin
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    return np.asarray(left / np.maximum(np.hypot(left[:, :1], left[:, 1:]), 1e-9))
+
+
+def _upright(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
+    low, high = np.full(len(begin), low_m), np.full(len(begin), high_m)
+    corners = [(begin, low), (end, low), (end, high), (begin, high)]
+    return np.stack([np.column_stack(corner) for corner in corners], axis=1)
+
+
+def _join_faces(faces: Sequence[Faces]) -> Faces:
+    return Faces(
+        np.concatenate([np.empty((0, 4, 3)), *(each.corners_m for each in faces)]),
+        np.concatenate([np.empty((0, 3)), *(each.colours for each in faces)]),
+        np.concatenate([np.empty((0, 2)), *(each.normals for each in faces)]),
+        np.concatenate([np.empty(0), *(each.seen_to_m for each in faces)]),
+    )
+
+
+def _poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
+    """Place posts of rails and lamp posts on barriers."""
+    poles = [np.empty((0, 5))]
+    for rail, stations in runs:
+        if rail.kind == "rail":
+            place, shape = road.across(stations, rail.offset_m), (0.0, 0.72, 0.12)
+        elif lamps:
+            place, shape = road.across(_lamp_stations(stations), rail.offset_m), (0.8, 9.5, 0.16)
+        else:
+            continue
+        poles.append(np.column_stack([place, np.tile(shape, (len(place), 1))]))
+    return np.concatenate(poles)
+
+
+def _middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
+    """Points (n, 2) along the middle of the asphalt, the heading (n,) there, and half its width."""
+    left_m = max(strip.left_m for strip in road.paved)
+    right_m = min(strip.right_m for strip in road.paved)
+    stations = np.arange(road.first_m - 40.0, road.last_m + 40.0, 4.0)
+    return road.across(stations, (left_m + right_m) / 2), road.point(stations)[2], (left_m - right_m) / 2
+
+
+def _road_heading(road: Road, places: FloatArray) -> FloatArray:
+    middle, heading_rad, _ = _middle(road)
+    nearest = ((places[:, None] - middle[None]) ** 2).sum(axis=-1).argmin(axis=1)
+    return np.asarray(heading_rad[nearest], dtype=np.float64)
+
+
+def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> FloatArray:
+    """Random places around the road, one in `every_m2`, none nearer than `clear_m` to its asphalt."""
+    middle, _, half_width_m = _middle(road)
+    low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
+    places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
+    distance = np.full(len(places), np.inf)
+    for x_m, y_m in middle:  # point after point: a table of all distances does not fit a long road
+        np.minimum(distance, np.hypot(places[:, 0] - x_m, places[:, 1] - y_m), out=distance)
+    return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
+
+
+def _plant(road: Road) -> FloatArray:
+    places = _free_places(road, "tree places", _TREE_EVERY_M2, clear_m=6.0)
+    random = stream(_WORLD_SEED, "tree shapes")
+    kinds = random.integers(0, TREE_KINDS, len(places))
+    heights = np.where(
+        kinds == TREE_KINDS - 1, random.uniform(1.2, 2.6, len(places)), random.uniform(5.5, 12.0, len(places))
+    )
+    return np.column_stack([places, heights, kinds])
+
+
+def _build(road: Road) -> Walls:
+    random = stream(_WORLD_SEED, "building shapes")
+    outlines, colours, normals, windows = [], [], [], []
+    for place in _free_places(road, "building places", _BUILDING_EVERY_M2, clear_m=24.0):
+        length_m, width_m, storeys = random.uniform(14, 34), random.uniform(10, 16), int(random.integers(2, 7))
+        heading_rad = random.uniform(0, math.pi)
+        colour = np.array(_FACADES[int(random.integers(0, len(_FACADES)))], dtype=np.float64)
+        forward = np.array([math.cos(heading_rad), math.sin(heading_rad)]) * length_m / 2
+        left = np.array([-math.sin(heading_rad), math.cos(heading_rad)]) * width_m / 2
+        corners = np.array([forward - left, forward + left, -forward + left, -forward - left]) + place
+        for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            columns = max(2, round(float(np.hypot(*(end - begin))) / 3.0))
+            first = (np.arange(columns) + 0.25) / columns
+            sill = np.linspace(1.0, 1.0 + _STOREY_M * (storeys - 1), storeys)
+            windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
+            whole, height_m = (np.zeros(1), np.ones(1)), (np.zeros(1), np.full(1, _STOREY_M * storeys + 0.5))
+            outlines.append(_panels(begin, end, shares=whole, heights_m=height_m)[0])
+            normals.append(-_beside(begin[None], end[None])[0])
+            colours.append(colour)
+    return Walls(
+        np.array(outlines).reshape(-1, 4, 3),
+        np.array(colours).reshape(-1, 3),
+        np.array(normals).reshape(-1, 2),
+        tuple(windows),
+    )
+
+
+def _panels(
+    begin: FloatArray,
+    end: FloatArray,
+    *,
+    shares: tuple[FloatArray, FloatArray],
+    heights_m: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Rectangles on a wall: every (first, last) share of its length with every (low, high) height, (n, 4, 3)."""
+    left = begin + shares[0][:, None] * (end - begin)
+    right = begin + shares[1][:, None] * (end - begin)
+    panels = [
+        [[*near, low], [*far, low], [*far, high], [*near, high]]
+        for low, high in zip(*heights_m, strict=True)
+        for near, far in zip(left, right, strict=True)
+    ]
+    return np.array(panels)

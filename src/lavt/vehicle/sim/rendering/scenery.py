@@ -1,0 +1,159 @@
+"""Draws what stands beside the road, from far to near, in one light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from itertools import repeat
+from operator import itemgetter
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lavt.domain import FloatArray, Picture
+from lavt.vehicle.sim.rendering.light import Light
+from lavt.vehicle.sim.rendering.pinhole import View
+from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, Standing
+from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, Trees
+
+HAZE_M = 240.0
+"""At this distance 63 % of a thing's colour is haze."""
+
+_NEAR_M = 0.4
+_SUBPIXEL_BITS = 4
+_LARGEST_PX = 4000.0
+_GLASS = (104.0, 88.0, 74.0)
+_POLE = 96.0
+
+Drawing = tuple[float, Callable[..., None], Any, Any]
+"""Depth (m), what draws the thing, and its two arguments after the picture."""
+
+
+class Scenery:
+    """Everything that stands along one road, in one light."""
+
+    def __init__(self, standing: Standing, light: Light) -> None:
+        self._standing = standing
+        faces, walls = standing.faces, standing.walls
+        self._colours = faces.colours * light.upright(faces.normals)
+        self._pole_colour = _POLE * light.upright(np.zeros((1, 2)))
+        self._wall_colours = walls.colours * light.upright(walls.normals)
+        self._glass = np.array(_GLASS) * light.upright(walls.normals)
+        # The trees' pictures have the sun to the left: those that see it to the right of the road are mirrored.
+        mirrored = np.sin(light.azimuth_rad - standing.tree_road_rad) < 0
+        self._trees = np.column_stack([standing.trees, mirrored])
+        self._haze = np.array(light.haze)
+        self._sprites = Trees(light)
+
+    def prepare(self) -> None:
+        """Paint beforehand what is slow."""
+        self._sprites.prepare()
+
+    def draw(self, view: View, picture: Picture) -> None:
+        """Draw into `picture` what is in view."""
+        things: list[Drawing] = [
+            *self._faces(view), *self._poles(view), *self._tree_drawings(view), *self._walls(view)
+        ]  # fmt: skip
+        things.sort(key=itemgetter(0), reverse=True)  # stable: faces of one piece stay in the order of painting
+        for _, draw, shape, look in things:
+            draw(picture, shape, look)
+
+    def _faces(self, view: View) -> Iterable[Drawing]:
+        faces = self._standing.faces
+        corners = faces.corners_m
+        ahead = _ahead(corners[:, :2, :2], view)
+        near = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.seen_to_m))
+        ahead = ahead[near]
+        points = view.project(_clipped(corners[near], ahead))
+        inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
+        # Faces of one piece have one depth.
+        depth = np.maximum(ahead[inside], _NEAR_M).mean(axis=1)
+        shades = self._hazed(self._colours[near[inside]], depth)
+        return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
+
+    def _poles(self, view: View) -> Iterable[Drawing]:
+        ahead = _ahead(self._standing.poles[:, :2], view)
+        shown = (ahead > 1.0) & (ahead < FAR_M)
+        poles, depth = self._standing.poles[shown], ahead[shown]
+        ends = view.project(np.stack([poles[:, :3], poles[:, [0, 1, 3]]], axis=1))
+        inside = (ends[:, 0, 0] > -20) & (ends[:, 0, 0] < view.model.width_px + 20)
+        depth = depth[inside]
+        widths = np.clip(np.rint(poles[inside, 4] * view.model.focal_px / depth), 1, 40).astype(int).tolist()
+        shades = self._hazed(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
+        looks = zip(shades, widths, strict=True)
+        # A pole stands behind the face it carries.
+        return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), looks)
+
+    def _tree_drawings(self, view: View) -> Iterable[Drawing]:
+        ahead = _ahead(self._trees[:, :2], view)
+        trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
+        feet = view.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
+        heights = trees[:, 2] * view.model.focal_px / feet[:, 2]
+        reach = heights * (TREE_WIDTH / 2)
+        inside = (heights >= 3) & (feet[:, 0] > -reach) & (feet[:, 0] < view.model.width_px + reach)
+        shapes = np.column_stack([feet[:, :2], heights, trees[:, 3:]])[inside].tolist()
+        depth = feet[inside, 2]
+        haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
+        return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
+
+    def _walls(self, view: View) -> Iterable[Drawing]:
+        walls = self._standing.walls
+        outlines = walls.outlines_m
+        begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
+        # Seen from outside, a wall's outline runs from the left to the right.
+        seen = (view.x_m - begin[:, 0]) * (end - begin)[:, 1] > (view.y_m - begin[:, 1]) * (end - begin)[:, 0]
+        ahead = _ahead(outlines[:, :2, :2], view)
+        seen &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
+        points = view.project(outlines)
+        seen &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
+        shown = np.flatnonzero(seen)
+        depth = ahead[shown].mean(axis=1)
+        windows = [list(_subpixels(view.project(walls.windows_m[wall]))) for wall in shown]
+        walls_and_glass = (self._hazed(colours[shown], depth).tolist() for colours in (self._wall_colours, self._glass))
+        shapes = zip(_subpixels(points[shown]), windows, strict=True)
+        return zip(depth.tolist(), repeat(_facade), shapes, zip(*walls_and_glass, strict=True))
+
+    def _hazed(self, colours: FloatArray, depth_m: FloatArray) -> FloatArray:
+        share = (1.0 - np.exp(-depth_m / HAZE_M))[:, None]
+        return np.asarray(np.minimum(np.rint(colours * (1 - share) + self._haze * share), 255.0))
+
+
+def _polygon(picture: Picture, polygon: NDArray[np.int32], colour: list[float]) -> None:
+    cv2.fillConvexPoly(picture, polygon, colour, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _line(picture: Picture, ends: list[list[int]], look: tuple[list[float], int]) -> None:
+    cv2.line(picture, ends[0], ends[1], look[0], look[1], cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _facade(
+    picture: Picture,
+    shape: tuple[NDArray[np.int32], list[NDArray[np.int32]]],
+    colours: tuple[list[float], list[float]],
+) -> None:
+    cv2.fillConvexPoly(picture, shape[0], colours[0], cv2.LINE_AA, _SUBPIXEL_BITS)
+    cv2.fillPoly(picture, shape[1], colours[1], cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _ahead(points_m: FloatArray, view: View) -> FloatArray:
+    """How far ahead of the camera points (..., 2) are."""
+    along = (points_m[..., 0] - view.x_m) * math.cos(view.heading_rad)
+    return np.asarray(along + (points_m[..., 1] - view.y_m) * math.sin(view.heading_rad))
+
+
+def _clipped(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
+    """Faces with the part that is not in front of the camera cut off; `ahead` (n, 2) is of their begin and end."""
+    for near, far in ((0, 1), (1, 0)):
+        cut = ahead[:, near] < _NEAR_M
+        if cut.any():
+            share = ((_NEAR_M - ahead[cut, near]) / (ahead[cut, far] - ahead[cut, near]))[:, None]
+            for here, there in ((near, far), (3 - near, 3 - far)):
+                corners_m[cut, here] += share * (corners_m[cut, there] - corners_m[cut, here])
+    return corners_m
+
+
+def _subpixels(points: FloatArray) -> NDArray[np.int32]:
+    limited = np.minimum(np.maximum(points[..., :2], -_LARGEST_PX), _LARGEST_PX)
+    return np.asarray(np.rint(limited * (1 << _SUBPIXEL_BITS)), dtype=np.int32)

@@ -1,0 +1,228 @@
+"""Trees and a bush, painted once for each light and scaled to what the camera sees of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from lavt.domain import FloatArray, Picture
+from lavt.streams import stream
+from lavt.vehicle.sim.rendering.light import Light
+from lavt.vehicle.sim.rendering.textures import Grey
+
+TREE_KINDS = 5
+"""Three broad-leaved trees, a conifer, and last a bush."""
+
+_WORLD_SEED = 0
+_HEIGHT_PX = 256
+_WIDTH_PX = 208
+TREE_WIDTH = _WIDTH_PX / _HEIGHT_PX
+"""Width of a tree's picture as a share of its height."""
+
+_SHADOW_REDUCTION = 4
+_LARGEST_KEPT_PX = 64
+_KEPT = 2000
+_HAZE_STEPS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Sprite:
+    """What a tree adds to a picture, and what it leaves of it, 0 to 255 (rows, columns, 3)."""
+
+    adds: Picture
+    leaves: Picture
+
+
+class Trees:
+    """The trees in one light."""
+
+    def __init__(self, light: Light) -> None:
+        self._light = light
+        self._kept: dict[tuple[int, bool, int, int], Sprite] = {}
+
+    def prepare(self) -> None:
+        """Paint all trees beforehand."""
+        for kind in range(TREE_KINDS):
+            for mirrored in (False, True):
+                _lit(self._light, kind, mirrored)
+
+    def draw(self, picture: Picture, shape: Sequence[float], haze: float) -> None:
+        """Draw a tree into `picture`; `haze` is the share of haze in its colour.
+
+        `shape` is where its foot is (u, v), how high it is in pixels, its kind, and whether it is mirrored.
+        """
+        foot_u, foot_v, height_px, kind, mirrored = shape
+        what = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
+        if height_px > _LARGEST_KEPT_PX:
+            self._draw_large(picture, what, height_px, (foot_u, foot_v))
+            return
+        rows = round(height_px)
+        sprite = self._small(*what, rows)
+        columns = sprite.adds.shape[1]
+        left, top = round(foot_u - columns / 2), round(foot_v) - rows + 1
+        low_u, high_u = max(left, 0), min(left + columns, picture.shape[1])
+        low_v, high_v = max(top, 0), min(top + rows, picture.shape[0])
+        if low_u < high_u and low_v < high_v:
+            part = np.s_[low_v - top : high_v - top, low_u - left : high_u - left]
+            _lay(picture[low_v:high_v, low_u:high_u], sprite.adds[part], sprite.leaves[part])
+
+    def _small(self, kind: int, mirrored: bool, step: int, rows: int) -> Sprite:
+        key = (kind, mirrored, step, rows)
+        sprite = self._kept.get(key)
+        if sprite is None:
+            whole = _whole(self._light, kind, mirrored, step, 0)
+            size = (max(2, round(rows * TREE_WIDTH)), rows)
+            sprite = Sprite(_resized(whole.adds, size), _resized(whole.leaves, size))
+            if len(self._kept) >= _KEPT:
+                self._kept.clear()
+            self._kept[key] = sprite
+        return sprite
+
+    def _draw_large(
+        self, picture: Picture, what: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
+    ) -> None:
+        """Scale only what of the tree is in the picture, to fractions of a pixel: large trees would jump otherwise."""
+        width_px = height_px * TREE_WIDTH
+        left, top = foot_px[0] - width_px / 2, foot_px[1] - height_px
+        low_u, high_u = max(round(left), 0), min(round(left + width_px), picture.shape[1])
+        low_v, high_v = max(round(top), 0), min(round(top + height_px), picture.shape[0])
+        if low_u >= high_u or low_v >= high_v:
+            return
+        kind, mirrored, step = what
+        whole = _whole(self._light, kind, mirrored, step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
+        scale = whole.adds.shape[0] / height_px
+        matrix = np.array(
+            [
+                [scale, 0.0, (low_u - left + 0.5) * scale - 0.5],
+                [0.0, scale, (low_v - top + 0.5) * scale - 0.5],
+            ]
+        )
+        size, flags = (high_u - low_u, high_v - low_v), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        adds = cv2.warpAffine(whole.adds, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        border = (255.0, 255.0, 255.0)
+        leaves = cv2.warpAffine(
+            whole.leaves, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=border
+        )
+        _lay(picture[low_v:high_v, low_u:high_u], np.asarray(adds, np.uint8), np.asarray(leaves, np.uint8))
+
+
+def _lay(under: Picture, adds: Picture, leaves: Picture) -> None:
+    cv2.multiply(under, leaves, under, 1 / 255)
+    cv2.add(under, adds, under)
+
+
+def _resized(image: Picture, size: tuple[int, int]) -> Picture:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+@lru_cache(maxsize=240)
+def _whole(light: Light, kind: int, mirrored: bool, step: int, halvings: int) -> Sprite:
+    """Make the sprite of a tree in full size, halved so many times."""
+    if halvings:
+        larger = _whole(light, kind, mirrored, step, halvings - 1)
+        size = (_WIDTH_PX >> halvings, _HEIGHT_PX >> halvings)
+        return Sprite(_resized(larger.adds, size), _resized(larger.leaves, size))
+    clear, hazed, leaves = _lit(light, kind, mirrored)
+    share = step / _HAZE_STEPS
+    return Sprite(np.asarray(cv2.addWeighted(clear, 1 - share, hazed, share, 0.0), dtype=np.uint8), leaves)
+
+
+@lru_cache(maxsize=6 * TREE_KINDS)
+def _lit(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture, Picture]:
+    """What a tree adds to a picture without haze and in nothing but haze, and what it leaves."""
+    colour, alpha = _painted(kind)
+    if mirrored:
+        colour, alpha = colour[:, ::-1], alpha[:, ::-1]
+    # The painting is of a tree in the noon sun: its dark side takes the colour of shade, its bright one of the sun.
+    brightness = np.clip(colour.mean(axis=2, keepdims=True) / 75.0, 0.0, 1.0)
+    if light.shadows:
+        factor = np.array(light.shade) * 1.7 * (1 - brightness) + np.array(light.lit) * brightness
+        lit = colour * np.minimum(factor, 1.15)
+    else:
+        # Under clouds light comes from everywhere: the picture loses most of its contrast.
+        mean = colour[alpha > 0].mean(axis=0)
+        lit = (mean + 0.45 * (colour - mean)) * np.array(light.lit)
+    cover = alpha[..., None] / 255.0
+    clear, hazed = (np.clip(np.rint(each * cover), 0, 255).astype(np.uint8) for each in (lit, np.array(light.haze)))
+    return clear, hazed, np.repeat(255 - alpha[..., None], 3, axis=2)
+
+
+@lru_cache(maxsize=TREE_KINDS)
+def tree_shape(kind: int) -> Grey:
+    """Outline of a tree as its shadow sees it, 0 to 255; small, so that the shadow's edge is soft."""
+    _, alpha = _painted(kind)
+    size = (_WIDTH_PX // _SHADOW_REDUCTION, _HEIGHT_PX // _SHADOW_REDUCTION)
+    return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+@lru_cache(maxsize=TREE_KINDS)
+def _painted(kind: int) -> tuple[Picture, Grey]:
+    """Colour (rows, columns, 3) and cover of a tree, the sun at its upper left."""
+    random = stream(_WORLD_SEED, "tree", kind)
+    leaf = np.array([46.0, 92.0, 70.0]) * random.uniform(0.75, 1.1) + random.uniform(-8, 8, 3)
+    colour = np.broadcast_to(np.clip(leaf * 0.55, 0, 255), (_HEIGHT_PX, _WIDTH_PX, 3)).astype(np.uint8).copy()
+    alpha = np.zeros((_HEIGHT_PX, _WIDTH_PX), dtype=np.uint8)
+    middle = _WIDTH_PX // 2
+    if kind != TREE_KINDS - 1:
+        _paint_trunk(colour, alpha, middle, random)
+    for u, v, radius, light in _leaves(kind, random):
+        shade = np.clip(leaf * light + random.uniform(-5, 5, 3), 0, 255).tolist()
+        centre, size = (round(u * 8), round(v * 8)), round(radius * 8)
+        cv2.circle(colour, centre, size, shade, -1, cv2.LINE_AA, 3)
+        cv2.circle(alpha, centre, size, (255,), -1, cv2.LINE_AA, 3)
+    return colour, alpha
+
+
+def _paint_trunk(colour: Picture, alpha: Grey, middle: int, random: np.random.Generator) -> None:
+    ways = [((middle, _HEIGHT_PX), (middle, 120), 8)]
+    ways += [
+        ((middle, round(v)), (round(middle + u), round(v - 60)), 4)
+        for u, v in random.uniform((-50, 130), (50, 190), (5, 2))
+    ]
+    for begin, end, width_px in ways:
+        for image, paint in ((colour, (38, 50, 62)), (alpha, (255,))):
+            cv2.line(image, begin, end, paint, width_px, cv2.LINE_AA)
+
+
+def _leaves(kind: int, random: np.random.Generator) -> FloatArray:
+    """Tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
+    count = 3200
+    middle = _WIDTH_PX / 2
+    if kind == 3:  # a conifer: a cone of tiers
+        down = np.sqrt(random.uniform(0.0, 1.0, count))
+        across = random.uniform(-1.0, 1.0, count)
+        tier = 1.0 - 0.28 * np.mod(down * 8.0, 1.0)[::-1]
+        u = middle + across * (4 + down * 72) * tier
+        v = 8 + down * 214 + 10 * np.abs(across)
+        light = 0.60 - 0.28 * across + random.uniform(-0.20, 0.20, count) + 0.1 * (1 - down)
+        near = random.uniform(0, 1, count)
+    else:
+        u, v, light, near = _crown(kind, random, count, middle)
+    order = np.argsort(near)
+    radius = random.uniform(1.4, 3.6, count)
+    return np.stack([u, v, radius, light], axis=-1)[order]
+
+
+def _crown(
+    kind: int, random: np.random.Generator, count: int, middle: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """A crown is made of clumps, each a ball of leaves with a bright and a dark side, before and behind each other."""
+    bush = kind == TREE_KINDS - 1
+    clumps = 26
+    half_height, centre_v, half_width = (84.0, 150.0, 70.0) if bush else (62.0, 96.0, 70.0)
+    angle, away = random.uniform(0, 2 * np.pi, clumps), np.sqrt(random.uniform(0.02, 1, clumps))
+    clump_u, clump_v = np.cos(angle) * away * half_width, np.sin(angle) * away * half_height
+    clump_near, clump_size = random.uniform(0, 1, clumps), random.uniform(17.0, 30.0, clumps)
+    of = random.integers(0, clumps, count)
+    turn, out = random.uniform(0, 2 * np.pi, count), np.sqrt(random.uniform(0, 1, count)) ** 0.8
+    u_in, v_in = np.cos(turn) * out, np.sin(turn) * out
+    u = middle + clump_u[of] + u_in * clump_size[of]
+    v = centre_v + clump_v[of] + v_in * clump_size[of]
+    light = 0.80 - 0.26 * u_in - 0.34 * v_in
+    light += -0.14 * clump_u[of] / half_width - 0.26 * clump_v[of] / half_height + 0.16 * clump_near[of]
+    light += random.uniform(-0.16, 0.16, count)
+    return u, np.minimum(v, _HEIGHT_PX - 3.0), light, clump_near[of] + 0.25 * random.uniform(0, 1, count)

@@ -1,0 +1,1 @@
+"""Roads: files, centre lines, cross-sections and markings."""

@@ -1,0 +1,164 @@
+"""A road as data: the centre of the driven lane as lines, arcs and clothoids, and what lies across it.
+
+The reference is the centre of the driven lane. A station `s_m` is a distance along it, 0 at the route's start; a
+lateral offset is across it, left positive. Roads are flat. Their files are explained in `docs/roads.md`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lavt.domain import FloatArray
+from lavt.errors import UserError
+from lavt.vehicle.sim.road.centreline import Centreline, Segment
+from lavt.vehicle.sim.road.cross_section import Lanes, Paved, Rail, RoadMark, moved_start
+from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
+
+PROJECTION_WINDOW_M = 15.0
+"""How far from the last known station a projection looks: a search of the whole road may jump to a far carriageway."""
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road and the route on it.
+
+    The route is stations 0 to `length_m`; the segments begin at station `first_m`, before the start, with the pose
+    `origin` (x, y in m, heading in rad, the world's frame), and go on beyond the end. Beyond both ends it is straight.
+    """
+
+    title: str
+    origin: tuple[float, float, float]
+    first_m: float
+    length_m: float
+    segments: tuple[Segment, ...]
+    lanes: Lanes
+    paved: tuple[Paved, ...]
+    marks: tuple[RoadMark, ...]
+    rails: tuple[Rail, ...]
+
+    @cached_property
+    def last_m(self) -> float:
+        """Station where the last segment ends."""
+        return self._centreline.last_m
+
+    @cached_property
+    def start(self) -> tuple[float, float, float]:
+        """x, y (m) and heading (rad) of the route's start, in the world's frame."""
+        x_m, y_m, heading_rad, _ = self.point(0.0)
+        return float(x_m), float(y_m), float(heading_rad)
+
+    def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Tell x, y (m), heading (rad) and curvature (1/m) of the lane's centre at the stations `s_m`, any shape."""
+        return self._centreline.point(s_m)
+
+    def across(self, s_m: ArrayLike, offset_m: ArrayLike) -> FloatArray:
+        """World x, y (m) of the points at stations `s_m` and lateral offsets `offset_m`: shape (..., 2)."""
+        x_m, y_m, heading_rad, _ = self.point(s_m)
+        offset = np.asarray(offset_m, dtype=np.float64)
+        return np.stack([x_m - offset * np.sin(heading_rad), y_m + offset * np.cos(heading_rad)], axis=-1)
+
+    def project(self, x_m: float, y_m: float, near_s_m: float) -> tuple[float, float, float]:
+        """Find the point of the lane's centre nearest to a place.
+
+        Only stations within `PROJECTION_WINDOW_M` of `near_s_m` are looked at. Returns the point's station (m), the
+        place's lateral offset (m, left positive) and the lane's heading (rad) there.
+        """
+        window_m = PROJECTION_WINDOW_M
+        return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
+
+    def part(self, title: str, from_m: float, length_m: float) -> Road:
+        """Give the same road with a route that begins at station `from_m`: nothing on the ground changes."""
+        return replace(
+            self,
+            title=title,
+            first_m=self.first_m - from_m,
+            length_m=length_m,
+            paved=tuple(moved_start(each, from_m) for each in self.paved),
+            marks=tuple(replace(moved_start(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks),
+            rails=tuple(moved_start(each, from_m) for each in self.rails),
+        )
+
+    @cached_property
+    def _centreline(self) -> Centreline:
+        return Centreline(self.first_m, self.origin, self.segments)
+
+
+def road_names() -> list[str]:
+    """Names of the roads that come with the package, sorted."""
+    folder = resources.files("lavt") / "data" / "roads"
+    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
+
+
+def load_road(name: str) -> Road:
+    """Read the road that comes with LAVT under `name`, or the one in the file of that path.
+
+    Raises `UserError` where there is none, and for what is wrong in a file.
+    """
+    return parse_road(*_text_of(name))
+
+
+def parse_road(text: str, source: str) -> Road:
+    """Read a road from YAML text; `UserError` that names `source` and the key when a key or a value is wrong.
+
+    A part of a road names a road that comes with LAVT, or a file beside its own.
+    """
+    read = read_road_file(text, source)
+    if isinstance(read, RoadFile):
+        return _whole(read)
+    try:
+        of_file = read_road_file(*_text_of(_beside(source, read.part_of)))
+    except UserError as error:
+        raise UserError(f"{source} is a part of {read.part_of}: {error}") from error
+    if not isinstance(of_file, RoadFile):
+        raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole as part_of")
+    whole = _whole(of_file)
+    room_m = whole.last_m - read.from_m
+    if room_m <= 0.0:
+        raise UserError(f"{source}: {read.part_of} ends at {whole.last_m:.1f} m: from_m must be less")
+    if read.length_m > room_m:
+        raise UserError(f"{source}: {read.part_of} has only {room_m:.1f} m from {read.from_m} m on: shorten length_m")
+    return whole.part(read.title, read.from_m, read.length_m)
+
+
+def _whole(read: RoadFile) -> Road:
+    x_m, y_m, heading_rad = read.start
+    run_in_m = read.run_in_m
+    return Road(
+        title=read.title,
+        origin=(x_m - run_in_m * math.cos(heading_rad), y_m - run_in_m * math.sin(heading_rad), heading_rad),
+        first_m=-run_in_m,
+        length_m=read.route_m,
+        segments=read.all_segments,
+        lanes=read.lanes,
+        paved=read.all_paved,
+        marks=read.all_marks,
+        rails=read.rails,
+    )
+
+
+def _text_of(name: str) -> tuple[str, str]:
+    """Read the file of a road; give its text and what to call it."""
+    if name in road_names():
+        file = resources.files("lavt") / "data" / "roads" / f"{name}.yaml"
+        return file.read_text(encoding="utf-8"), f"{name}.yaml"
+    if not name.endswith((".yaml", ".yml")):
+        raise UserError(
+            f"there is no road {name!r}: name one that comes with LAVT ({', '.join(road_names())}) or a .yaml file"
+        )
+    try:
+        return Path(name).read_text(encoding="utf-8"), name
+    except OSError as error:
+        raise UserError(f"the road {name} cannot be read ({error.strerror}): name an existing file") from error
+    except ValueError as error:  # bytes that are no text, a path with a zero in it
+        raise UserError(f"the road {name} is not a text file: {error}") from error
+
+
+def _beside(source: str, part_of: str) -> str:
+    return part_of if part_of in road_names() else str(Path(source).parent / part_of)

@@ -1,0 +1,52 @@
+"""Software cars made of a server's config."""
+
+from __future__ import annotations
+
+import pytest
+from tests.vehicle.software_car.rig import START_NS, Asked, Hand1, Hand2
+
+from lavt.assembly.dbw import load_profile
+from lavt.assembly.simulators import simulator_of
+from lavt.assembly.software_car import build_software_car
+from lavt.config import DbwConfig, ServerConfig, VehicleConfig
+from lavt.vehicle.sim.road.road import load_road
+from lavt.vehicle.software_car.car import SoftwareCar
+
+
+def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
+    return build_software_car(config or ServerConfig(), load_profile(profile), load_road("a_key"), START_NS)
+
+
+@pytest.mark.parametrize(
+    ("profile", "obeyed"),
+    [
+        ("dataspeed_gen1", "generation 1"),
+        ("dataspeed_gen2", "remote"),
+        ("dataspeed_gen2:remote", "remote"),
+        ("dataspeed_gen2:user", "user"),
+    ],
+)
+def test_the_kit_is_the_profiles(profile: str, obeyed: str) -> None:
+    """The kit obeys the commands of the generation and set that the profile is for, and no others."""
+    hands: dict[str, Hand1 | Hand2] = {"generation 1": Hand1(), "remote": Hand2(), "user": Hand2(first=0x210)}
+    for name, hand in hands.items():
+        car = built(profile)
+        for frame in hand.commands(Asked(brake=0.5)):
+            car.receive(frame, START_NS)
+        assert (car.kit.state.actuators["brake"].order is not None) == (name == obeyed)
+
+
+def test_the_car_is_the_servers() -> None:
+    """The car begins where a simulator of the same config begins, with its seed and its lags."""
+    config = ServerConfig(seed=7, vehicle=VehicleConfig(steering_lag_ms=250.0))
+    car, simulator = built("dataspeed_gen2", config), simulator_of(config, load_road("a_key"), START_NS)
+    assert car.simulator.ground_truth() == simulator.ground_truth()
+    assert car.simulator.ground_truth() != built("dataspeed_gen2").simulator.ground_truth()
+    assert car.simulator._parameters.steering_lag_s == 0.25
+
+
+def test_a_config_with_options_of_a_bus_can_be_compared() -> None:
+    """Configs of equal options are equal and have one hash, as whoever remembers by them needs."""
+    one, same, other = (VehicleConfig(dbw=DbwConfig(options={"port": port})) for port in (1, 1, 2))
+    assert hash(one) == hash(same)
+    assert len({one, same, other}) == 2

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lavt.experiment.analysis.latency import ages_at_actuation_ns
+from lavt.experiment.analysis.metrics import measure
+from lavt.recording.record import read_record
+from lavt.recording.table import table_of
+
+MakeRun = Callable[..., Path]
+
+
+def test_every_hop_is_timed_in_the_order_of_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
+    """Hops have their recorded durations; a link is tau less what the nodes did, whatever the clocks show."""
+    make_run(tmp_path)
+    entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
+    hops = {(hop["node"], hop["hop"]): hop for hop in entry["hops_ms"]}
+    assert list(hops) == [
+        ("camera", "encode"),
+        ("camera", "packetize"),
+        ("network", "video link"),
+        ("receiver", "reorder and depacketize"),
+        *(("driver", hop) for hop in ("reorder", "decode", "read_stamp", "lane", "control")),
+        ("network", "control link"),
+    ]
+    assert hops["driver", "decode"]["p50"] == pytest.approx(2.0)
+    # Of tau_v, 62 ms, the camera takes 5 after the stamp, and the client 10 from the packet to the stamp.
+    link = hops["network", "video link"]
+    assert (link["p50"], link["p95"]) == pytest.approx((47.0, 49.0), abs=1e-3)
+    assert link["n"] == entry["tau_v_ms"]["n"]
+    assert hops["network", "control link"]["p50"] == entry["tau_c_ms"]["p50"]
+
+
+def test_links_need_the_offset_between_the_clocks(make_run: MakeRun, tmp_path: Path) -> None:
+    """Where Delta is not known, the nodes' own hops are there and the links are not."""
+    unknown = {"client_clock": lambda _second: {"correction_s": None}, "probes": False}
+    make_run(tmp_path, **unknown)
+    entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
+    assert {hop["node"] for hop in entry["hops_ms"]} == {"camera", "receiver", "driver"}
+
+
+def test_each_obeyed_command_has_the_age_of_its_picture() -> None:
+    """Of a picture stamped at 10 ms, commands applied at 30 and 50 ms are 20 and 40 ms old; a refused one has none."""
+    milliseconds = 1_000_000
+    frames = table_of([{"stamp_ns": 7, "stamped_mono_ns": 10 * milliseconds}], [0], [0])
+    rows = [(30, 7, "obeyed"), (40, 7, "refused"), (50, 7, "obeyed"), (60, 8, "obeyed"), (90, 7, "obeyed")]
+    admissions = table_of(
+        [{"applied_mono_ns": at * milliseconds, "stamp_ns": stamp, "verdict": said} for at, stamp, said in rows],
+        [0] * len(rows),
+        [0] * len(rows),
+    )
+    ages_ns = ages_at_actuation_ns(frames, admissions, 0, 80 * milliseconds)
+    assert np.divide(ages_ns, milliseconds).tolist() == [20.0, 40.0]
+
+
+def test_age_at_actuation_is_that_of_every_command(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a loop of 76 ms and a second command from each picture 15 ms later, the median age is between the two."""
+    make_run(tmp_path, spread_ms=0.0)
+    age = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
+    assert age["age_at_actuation_ms"]["p5"] == pytest.approx(76.0, abs=1e-3)
+    assert age["age_at_actuation_ms"]["p95"] == pytest.approx(91.0, abs=1e-3)

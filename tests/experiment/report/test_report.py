@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lavt.domain import NS_PER_S, Now
+from lavt.errors import WorkError
+from lavt.experiment.analysis.drive_data import capture_to_stamp_ms, read_drive
+from lavt.experiment.analysis.results import read_json, run_result, write_json
+from lavt.experiment.report import table_format
+from lavt.experiment.report.figure_style import condition_colours
+from lavt.experiment.report.report import write_report
+from lavt.experiment.report.run_sections import received_pictures
+from lavt.experiment.report.tables import hop_table
+from lavt.nodes.payloads import VideoUnit
+from lavt.recording.record import RecordWriter, read_record
+
+MakeRun = Callable[..., Path]
+
+
+def add_run(make_run: MakeRun, sweep: Path, name: str, *, time: str = "virtual", **settings: Any) -> None:
+    condition, video_ms = settings.pop("condition", "L0"), settings.pop("video_ms", 0.0)
+    directory = make_run(sweep / "runs" / name, tau_v_ms=62.0 + video_ms, **settings)
+    identity = {
+        "run": name,
+        "time": time,
+        "injection": "model" if time == "virtual" else "relay",
+        "inherent": "paper_wifi5",
+        "route": "A <key> $^$",
+        "condition": condition,
+        "controller": "lane",
+        "preset": "designed",
+        "seed": 1,
+        "injected_ms": {"video": video_ms, "control": 0.0},
+    }
+    server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
+    write_json(directory / "result.json", run_result(identity, server, client))
+
+
+@pytest.fixture(scope="module")
+def sweep(make_run: MakeRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give a sweep and its report: three virtual runs, of which one ends early, three in real time, one unfinished."""
+    directory = tmp_path_factory.mktemp("sweep")
+    add_run(make_run, directory, "0", seconds=3.0)
+    add_run(make_run, directory, "1", seconds=3.0, condition="L1", video_ms=75.0)
+    add_run(make_run, directory, "2", seconds=2.0, condition="L1", video_ms=75.0, ending="collision", wobble_m=2.0)
+    add_run(make_run, directory, "3", seconds=3.0, time="real", bound_s=0.003)
+    add_run(make_run, directory, "5", seconds=3.0, time="real", client_clock=lambda _second: {"correction_s": None})
+    add_run(
+        make_run, directory, "6", seconds=3.0, time="real", server_host="a", client_host="a", offset_s=0.0, drift=0.0
+    )  # fmt: skip
+    (directory / "runs" / "4").mkdir()
+    write_report(directory, speed={"simulated_s": 30.0, "wall_s": 10.0, "jobs": 2})
+    return directory
+
+
+def page_of(sweep: Path) -> str:
+    return (sweep / "report" / "index.html").read_text()
+
+
+def test_the_report_is_whole(sweep: Path) -> None:
+    """The page, every file it names in each of its formats, and the summary are there; nothing is from a network."""
+    html = page_of(sweep)
+    figures = {name.rpartition(".")[0] for name in re.findall(r'src="([^"]+)"', html)}
+    assert figures == {
+        "degradation", "injected", "hops_virtual", "hops_real", "time_virtual", "time_real", "survival_virtual",
+        "survival_real", "incidence_virtual", "incidence_real", "trajectories_whole_virtual", "trajectories_whole_real",
+        "cross_track_virtual", "cross_track_real",
+    }  # fmt: skip
+    for figure in figures:
+        assert (sweep / "report" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<text" in (sweep / "report" / f"{figure}.svg").read_text()
+    linked = set(re.findall(r'href="([^"#]+)"', html))
+    assert {f"{figure}.{ending}" for figure in figures for ending in ("svg", "png")} < linked
+    assert {"tables/runs.csv", "tables/runs.tex", "tables/conditions_real_driving.csv"} < linked
+    assert all((sweep / "report" / name).is_file() for name in linked)
+    assert "http" not in html
+    assert "3.0 times as fast" in html
+    summary = json.loads((sweep / "summary.json").read_text())
+    assert summary["conditions"]["L1"]["completion_rate"] == 0.5
+    assert summary["conditions"]["L1"]["injected_ms"]["video"] == 75.0
+    assert summary["speed"]["jobs"] == 2
+
+
+def test_every_section_has_a_link_and_is_in_order(sweep: Path) -> None:
+    """The page links to each of its sections, in the order in which they come."""
+    html = page_of(sweep)
+    names = re.findall(r'<h2 id="([^"]+)"', html)
+    assert re.findall(r'<a href="#([^"]+)"', html) == names
+    assert names == [
+        "conditions", "planned_contrasts", "trajectories", "injected_and_measured_latency", "driving_against_latency",
+        "how_far_the_runs_came", "where_the_latency_comes_from", "route_by_route", "single_runs", "every_run",
+        "clocks_of_two_machines", "versions_and_machine",
+    ]  # fmt: skip
+
+
+def test_the_same_runs_give_the_same_bytes(sweep: Path) -> None:
+    """A report made again, of drives that were read before, is the same file by file, figures and page included."""
+    before = files_of(sweep)
+    assert len(before) > 40
+    directories = [sweep / "runs" / name for name in "012356"]
+    drives = {directory: read_drive(directory, read_json(directory / "result.json")) for directory in directories}
+    write_report(sweep, drives=drives)
+    assert files_of(sweep) == before
+
+
+def files_of(sweep: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((sweep / "report").rglob("*.*"))}
+
+
+def test_numbers_come_back_from_the_csv(sweep: Path) -> None:
+    """The CSV of a table has each number to its last digit, an interval in two columns, and what is unknown empty."""
+    summary = json.loads((sweep / "summary.json").read_text())
+    with (sweep / "report" / "tables" / "conditions_virtual_driving.csv").open(newline="") as file:
+        rows = {row["condition"]: row for row in csv.DictReader(file)}
+    entry = summary["conditions"]["L1"]
+    read = [float(rows["L1"][f"95 %, these routes {end} (share)"]) for end in ("low", "high")]
+    assert read == entry["completion_interval"]
+    assert float(rows["L1"]["lane invasions / km"]) == entry["lane_invasions_per_km"]
+    with (sweep / "report" / "tables" / "conditions_virtual_latency.csv").open(newline="") as file:
+        latencies = {row["condition"]: row for row in csv.DictReader(file)}
+    assert float(latencies["L0"]["τ video ms p50"]) == summary["conditions"]["L0"]["tau_v_ms"]["p50"]
+    with (sweep / "report" / "tables" / "conditions_virtual_error.csv").open(newline="") as file:
+        errors = {row["condition"]: row for row in csv.DictReader(file)}
+    assert float(errors["L1"]["maximum m, mean of runs"]) == summary["conditions"]["L1"]["max_m"]
+    assert errors["L1"]["p95 m, all runs ranked p75"] == ""
+
+
+def test_real_and_virtual_runs_have_tables_of_their_own(sweep: Path) -> None:
+    """The page says of each table whether time was real and who injected; an invalid run is named with its reason."""
+    html = page_of(sweep)
+    assert "Virtual time, fidelity video: network and clocks are modelled" in html
+    assert "Real time, injected by relay" in html
+    assert "not valid: the offset between the clocks is only known to 6.00 ms" in html
+
+
+def test_two_clocks_are_told_with_source_bound_and_drift(sweep: Path) -> None:
+    """Of runs on two machines the page has Delta, its source, bound and drift, and the probe's Delta; of others not."""
+    clocks = page_of(sweep).partition('id="clocks_of_two_machines"')[2].partition('id="versions_and_machine"')[0]
+    rows = re.findall(r"<tr><td.*?</tr>", clocks.replace("\n", ""))
+    cells = [[re.sub("<[^>]*>|\xa0", "", cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", row)] for row in rows]
+    assert [row[:2] for row in cells] == [["3", "chrony"], ["5", "probe"]]
+    assert cells[0][2:4] == ["250.030±6.000", "20.00"]
+    assert [cell.partition("±")[0] for cell in (cells[0][4], cells[1][2], cells[1][4])] == ["250.030"] * 3
+    assert "half the round trip" in clocks
+    first, *_ = (sweep / "report" / "tables" / "clocks.csv").read_text().splitlines()
+    assert first.split(",")[2:4] == ["Delta ms", "Delta ms bound"]
+
+
+def test_names_cannot_become_html(sweep: Path) -> None:
+    """Whatever a route or a run is called, the page and the figures show it as text."""
+    html = page_of(sweep)
+    assert "A &lt;key&gt;" in html
+    assert "<key>" not in html
+
+
+def test_a_report_made_again_keeps_the_speed(sweep: Path) -> None:
+    """A second report of the same runs gives the same summary, the speed of the sweep included."""
+    first = (sweep / "summary.json").read_bytes()
+    write_report(sweep)
+    assert (sweep / "summary.json").read_bytes() == first
+
+
+def test_unfinished_runs_are_left_out_and_named(sweep: Path) -> None:
+    """A run without a result is named as left out; a directory without any finished run is an error."""
+    assert "1 of the runs asked for failed and are in no number of this page" in page_of(sweep)
+    assert "4: it has no result" in page_of(sweep)
+    with pytest.raises(WorkError, match=r"no finished run"):
+        write_report(sweep / "report")
+
+
+def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_path: Path, sweep: Path) -> None:
+    """From capture to stamp is the first row of the table of hops; a dash where no camera told."""
+    make_run(tmp_path, seconds=3.0, capture_ms=7.5)
+    assert capture_to_stamp_ms(tmp_path / "server.mcap") == 7.5
+    assert capture_to_stamp_ms(sweep / "runs" / "0" / "server.mcap") is None
+    row = "camera: capture to stamp, before the loop"
+    assert list(hop_table({"L0": []}, {"L0": 7.5}).rows) == [[row, 7.5]]
+    assert re.search(f"{row}</td><td>–</td>", page_of(sweep))
+
+
+def test_received_pictures_are_decoded(tmp_path: Path) -> None:
+    """Four pictures, evenly spread, come out of the recorded video; a record without video has none."""
+    h264 = pytest.importorskip("lavt.transport.video.h264")
+    writer = RecordWriter(tmp_path / "client.mcap", "client")
+    writer.close()
+    assert received_pictures(tmp_path / "client.mcap") == []
+    writer = RecordWriter(tmp_path / "client.mcap", "client")
+    encoder = h264.Encoder(width_px=320, height_px=240, rate_hz=30.0, bit_rate_bps=1_000_000, gop_frames=30)
+    for index in range(8):
+        picture = np.full((240, 320, 3), 20 * index + 40, np.uint8)
+        unit = encoder.encode(picture)
+        writer.write("video", VideoUnit(index * NS_PER_S, unit), Now(index, index))
+    writer.close()
+    pictures = received_pictures(tmp_path / "client.mcap")
+    assert [text for text, _ in pictures] == ["1.0 s", "3.0 s", "5.0 s", "7.0 s"]
+    assert [round(float(picture.mean()) / 20) for _, picture in pictures] == [3, 5, 7, 9]
+
+
+def test_every_condition_has_a_colour_of_its_own() -> None:
+    """However many conditions there are, no two share a colour, and the order they come in does not matter."""
+    names = [f"L{index}" for index in range(20)]
+    colours = condition_colours(names)
+    assert len({str(colour) for colour in colours.values()}) == 20
+    assert condition_colours(["L5", "L0"]) == condition_colours(["L0", "L5"])
+
+
+def test_what_is_undefined_is_a_dash() -> None:
+    """A number, a share, an interval or a latency that is not known is shown as a dash, and a bound as unknown."""
+    nothing = {"p5": None, "p50": None, "p95": None, "bound": None, "n": 0}
+    dashes = [
+        table_format.number(None),
+        table_format.percent(None),
+        table_format.interval(None),
+        table_format.latency(nothing),
+    ]
+    assert dashes == [table_format.NOTHING] * 4
+    unbounded = table_format.latency({"p5": 1.0, "p50": 2.0, "p95": 3.0, "bound": None, "n": 1})
+    assert unbounded.replace(table_format.UNBROKEN, " ") == "2.0 ± unknown (1.0 to 3.0)"
+
+
+def test_a_run_of_which_nothing_is_known_is_reported(tmp_path: Path) -> None:
+    """Records without any message give a report all the same: nothing measured, and the reasons why it is not valid."""
+    directory = tmp_path / "runs" / "0"
+    directory.mkdir(parents=True)
+    RecordWriter(directory / "server.mcap", "server").close()
+    RecordWriter(directory / "client.mcap", "client").close()
+    server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
+    identity = {"run": "0", "time": "real", "injection": "none", "route": "A", "condition": "L0"}
+    write_json(directory / "result.json", run_result(identity, server, client))
+    html = write_report(tmp_path).read_text()
+    assert "Real time, nothing injected" in html
+    assert "the record has no ending" in html

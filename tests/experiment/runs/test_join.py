@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from lavt.config import ClientConfig, RunConfig, ServerConfig
+from lavt.config_file import load_config, parse_config
+from lavt.domain import Now
+from lavt.errors import UserError
+from lavt.experiment.runs.join import join
+from lavt.experiment.runs.run import compute_result
+from lavt.recording.record import RecordWriter, read_record
+
+MakeRun = Callable[..., Path]
+
+
+def sides(make_run: MakeRun, where: Path, **settings: Any) -> tuple[Path, Path]:
+    """Leave what `lavt server --out` and `lavt client --out` leave of a drive."""
+    records = make_run(where / "records", **settings)
+    controller, client_video = {"preset": "paper_calibrated"}, {"reorder_hold_ms": 25.0}
+    server_video = {"bit_rate_bps": 2_000_000, "reorder_hold_ms": 40.0}
+    client = parse_config(ClientConfig, {"controller": controller, "video": client_video}, "the client")
+    server = parse_config(ServerConfig, {"vehicle": {"route": "b_key"}, "video": server_video}, "the server")
+    for side, config in (("server", server), ("client", client)):
+        (where / side).mkdir()
+        (where / side / "config.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
+        (records / f"{side}.mcap").rename(where / side / f"{side}.mcap")
+    return where / "server", where / "client"
+
+
+def test_two_directories_become_one_run(make_run: MakeRun, tmp_path: Path) -> None:
+    """The run has both records, a config that can be read again, and a result with what both sides were."""
+    server, client = sides(make_run, tmp_path)
+    result = join(server, client, tmp_path / "run")
+    assert (result["route"], result["preset"], result["ending"]) == ("b_key", "paper_calibrated", "completed")
+    assert (result["time"], result["injection"], result["inherent"], result["condition"]) == (
+        "real", "none", "network", "none",
+    )  # fmt: skip
+    assert (result["valid"], result["invalid_because"]) == (True, [])
+    config = load_config(RunConfig, tmp_path / "run" / "config.yaml")
+    assert (config.vehicle.route, config.video.bit_rate_bps, config.time) == ("b_key", 2_000_000, "real")
+    written = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert compute_result(tmp_path / "run", written, None) == written
+
+
+def test_records_of_two_drives_are_refused(make_run: MakeRun, tmp_path: Path) -> None:
+    """Directories in which the client has not seen what the server sent are refused, and nothing is left."""
+    server, _ = sides(make_run, tmp_path / "one")
+    _, client = sides(make_run, tmp_path / "two", began_s=100.0)
+    with pytest.raises(UserError, match="same drive"):
+        join(server, client, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
+    """For how long packets waited for earlier ones is what the client's config says, not what the server's does."""
+    server, client = sides(make_run, tmp_path)
+    join(server, client, tmp_path / "run")
+    assert load_config(RunConfig, tmp_path / "run" / "config.yaml").video.reorder_hold_ms == 25.0
+
+
+def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+    """A client that has only seen what the server sent after its first drive is refused: that drive was not its own."""
+    server, client = sides(make_run, tmp_path)
+    seen = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
+    writer = RecordWriter(server / "server.mcap", "server")
+    for mono_ns, kind in ((100, "drive_began"), (200, "ending"), (300, "drive_began")):
+        writer.write("event", {"mono_ns": mono_ns, "kind": kind, "detail": ""}, Now(mono_ns, mono_ns))
+    for mono_ns, stamp_ns in ((50, seen[0]), (150, seen[0] - 1), (350, seen[1])):
+        writer.write("frame", {"number": 0, "stamp_ns": stamp_ns, "stamped_mono_ns": mono_ns}, Now(mono_ns, mono_ns))
+    writer.close()
+    with pytest.raises(UserError, match="only the first drive"):
+        join(server, client, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_not_the_directory_of_a_side_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+    """A directory without the record or the config of its side is refused with what to name instead."""
+    server, client = sides(make_run, tmp_path)
+    with pytest.raises(UserError, match="--out of `lavt server`"):
+        join(client, server, tmp_path / "run")

@@ -1,0 +1,127 @@
+"""Delta of drives in virtual time, where the truth about both hosts' clocks is known to the nanosecond."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.experiment.analysis.clock_offset import Offset
+from lavt.experiment.analysis.metrics import Measured, measure
+from lavt.experiment.analysis.results import run_result
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive
+from lavt.recording.record import read_record
+from lavt.runtime.virtual import HostClock, VirtualHost, modelled_clock_source
+from lavt.transport.clock_sync.clock_report import ClockReport, unknown_clock
+
+Change = Callable[[VirtualLoop], None]
+APART = ("clocks.offset_ms=250.0", "clocks.drift_ppm=30.0")
+
+
+def drive_with(out: Path, *changes: str, change: Change = lambda _: None) -> tuple[Measured, dict[str, Any], HostClock]:
+    """Drive without pictures; give what was measured, `result.json`, and the server's clock (the client's is true)."""
+    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), ("fidelity=geometry", *APART, *changes)))
+    loop = build_loop(planned, out)
+    change(loop)
+    drive(loop)
+    server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
+    result = run_result(planned.identity, server, client)
+    return measure(server, client), result, loop.runtime.hosts["server"].clock
+
+
+def errors_ms(measured: Measured, offset: Offset | None, server: HostClock) -> tuple[Any, Any]:
+    """Give how wrong Delta is at every 10 ms of the drive, and how wrong it says it can be."""
+    assert offset is not None
+    began_ns, ended_ns = measured.clocks.client_wall_ns.tolist()
+    client_wall_ns = np.arange(began_ns, ended_ns, 10 * NS_PER_MS)
+    true_ns = client_wall_ns - server.wall_start_ns
+    truth_ns = np.array([server.at(true).wall_ns for true in true_ns.tolist()]) - client_wall_ns
+    wrong_ns = np.abs(offset.at(client_wall_ns) - truth_ns)
+    return wrong_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
+
+
+def without_a_source(loop: VirtualLoop) -> None:
+    def install(host: VirtualHost) -> None:
+        def unknown(true_ns: int) -> ClockReport:
+            return unknown_clock(host.clock.at(true_ns), host.side, "chrony", "chrony is not installed")
+
+        host.clock_source = unknown
+
+    for host in loop.runtime.hosts.values():
+        install(host)
+
+
+def test_both_opinions_hold_the_truth(tmp_path: Path) -> None:
+    """With the server 250 ms ahead and drifting by 30 ppm the truth is inside both bounds all through the drive."""
+    measured, result, server = drive_with(tmp_path / "run")
+    for offset in (measured.clocks.offset, measured.clocks.probe):
+        wrong_ms, bound_ms = errors_ms(measured, offset, server)
+        assert (wrong_ms <= bound_ms).all()
+        assert wrong_ms.max() < 1.0
+        assert bound_ms.max() < 2.0
+    delta = result["delta"]
+    assert delta["source"] == "model"
+    assert delta["ms"] == pytest.approx(250.0, abs=1.0)
+    assert delta["drift_ppm"] == pytest.approx(30.0, abs=0.1)
+    assert delta["bound_ms"] == result["tau_v_ms"]["bound"] == result["tau_c_ms"]["bound"]
+    assert result["valid"], result["invalid_because"]
+
+
+def test_the_probe_alone_under_delayed_control(tmp_path: Path) -> None:
+    """Without a source of time and with 100 ms on control the truth is inside the probe's bound, and tau is right."""
+    _, with_sources, _ = drive_with(tmp_path / "sources", "network.condition=L5")
+    measured, result, server = drive_with(tmp_path / "probe", "network.condition=L5", change=without_a_source)
+    wrong_ms, bound_ms = errors_ms(measured, measured.clocks.offset, server)
+    assert (wrong_ms <= bound_ms).all()
+    assert bound_ms.max() <= 2.0
+    assert result["delta"]["source"] == "probe"
+    assert result["valid"], result["invalid_because"]
+    for name in ("tau_v_ms", "tau_c_ms"):
+        assert result[name]["p50"] == pytest.approx(with_sources[name]["p50"], abs=result[name]["bound"])
+
+
+def test_a_misled_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
+    """A chrony behind 75 ms on one way is wrong by half of that: it and the probe disagree, and the run is invalid."""
+
+    def mislead(loop: VirtualLoop) -> None:
+        host = loop.runtime.hosts["client"]
+        host.clock_source = modelled_clock_source(host.clock, "virtual-client", 0.0375, 0.0001)
+
+    _, result, _ = drive_with(tmp_path / "run", change=mislead)
+    (reason,) = result["invalid_because"]
+    assert "model and the probe disagree" in reason
+    assert ": 287." in reason
+
+
+def test_a_probe_without_answers(tmp_path: Path) -> None:
+    """A firewall that lets no probe through leaves Delta unchecked, and the run is invalid."""
+
+    def block(loop: VirtualLoop) -> None:
+        loop.runtime.links["probe_reply"].open = False
+
+    _, result, _ = drive_with(tmp_path / "run", change=block)
+    (reason,) = result["invalid_because"]
+    assert reason.startswith("the probe had no answer")
+    assert (result["delta"]["probe_ms"], result["delta"]["probe_bound_ms"]) == (None, None)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("side", ["client", "server"])
+def test_a_step_is_one_reason(tmp_path: Path, side: str, known: bool) -> None:
+    """A wall clock set by a second in the middle of the drive is the one reason against it, with sources or without."""
+
+    def step(loop: VirtualLoop) -> None:
+        if not known:
+            without_a_source(loop)
+        loop.runtime.hosts[side].clock.steps = [(10 * NS_PER_S, NS_PER_S)]
+
+    _, result, _ = drive_with(tmp_path / "run", change=step)
+    (reason,) = result["invalid_because"]
+    assert f"the {side} stepped by +1000.0 ms" in reason

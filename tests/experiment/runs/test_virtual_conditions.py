@@ -1,0 +1,150 @@
+"""Drives in virtual time under what is more than a constant delay."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lavt.config import RunConfig, SweepConfig
+from lavt.config_file import conditions, load_config, parse_config, shipped
+from lavt.domain import NS_PER_S
+from lavt.experiment.runs.plan import plan_run, plan_sweep
+from lavt.experiment.runs.run import run_once
+from lavt.experiment.runs.virtual_run import build_loop, drive
+from lavt.recording.record import read_record
+from lavt.recording.table import MISSING
+
+MORE = sorted(set(conditions()) - {"L0", "L1", "L2", "L3", "L4", "L5"})
+
+
+def all_but_one_full(names: list[str], quick: str) -> list[Any]:
+    """Mark all names but one as `full`."""
+    return [name if name == quick else pytest.param(name, marks=pytest.mark.full) for name in names]
+
+
+def driven(out: Path, *changes: str) -> dict[str, Any]:
+    given = ("vehicle.scenery=none", "record.video=false", *changes)
+    return run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given)), out)
+
+
+def link_counts(side: Path) -> dict[str, dict[str, int]]:
+    """What a record says of its side's links: name to counters."""
+    table = read_record(side).table("counts")
+    names = ("packets", "lost", "dropped", "overtook")
+    columns = {name: table.ints(f"link_{name}") for name in names}
+    return {
+        node: {name: int(columns[name][row]) for name in names}
+        for row, node in enumerate(table.texts("node"))
+        if node.startswith("link ") and columns["packets"][row] != MISSING
+    }
+
+
+def test_a_constant_delay_counts_nothing(tmp_path: Path) -> None:
+    """Where nothing but a constant delay is injected, the record says nothing of links."""
+    driven(tmp_path / "run", "fidelity=geometry", "network.condition=L4", "vehicle.time_limit_s=2")
+    assert link_counts(tmp_path / "run/server.mcap") == link_counts(tmp_path / "run/client.mcap") == {}
+
+
+@pytest.mark.parametrize("name", all_but_one_full(MORE, "loss_burst"))
+def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> None:
+    """Without pixels every condition is driven to the goal, validly, and with equal digests when driven again."""
+    changes = ("fidelity=geometry", f"network.condition={name}")
+    result, again = driven(tmp_path / "run", *changes), driven(tmp_path / "again", *changes)
+    assert (result["ending"], result["valid"], result["invalid_because"]) == ("completed", True, [])
+    assert result["digest"] == again["digest"]
+    other = driven(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
+    assert other["digest"] != result["digest"]
+
+
+def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
+    """The record of who sends says how many packets were lost, and so many less have come; pixels record all."""
+    driven(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
+    server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
+    video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
+    control = link_counts(tmp_path / "run/client.mcap")["link control"]
+    assert 0.05 < video["lost"] / video["packets"] < 0.15
+    assert 0.05 < control["lost"] / control["packets"] < 0.15
+    for sender, receiver, topic, counts in ((server, client, "rtp", video), (client, server, "control", control)):
+        sent, received = len(sender.table(topic)), len(receiver.table(topic))
+        assert sent == counts["packets"]
+        assert 0 <= sent - counts["lost"] - received <= 10  # the rest was under way at the end
+
+
+@pytest.mark.parametrize("name", all_but_one_full(MORE, "reorder"))
+def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
+    """With real video the first seconds under every condition go by, and the link does what it is for."""
+    given = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
+    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given))
+    loop = build_loop(planned, tmp_path / "run")
+    drive(loop, limit_ns=4 * NS_PER_S)
+    counts = link_counts(tmp_path / "run/server.mcap")["link rtp"]
+    assert counts["packets"] > 500
+    assert (counts["lost"] > 0) == name.startswith("loss")
+    assert (counts["dropped"] > 0) == (name == "rate_short_queue")
+    assert (counts["overtook"] > 0) == (name == "reorder")
+
+
+def test_a_trace_is_no_constant_and_is_told_by_its_content(tmp_path: Path) -> None:
+    """What a trace of delay injects is not said to be a number; the record has the digest of every trace."""
+    (tmp_path / "mine.csv").write_text("time_s,delay_ms\n0,20\n60,80\n")
+    given = (f"network.video.trace={tmp_path / 'mine.csv'}", "network.control.trace=fading.mahimahi")
+    planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), (*given, "fidelity=geometry")))
+    assert planned.identity["injected_ms"] == {"video": None, "control": 0.0}
+    assert planned.identity["injected_least_ms"] == {"video": 0.0, "control": 0.0}
+    result = run_once(planned, tmp_path / "run")
+    assert (result["injected_ms"]["video"], result["valid"]) == (None, True)
+    traces = json.loads(read_record(tmp_path / "run/server.mcap").annotations["model"]["traces"])
+    assert traces == {
+        str(tmp_path / "mine.csv"): sha256((tmp_path / "mine.csv").read_bytes()).hexdigest(),
+        "fading.mahimahi": sha256(shipped("netem/traces/fading.mahimahi").read_bytes()).hexdigest(),
+    }
+
+
+def test_a_slow_link_is_a_late_picture_and_no_doubt(tmp_path: Path) -> None:
+    """A queue that grows to seconds ends the drive by the age of the pictures, and says nothing against the run."""
+    result = driven(tmp_path / "run", "network.condition=rate")
+    assert (result["ending"], result["valid"], result["invalid_because"]) == ("safe_stop", True, [])
+    assert result["loop_ms"]["p50"] > 1000
+
+
+AXES: list[tuple[str, list[Any], str]] = [
+    ("network.video.loss", [0.0, 0.2], "geometry"),
+    ("network.control.loss_burst_packets", [1.0, 4.0], "geometry"),
+    ("network.video.jitter_ms", [0.0, 20.0], "geometry"),
+    ("network.video.jitter_distribution", ["normal", "pareto"], "geometry"),
+    ("network.video.trace", ["", "handover.csv", "fading.mahimahi"], "geometry"),
+    ("network.video.rate_bps", [0, 3_000_000], "video"),
+    ("network.video.delay_ms", [0.0, 33.0], "geometry"),
+    ("camera.rate_hz", [20.0, 30.0], "geometry"),
+    ("controller.speed_mps", [5.0, 8.0], "geometry"),
+    ("controller.lookahead_s", [0.7, 1.2], "geometry"),
+    ("controller.preset", ["designed", "paper_calibrated"], "geometry"),
+    ("video.bit_rate_bps", [1_000_000, 4_000_000], "video"),
+    ("vehicle.light", ["noon", "low_sun"], "pixels"),
+]
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "fidelity"),
+    [pytest.param(*axis, id=axis[0], marks=() if axis[2] == "geometry" else pytest.mark.full) for axis in AXES],
+)
+def test_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> None:
+    """Each of these config values is an axis: its runs share their seed, say its value, and go differently."""
+    sweep = {
+        "fidelity": fidelity,
+        "conditions": ["L1"],
+        "vehicle": {"time_limit_s": 6.0 if fidelity == "geometry" else 1.0, "scenery": "light"},
+        "record": {"video": False},
+        "network": {"control": {"loss": 0.2}, "video": {"jitter_ms": 5.0}},
+        "axes": {key: values},
+    }
+    runs = plan_sweep(parse_config(SweepConfig, sweep, "test"))
+    results = [run_once(run, tmp_path / run.name.replace("/", "-")) for run in runs]
+    assert [result["axes"] for result in results] == [{key: value} for value in values]
+    assert len({result["seed"] for result in results}) == 1
+    assert len({result["digest"] for result in results}) == len(values)
+    assert all(result["valid"] for result in results), [result["invalid_because"] for result in results]

@@ -1,0 +1,306 @@
+"""The whole loop in virtual time: real pixels, codec and packets."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lavt.config import RunConfig
+from lavt.config_file import condition, load_config, shipped
+from lavt.domain import NS_PER_S, Picture, Pose
+from lavt.experiment.analysis.metrics import driving_interval, measure
+from lavt.experiment.analysis.results import run_result
+from lavt.experiment.runs.network import STAMP_TO_STAMP, injected_network, virtual_network
+from lavt.experiment.runs.plan import PlannedRun, plan_run
+from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive, host_clocks, read_costs
+from lavt.recording.record import Record, read_record
+from lavt.runtime.virtual import modelled_clock_source
+from lavt.streams import stream
+from lavt.transport.clock_sync.clock_report import ClockReport
+from lavt.vehicle.camera import CapturedFrame
+
+BARE = "vehicle.scenery=none"
+GREY_FROM_FRAME = 240  # 8 s: the car has 30 km/h and is about to enter the curve
+
+Change = Callable[[VirtualLoop], None]
+
+
+def planned(*changes: str) -> PlannedRun:
+    return plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
+
+
+def run(
+    out: Path, run: PlannedRun, *, change: Change = lambda _: None, seconds: float = 600.0, **keys: Any
+) -> VirtualLoop:
+    out.mkdir()
+    loop = build_loop(run, out, **keys)
+    change(loop)
+    drive(loop, limit_ns=round(seconds * NS_PER_S))
+    return loop
+
+
+def records(out: Path) -> tuple[Record, Record]:
+    return read_record(out / "server.mcap"), read_record(out / "client.mcap")
+
+
+def with_pictures(change: Callable[[int, Picture], Picture]) -> Change:
+    """Change the camera's pictures by a function of (frame number, picture)."""
+
+    def install(loop: VirtualLoop) -> None:
+        node = loop.server.camera
+        take = node._expose
+
+        def expose(number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
+            frame = take(number, begin_ns, poses)
+            return None if frame is None else replace(frame, picture=change(number, frame.picture))
+
+        node._expose = expose
+
+    return install
+
+
+@pytest.fixture(scope="module")
+def l0(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One whole drive at L0, with scenery, on hosts whose clocks are 250 ms and 20 ppm apart."""
+    out = tmp_path_factory.mktemp("virtual") / "l0"
+    run(out, planned())
+    return out
+
+
+def test_the_car_keeps_its_lane_without_delay(l0: Path) -> None:
+    """At L0 the lane keeper completes the route by what it sees, with a cross-track P95 under 0.3 m, and validly."""
+    result = run_result(planned().identity, *records(l0))
+    assert result["ending"] == "completed"
+    assert result["p95_m"] < 0.3
+    assert result["lane_invasions"] == 0
+    assert result["valid"], result["invalid_because"]
+
+
+def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
+    """What the model delays video and control by: the costs of the hops and the laws of the links."""
+    costs = read_costs()
+    asked = injected_network(
+        run.config.network.inherent, condition(run.config.network.condition), costs, run.seed, state_delay="none"
+    )
+    network = virtual_network(asked, costs)
+    hops_us = sum(costs.hops_us.get(node, {}).get(hop, 0.0) for node, hop in STAMP_TO_STAMP)
+    sending_us = costs.hops_us["driver"]["command"]
+    return network.video.constant_ms + hops_us / 1000, network.control.constant_ms + sending_us / 1000
+
+
+def test_latencies_are_true_within_the_printed_bound(l0: Path) -> None:
+    """With hosts' clocks 250 ms and 20 ppm apart, the median tau_v and tau_c are the truth within the printed bound."""
+    entry = measure(*records(l0)).entry
+    video_ms, control_ms = true_latencies_ms(planned())
+    for name, truth_ms in (("tau_v_ms", video_ms), ("tau_c_ms", control_ms)):
+        assert 0 < entry[name]["bound"] <= 2.0
+        assert abs(entry[name]["p50"] - truth_ms) <= entry[name]["bound"], name
+
+
+def test_forgetting_the_clock_offset_is_noticed(tmp_path: Path) -> None:
+    """A source of time that forgets the offset makes tau_v and tau_c wrong by it: the test above can fail."""
+
+    def forget(loop: VirtualLoop) -> None:
+        for side, host in loop.runtime.hosts.items():
+            host.clock_source = partial(
+                lambda name, clock, true_ns: ClockReport(
+                    clock.at(true_ns).mono_ns, clock.at(true_ns).wall_ns, name, "forgetful", 0.0, 0.0001
+                ),
+                side,
+                host.clock,
+            )
+
+    out = tmp_path / "run"
+    run(out, planned(BARE), change=forget, seconds=5)
+    entry = measure(*records(out)).entry
+    video_ms, control_ms = true_latencies_ms(planned(BARE))
+    assert entry["tau_v_ms"]["p50"] == pytest.approx(video_ms - 250, abs=1)
+    assert entry["tau_c_ms"]["p50"] == pytest.approx(control_ms + 250, abs=1)
+    assert entry["loop_ms"]["p50"] == pytest.approx(video_ms + control_ms, abs=20)  # needs no clock at all
+
+
+def test_injected_delay_is_what_is_measured(l0: Path, tmp_path: Path) -> None:
+    """The medians of tau_v and tau_c at L5 are those at L0 plus what was injected, and so is the loop latency."""
+    out = tmp_path / "l5"
+    run(out, planned(BARE, "network.condition=L5"), seconds=8)
+    before, after = measure(*records(l0)).entry, measure(*records(out)).entry
+    for name, injected_ms in (("tau_v_ms", 225.0), ("tau_c_ms", 100.0), ("loop_ms", 325.0)):
+        assert after[name]["p50"] - before[name]["p50"] == pytest.approx(injected_ms, abs=0.5), name
+
+
+@pytest.mark.full
+def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> None:
+    """With `paper_wifi5` tau_v has the paper's median of 62 and P95 of 86 ms, and tau_c is 9 ms."""
+    out = tmp_path / "run"
+    run(out, planned(BARE, "network.inherent=paper_wifi5"), seconds=30)
+    entry = measure(*records(out)).entry
+    assert entry["tau_v_ms"]["p50"] == pytest.approx(62, abs=2)
+    assert entry["tau_v_ms"]["p95"] == pytest.approx(86, abs=8)
+    assert entry["tau_c_ms"]["p50"] == pytest.approx(9, abs=0.5)
+
+
+# The same again: digests.
+
+DIGEST = """
+import sys
+from pathlib import Path
+import cv2
+from lavt.config import RunConfig
+from lavt.config_file import load_config, shipped
+from lavt.experiment.plan import plan_run
+from lavt.experiment.virtual_run import build_loop, drive
+cv2.setNumThreads(1)
+loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"))), Path(sys.argv[1]))
+drive(loop, limit_ns=4_000_000_000)
+print(loop.digest.hexdigest())
+"""
+
+
+def digest(out: Path, *changes: str, change: Change = lambda _: None) -> str:
+    digest: str = run(out, planned(BARE, *changes), change=change, seconds=3).digest.hexdigest()
+    return digest
+
+
+def flip_a_pixel(number: int, picture: Picture) -> Picture:
+    if number == 60:
+        picture[300, 320, 1] ^= 128
+    return picture
+
+
+def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
+    line = loop.runtime.links["control"].line
+    push, counted = line.push, iter(range(10**9))
+
+    def flip(item: tuple[bytes, Any], now_ns: int, index: int, size_bytes: int = 0) -> int | None:
+        payload, peer = item
+        if next(counted) == 50:
+            payload = payload[:-12] + bytes([payload[-12] ^ 1]) + payload[-11:]
+        return push((payload, peer), now_ns, index, size_bytes)
+
+    line.push = flip  # type: ignore[method-assign]
+
+
+def test_the_digest_repeats_and_sees_everything(tmp_path: Path) -> None:
+    """Equal runs have equal digests; another seed, one flipped pixel or one flipped bit of a command changes them."""
+    digests = [
+        digest(tmp_path / "first"),
+        digest(tmp_path / "seed", "seed=2"),
+        digest(tmp_path / "pixel", change=with_pictures(flip_a_pixel)),
+        digest(tmp_path / "bit", change=flip_a_bit_of_a_command),
+    ]
+    assert len(set(digests)) == 4
+    assert digest(tmp_path / "again") == digests[0]
+
+
+@pytest.mark.full
+def test_the_digest_does_not_depend_on_the_hash_seed(tmp_path: Path) -> None:
+    """Processes with other PYTHONHASHSEEDs give the same digest."""
+    said = set()
+    for hash_seed in ("1", "2"):
+        (tmp_path / hash_seed).mkdir()
+        done = subprocess.run(
+            [sys.executable, "-c", DIGEST, str(tmp_path / hash_seed)],
+            env={**os.environ, "PYTHONHASHSEED": hash_seed}, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        said.add(done.stdout.strip())
+    assert len(said) == 1
+
+
+# It drives by what it sees.
+
+
+def noisy_grey(number: int, picture: Picture) -> Picture:
+    if number < GREY_FROM_FRAME:
+        return picture
+    return stream(1, "grey", number).integers(120, 136, picture.shape, np.uint8)
+
+
+def grey(number: int, picture: Picture) -> Picture:
+    return picture if number < GREY_FROM_FRAME else np.full_like(picture, 128)
+
+
+def mirrored(_number: int, picture: Picture) -> Picture:
+    return np.ascontiguousarray(picture[:, ::-1])
+
+
+@pytest.mark.parametrize("change", [pytest.param(noisy_grey, marks=pytest.mark.full), grey])
+def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Picture], Picture]) -> None:
+    """Grey pictures, with noise or frozen, lead to a safe stop within 3 s."""
+    out = tmp_path / "run"
+    run(out, planned(BARE), change=with_pictures(change), seconds=60)
+    server, _ = records(out)
+    frames = server.table("frame")
+    grey_ns = int(frames.ints("stamped_mono_ns")[frames.ints("number") == GREY_FROM_FRAME][0])
+    events = server.table("event")
+    stops = [
+        mono_ns
+        for mono_ns, detail in zip(events.ints("mono_ns").tolist(), events.texts("detail"), strict=True)
+        if "-> safe_stop" in detail
+    ]
+    assert stops
+    assert 0 < stops[0] - grey_ns <= 3 * NS_PER_S
+    assert driving_interval(server)[2] == "safe_stop"
+
+
+def test_mirrored_pictures_lead_off_the_lane(tmp_path: Path) -> None:
+    """Pictures mirrored left to right make the car leave its lane: it really drives by what it sees."""
+    out = tmp_path / "run"
+    run(out, planned(BARE), change=with_pictures(mirrored), seconds=60)
+    entry = measure(*records(out)).entry
+    assert entry["ending"] != "completed"
+    assert entry["lane_invasions"] > 0
+
+
+def test_a_car_whose_state_is_not_heard_is_stopped(tmp_path: Path) -> None:
+    """When the vehicle's state no longer arrives, the client does not drive on by an old speed: it brakes and stops."""
+
+    def lose_the_state(loop: VirtualLoop) -> None:
+        loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
+
+    out = tmp_path / "run"
+    run(out, planned(BARE), change=lose_the_state, seconds=60)
+    entry = measure(*records(out)).entry
+    assert entry["ending"] == "safe_stop"
+    assert entry["duration_s"] < 11
+
+
+# Clocks may do what they like.
+
+
+@pytest.mark.parametrize("step_s", [1, -1])
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: int, step_s: int) -> None:
+    """A wall clock that steps by a second, either way, on either host, changes no safety state; the run is invalid."""
+    config = planned("fidelity=geometry")
+    clocks = host_clocks(config.config)
+    clocks[side].steps = [(8 * NS_PER_S, step_s * NS_PER_S)]
+    out = tmp_path / "run"
+
+    def follow(loop: VirtualLoop) -> None:
+        for host in loop.runtime.hosts.values():
+            host.clock_source = modelled_clock_source(host.clock, host.side, 0.0, 0.0001)
+
+    run(out, config, change=follow, clocks=clocks)
+    server, client = records(out)
+    safety = [
+        detail
+        for kind, detail in zip(server.table("event").texts("kind"), server.table("event").texts("detail"), strict=True)
+        if kind == "safety"
+    ]
+    assert [each.split(":")[0] for each in safety] == [
+        "disarmed -> arming",
+        "arming -> driving",
+        "driving -> safe_stop",  # the route is completed
+    ]
+    result = run_result(config.identity, server, client)
+    assert result["ending"] == "completed"
+    assert [each for each in result["invalid_because"] if "stepped" in each]

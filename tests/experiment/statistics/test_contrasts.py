@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from lavt.experiment.statistics.contrasts import fisher, mcnemar, paired_contrasts
+from lavt.experiment.statistics.paper_results import paper
+
+
+def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
+    """Give a run for each letter: c completed, x collision."""
+    words = {"c": "completed", "x": "collision"}
+    return [
+        {
+            "condition": condition,
+            "route": "a",
+            "repetition": index,
+            "seed": 100 + index,
+            "valid": True,
+            "ending": words[each],
+            **changes,
+        }
+        for index, each in enumerate(endings)
+    ]
+
+
+def test_mcnemar_by_hand() -> None:
+    """Five pairs that differ one way are p = 2 / 2^5, three against one 10 / 16, and none 1."""
+    assert mcnemar(5, 0) == pytest.approx(0.0625)
+    assert mcnemar(3, 1) == pytest.approx(0.625)
+    assert mcnemar(0, 0) == 1.0
+
+
+def test_fisher_by_hand() -> None:
+    """All of two against none of two: of six ways to choose two of four, two are as far apart, p = 1 / 3."""
+    assert fisher(2, 2, 0, 2) == pytest.approx(1 / 3)
+
+
+def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
+    """Pairs that differ are counted by the condition that was completed, whatever order the runs come in."""
+    contrasts = paired_contrasts([*runs("L0", "ccccccx"), *reversed(runs("L1", "cxxxxxc"))])
+    assert contrasts == [
+        {"a": "L0", "b": "L1", "pairs": 7, "only_a": 5, "only_b": 1, "p": pytest.approx(14 / 64), "p_holm": 14 / 64}
+    ]
+
+
+def test_holm_is_over_all_contrasts_that_could_be_made() -> None:
+    """Of two contrasts with p = 0.0625 and 1 the first is doubled; a condition that was not driven has none."""
+    contrasts = paired_contrasts([*runs("L0", "ccccc"), *runs("L1", "ccccc"), *runs("L2", "xxxxx")])
+    assert [(each["a"], each["b"], each["p_holm"]) for each in contrasts] == [
+        ("L0", "L1", 1.0),
+        ("L1", "L2", pytest.approx(0.125)),
+    ]
+
+
+def test_what_is_no_pair_does_not_count() -> None:
+    """Invalid runs, other seeds, and runs that nothing tells apart make no pair; without any, p is null."""
+    invalid = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", valid=False)])
+    seeds = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", seed=1)])
+    alike = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
+    for contrasts in (invalid, seeds, alike):
+        assert [(each["pairs"], each["p"], each["p_holm"]) for each in contrasts] == [(0, None, None)]
+    assert paired_contrasts([]) == []
+
+
+def test_the_papers_counts_say_less_than_its_text() -> None:
+    """By Fisher's test L1 and L2 differ; L3 and L4, of equal total delay, do not, nor do L2 and L3."""
+    contrasts = {(each["a"], each["b"]): each for each in paper()["contrasts"]}
+    assert len(contrasts) == 6
+    assert contrasts["L1", "L2"]["p"] == pytest.approx(0.00037, abs=5e-6)
+    assert contrasts["L1", "L2"]["p_holm"] == pytest.approx(6 * contrasts["L1", "L2"]["p"])
+    assert contrasts["L3", "L4"]["p"] == pytest.approx(0.785, abs=5e-4)
+    assert contrasts["L2", "L3"]["p"] == pytest.approx(0.435, abs=5e-4)
+    assert contrasts["L2", "L4"]["p"] == pytest.approx(0.187, abs=5e-4)
+
+
+def test_the_papers_percentages_are_counts_of_thirty() -> None:
+    """100, 93.3, 50, 36.7, 30 and 10 % are 30, 28, 15, 11, 9 and 3 of 30; the exact interval of L5 is 2 to 27 %."""
+    conditions = paper()["conditions"]
+    percent = [round(100 * entry["completion_rate"], 1) for entry in conditions.values()]
+    assert percent == [100.0, 93.3, 50.0, 36.7, 30.0, 10.0]
+    assert conditions["L5"]["completion_interval"] == pytest.approx([0.0211, 0.2653], abs=5e-5)
+    assert conditions["L4"]["injected_ms"] == {"video": 150, "control": 75}
+    assert (conditions["L4"]["tau_v_ms"], conditions["L4"]["tau_c_ms"], conditions["L4"]["p95_m"]) == (211, 83, 4.64)

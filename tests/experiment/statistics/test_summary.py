@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from lavt.experiment.statistics.conditions import road_rates
+from lavt.experiment.statistics.intervals import exact_interval
+from lavt.experiment.statistics.summary import summarize
+
+SPEED = {"simulated_s": 100.0, "wall_s": 10.0, "jobs": 2}
+
+
+def run(**changes: Any) -> dict[str, Any]:
+    latency = {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 100}
+    return {
+        "run": "1",
+        "time": "virtual",
+        "inherent": "paper_wifi5",
+        "controller": "lane",
+        "preset": "designed",
+        "driver": "controller",
+        "condition": "L0",
+        "route": "A",
+        "ending": "completed",
+        "valid": True,
+        "p95_m": 1.0,
+        "distance_m": 500.0,
+        "collisions": 0,
+        "lane_invasions": 2,
+        "tau_v_ms": latency,
+        "tau_c_ms": latency,
+        "loop_ms": {key: value for key, value in latency.items() if key != "bound"},
+        "injected_ms": {"video": 75.0, "control": 0.0},
+        **changes,
+    }
+
+
+def test_a_condition_is_counted() -> None:
+    """Completion, events and p95 of a condition: p95 over completed runs, the rest over all valid ones."""
+    runs = [run(), run(p95_m=3.0), run(ending="collision", p95_m=50.0, collisions=1), run(valid=False, p95_m=99.0)]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert (condition["runs"], condition["completed"]) == (3, 2)
+    assert condition["completion_rate"] == pytest.approx(2 / 3)
+    assert condition["collisions_per_run"] == pytest.approx(1 / 3)
+    assert condition["p95_m"] == 2.0
+    assert condition["injected_ms"] == {"video": 75.0, "control": 0.0}
+    assert condition["tau_v_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "bound": 0.4, "n": 300}
+    assert condition["loop_ms"] == {"p5": 60.0, "p50": 62.0, "p95": 86.0, "n": 300}
+
+
+def test_a_condition_without_valid_runs_is_null() -> None:
+    """A condition whose runs are all invalid is there, with no runs and nothing claimed."""
+    condition = summarize([run(valid=False)], SPEED)["conditions"]["L0"]
+    assert condition["runs"] == 0
+    assert condition["completion_rate"] is None
+    assert condition["tau_v_ms"]["p50"] is None
+    assert condition["injected_ms"]["video"] == 75.0
+
+
+def test_real_and_virtual_runs_are_never_mixed() -> None:
+    """Runs in real time are under `real`, runs in virtual time under `conditions`, and all under `runs`."""
+    summary = summarize([run(), run(time="real", condition="L5")], SPEED)
+    assert set(summary) == {
+        "schema", "speed", "runs", "failed", "conditions", "contrasts", "real", "groups", "paper"
+    }  # fmt: skip
+    assert set(summary["conditions"]) == {"L0"}
+    assert set(summary["real"]) == {"L5"}
+    assert len(summary["runs"]) == 2
+
+
+def test_conditions_are_of_the_base_config_and_groups_of_every_combination() -> None:
+    """Further axes make groups; `conditions` holds only the runs of the base config."""
+    runs = [run(preset=preset, axes={"speed": speed}) for preset in ("designed", "bold") for speed in (20, 30)]
+    summary = summarize(runs, SPEED, base={"preset": "designed", "speed": 30})
+    assert summary["conditions"]["L0"]["runs"] == 1
+    assert [(group["preset"], group["speed"]) for group in summary["groups"]] == [
+        ("designed", 20),
+        ("designed", 30),
+        ("bold", 20),
+        ("bold", 30),
+    ]
+    assert all(group["conditions"]["L0"]["runs"] == 1 for group in summary["groups"])
+
+
+def grid(*, condition: str = "L0", bad_route: str | None = None, **changes: Any) -> list[dict[str, Any]]:
+    """Give six routes with five repetitions each, of which those on one route ended early."""
+    return [
+        run(condition=condition, route=route, repetition=repetition, seed=f"{route}{repetition}", **changes)
+        | ({"ending": "safe_stop", "distance_m": 100.0 + repetition} if route == bad_route else {})
+        for route in ("a", "a_key", "b", "b_key", "c", "c_key")
+        for repetition in range(5)
+    ]
+
+
+def test_completion_is_told_by_route_for_these_and_for_such_roads() -> None:
+    """One route of six never completed: 25 of 30, exactly 0 to 52 % there, and such roads from 50 % to all."""
+    condition = summarize(grid(bad_route="b"), SPEED)["conditions"]["L0"]
+    assert condition["endings"] == {"completed": 25, "safe_stop": 5}
+    assert condition["completion_interval"] == exact_interval(25, 30)
+    assert condition["completion_such_roads"] == [0.5, 1.0]
+    assert {name: route["completed"] for name, route in condition["routes"].items()} == {
+        "a": 5, "a_key": 5, "b": 0, "b_key": 5, "c": 5, "c_key": 5
+    }  # fmt: skip
+    assert condition["routes"]["b"]["completion_interval"] == pytest.approx([0.0, 1 - 0.025**0.2])
+    assert condition["routes"]["b"]["p95_m"] is None
+    assert condition["survival"]["b"]["surviving"][-1] == 0.0
+
+
+@pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])
+def test_a_road_and_its_key_part_are_one(suffix: str) -> None:
+    """By name and by path: a route and the one that has its name with _key are one road."""
+    runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
+    assert road_rates(runs) == [1.0, 0.5]
+
+
+def test_one_road_says_nothing_of_such_roads() -> None:
+    """A route and its key part are one road, of which nothing follows for others."""
+    runs = [each for each in grid() if each["route"] in {"a", "a_key"}]
+    assert summarize(runs, SPEED)["conditions"]["L0"]["completion_such_roads"] is None
+
+
+def test_rates_by_distance_are_of_all_kilometres() -> None:
+    """One collision in 0.1 km and none in 0.9 km are 1 a kilometre, not the mean of 10 and 0."""
+    runs = [run(distance_m=100.0, collisions=1, ending="collision"), run(distance_m=900.0)]
+    assert summarize(runs, SPEED)["conditions"]["L0"]["collisions_per_km"] == pytest.approx(1.0)
+
+
+def test_means_and_latencies_are_over_the_runs_that_know_them() -> None:
+    """Means are over valid runs, latencies and hops medians over runs; what no run knows is null."""
+    hops = [{"node": "camera", "hop": "encode", "p50": 2.0, "p95": 3.0, "n": 9}]
+    ages = {"p5": 1.0, "p50": 2.0, "p95": 3.0, "n": 10}
+    runs = [
+        run(
+            mae_m=1.0,
+            oscillation_hz=0.4,
+            hops_ms=hops,
+            age_at_actuation_ms=ages,
+            picture_age_ms={"mean": 90, "p95": 99},
+        ),
+        run(
+            mae_m=2.0, oscillation_hz=None, hops_ms=[{**hops[0], "p50": 4.0}], age_at_actuation_ms={**ages, "p50": 4.0}
+        ),
+        run(mae_m=1.5, age_at_actuation_ms={**ages, "p50": 9.0}),
+        run(mae_m=9.0, oscillation_hz=9.0, valid=False),
+    ]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert (condition["mae_m"], condition["oscillation_hz"], condition["rms_m"]) == (1.5, 0.4, None)
+    assert condition["hops_ms"] == [{"node": "camera", "hop": "encode", "p50": 3.0}]
+    assert condition["age_at_actuation_ms"] == {**ages, "p50": 4.0, "n": 30}
+    assert condition["picture_age_ms"] == {"mean": 90.0, "p95": 99.0}
+
+
+def test_the_error_is_told_three_ways() -> None:
+    """Over completed runs, up to where both conditions came, and with those not completed ranking last."""
+    runs = [
+        *grid(p95_m=2.0, p95_by_10m=[0.1, 0.2, 0.3]),
+        *grid(condition="L1", bad_route="b", p95_m=4.0, p95_by_10m=[0.5, 0.6]),
+    ]
+    conditions = summarize(runs, SPEED)["conditions"]
+    assert (conditions["L0"]["p95_m"], conditions["L1"]["p95_m"]) == (2.0, 4.0)
+    assert conditions["L0"]["p95_common_m"] == pytest.approx(0.2)
+    assert conditions["L0"]["p95_common_interval"] == pytest.approx([0.2, 0.2])
+    assert conditions["L1"]["p95_common_m"] == pytest.approx(0.6)
+    assert conditions["L1"]["p95_worst_rank_m"] == {"p25": 4.0, "p50": 4.0, "p75": 4.0}
+
+
+def test_groups_have_contrasts_of_their_own() -> None:
+    """Runs are paired within a group, never across groups; the base config's contrasts are those of its group."""
+    runs = [
+        each
+        for speed, bad in ((20, None), (30, "b"))
+        for each in (*grid(axes={"speed": speed}), *grid(condition="L1", bad_route=bad, axes={"speed": speed}))
+    ]
+    summary = summarize(runs, SPEED, base={"speed": 30})
+    pairs = [(each["contrasts"][0]["pairs"], each["contrasts"][0]["p"]) for each in summary["groups"]]
+    assert pairs == [(30, 1.0), (30, pytest.approx(0.0625))]
+    assert summary["contrasts"] == summary["groups"][1]["contrasts"]
+
+
+def test_results_of_an_older_version_are_summarised() -> None:
+    """What an older result does not say is null or empty, and what it says is there."""
+    condition = summarize([run()], SPEED)["conditions"]["L0"]
+    assert condition["completion_rate"] == 1.0
+    assert (condition["p95_common_m"], condition["mae_m"], condition["hops_ms"]) == (None, None, [])
+    assert condition["age_at_actuation_ms"] == {"p5": None, "p50": None, "p95": None, "n": 0}
+    assert condition["survival"]["A"]["distance_m"] == [0.0, 500.0]
+
+
+def test_a_summary_of_nothing() -> None:
+    """Without runs there are no conditions and no contrasts, and the paper's figures all the same."""
+    summary = summarize([], None)
+    assert (summary["conditions"], summary["contrasts"], summary["groups"]) == ({}, [], [])
+    assert list(summary["paper"]["conditions"]) == ["L0", "L1", "L2", "L3", "L4", "L5"]
+
+
+def test_the_bound_of_a_condition_is_the_largest() -> None:
+    """Latencies of a condition have the largest bound of its runs, and none where a run has none."""
+    other = run()["tau_v_ms"]
+    runs = [run(), run(tau_v_ms={**other, "bound": 0.8}), run(tau_c_ms={**other, "bound": None})]
+    condition = summarize(runs, SPEED)["conditions"]["L0"]
+    assert (condition["tau_v_ms"]["bound"], condition["tau_c_ms"]["bound"]) == (0.8, None)

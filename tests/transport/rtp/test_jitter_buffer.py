@@ -1,0 +1,389 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import NS_PER_MS, NS_PER_S
+from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.rtp import RtpPacket
+
+CAPACITY, MAX_JUMP = 1024, 3000
+LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
+"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+HOLD_NS = 10 * NS_PER_MS
+STARTED_NS = HOLD_NS
+
+
+def packet(sequence: int, ssrc: int = 7) -> RtpPacket:
+    return RtpPacket(96, sequence % 2**16, 0, ssrc, False, b"")
+
+
+def numbers(ordered: Ordered) -> list[int]:
+    return [one.sequence for one, _ in ordered]
+
+
+def gaps(ordered: Ordered) -> list[int]:
+    return [one.sequence for one, lost_before in ordered if lost_before]
+
+
+def started(first: int = 0, hold_ns: int | None = HOLD_NS) -> ReorderBuffer:
+    """Give a buffer past its start: packet `first` has left it, at `STARTED_NS`."""
+    buffer = ReorderBuffer(hold_ns)
+    buffer.push(packet(first), 0)
+    assert numbers(buffer.expire(STARTED_NS)) == [first % 2**16]
+    return buffer
+
+
+def test_start() -> None:
+    """The first packets wait one hold, so that the stream begins with the first sent and not the first to arrive."""
+    buffer = ReorderBuffer(HOLD_NS)
+    assert buffer.next_wake_ns() is None
+    assert buffer.highest_sequence == 0
+    assert buffer.push(packet(11), 100) == []
+    assert buffer.push(packet(12), 100 + NS_PER_MS) == []
+    assert buffer.push(packet(10), 100 + 2 * NS_PER_MS) == []
+    assert buffer.next_wake_ns() == 100 + HOLD_NS
+    assert buffer.expire(100 + HOLD_NS - 1) == []
+    ordered = buffer.expire(100 + HOLD_NS)
+    assert numbers(ordered) == [10, 11, 12]
+    assert gaps(ordered) == []
+    assert buffer.next_wake_ns() is None
+    buffer.push(packet(10), 100 + HOLD_NS)
+    buffer.push(packet(9), 100 + HOLD_NS)
+    assert (buffer.duplicate, buffer.late) == (1, 1)
+
+
+def test_in_order() -> None:
+    """A packet in order leaves at once, also over the wrap of the sequence numbers."""
+    buffer = started(65_534)
+    assert [numbers(buffer.push(packet(number), STARTED_NS)) for number in (65_535, 0, 1)] == [[65_535], [0], [1]]
+    assert buffer.highest_sequence == 2**16 + 1
+
+
+def test_gap_that_closes() -> None:
+    """Packets after a gap leave with the packet that closes it, in order and without a loss."""
+    buffer = started()
+    assert buffer.push(packet(3), STARTED_NS) == []
+    assert buffer.push(packet(2), STARTED_NS) == []
+    ordered = buffer.push(packet(1), STARTED_NS + HOLD_NS - 1)
+    assert numbers(ordered) == [1, 2, 3]
+    assert gaps(ordered) == []
+    assert (buffer.reordered, buffer.lost) == (2, 0)
+
+
+def test_gap_that_stays() -> None:
+    """After one hold a gap is given up, and the packet behind it says so."""
+    buffer = started()
+    assert buffer.push(packet(3), STARTED_NS) == []
+    assert numbers(buffer.push(packet(4), STARTED_NS + 1)) == []
+    assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert numbers(ordered) == [3, 4]
+    assert gaps(ordered) == [3]
+    assert buffer.lost == 2
+
+
+def test_each_gap_has_its_own_hold() -> None:
+    """The hold of a gap begins with the first packet behind that gap."""
+    buffer = started()
+    buffer.push(packet(2), STARTED_NS)
+    buffer.push(packet(4), STARTED_NS + 3)
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
+    assert buffer.next_wake_ns() == STARTED_NS + HOLD_NS + 3
+    assert gaps(buffer.expire(STARTED_NS + HOLD_NS + 3)) == [4]
+
+
+def test_late_wake() -> None:
+    """A packet that closes a gap is used even if the hold is over, as long as nobody has given the gap up."""
+    buffer = started()
+    buffer.push(packet(2), STARTED_NS)
+    assert numbers(buffer.push(packet(1), STARTED_NS + 2 * HOLD_NS)) == [1, 2]
+    buffer.push(packet(4), STARTED_NS + 2 * HOLD_NS)
+    assert numbers(buffer.push(packet(5), STARTED_NS + 4 * HOLD_NS)) == [4, 5]
+
+
+def test_late_and_duplicate() -> None:
+    """A packet that comes after its gap was given up, or twice, is dropped and counted as what it is."""
+    buffer = started(10)
+    buffer.push(packet(12), STARTED_NS)
+    assert buffer.push(packet(12), STARTED_NS) == []
+    assert (buffer.late, buffer.duplicate) == (0, 1)
+    buffer.expire(STARTED_NS + HOLD_NS)
+    assert buffer.push(packet(11), STARTED_NS + HOLD_NS) == []
+    assert (buffer.late, buffer.duplicate, buffer.lost) == (1, 1, 1)
+    assert buffer.push(packet(11), STARTED_NS + HOLD_NS) == []
+    assert buffer.push(packet(12), STARTED_NS + HOLD_NS) == []
+    assert (buffer.late, buffer.duplicate) == (1, 3)
+    assert buffer.push(packet(9), STARTED_NS + HOLD_NS) == []
+    assert buffer.late == 2
+
+
+def test_new_sender() -> None:
+    """A new SSRC lets go all that is held and begins a new stream, which the old one's packets are missing before."""
+    buffer = started(50_000)
+    buffer.push(packet(50_002), STARTED_NS)
+    assert numbers(buffer.push(packet(40_000, ssrc=8), STARTED_NS)) == [50_002]
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert [(one.ssrc, one.sequence, lost) for one, lost in ordered] == [(8, 40_000, True)]
+    assert buffer.highest_sequence == 40_000
+
+
+def test_one_stray_packet() -> None:
+    """A single packet far from all others is dropped and counted, and the stream goes on."""
+    buffer = started()
+    assert buffer.push(packet(MAX_JUMP + 1), STARTED_NS) == []
+    assert buffer.push(packet(-MAX_JUMP - 1), STARTED_NS) == []
+    assert numbers(buffer.push(packet(1), STARTED_NS)) == [1]
+    assert buffer.stray == 2
+    assert buffer.next_wake_ns() is None
+
+
+def test_the_farthest_packet_of_a_stream() -> None:
+    """A packet as far from the newest one as is allowed belongs to the stream, on either side."""
+    buffer = started(10_000)
+    assert buffer.push(packet(10_000 + MAX_JUMP), STARTED_NS) == []
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [10_000 + MAX_JUMP]
+    assert buffer.push(packet(10_000), STARTED_NS + HOLD_NS) == []
+    assert numbers(buffer.push_recovered(packet(10_000 + 2 * MAX_JUMP), STARTED_NS + HOLD_NS)) == []
+    assert numbers(buffer.expire(STARTED_NS + 2 * HOLD_NS)) == [10_000 + 2 * MAX_JUMP]
+    assert (buffer.stray, buffer.duplicate, buffer.recovered) == (0, 1, 1)
+
+
+def test_stray_packets_apart() -> None:
+    """Two stray packets that are not in a row, or not one right after the other, move nothing."""
+    buffer = started()
+    for number, released in ((20_000, []), (20_002, []), (1, [1]), (20_003, []), (2, [2])):
+        assert numbers(buffer.push(packet(number), STARTED_NS)) == released
+    assert buffer.stray == 3
+
+
+@pytest.mark.parametrize(("first", "second"), [(20_000, 20_001), (65_535, 0)])
+def test_jump(first: int, second: int) -> None:
+    """Two packets in a row in another range move the stream there, and neither of them is dropped."""
+    buffer = started(10_000)
+    assert buffer.push(packet(first), STARTED_NS) == []
+    assert buffer.push(packet(second), STARTED_NS) == []
+    ordered = buffer.expire(STARTED_NS + HOLD_NS)
+    assert numbers(ordered) == [first, second]
+    assert gaps(ordered) == [first]
+    assert (buffer.stray, buffer.lost) == (0, 0)
+
+
+def test_a_jump_keeps_the_wraps() -> None:
+    """A stream that goes on elsewhere goes on upwards: who reads its reports must not see it go back."""
+    buffer = started(65_000)
+    for number in (65_000 + MAX_JUMP + 1, 65_000 + MAX_JUMP + 2, 50_000, 50_001):
+        buffer.push(packet(number), STARTED_NS)
+        buffer.expire(STARTED_NS + HOLD_NS)
+    assert buffer.highest_sequence == 2**16 + 50_001
+
+
+def test_delay_spike() -> None:
+    """Many old packets in a row are late packets and not a restart of the sender."""
+    buffer = started()
+    buffer.push(packet(1500), STARTED_NS)
+    buffer.expire(STARTED_NS + HOLD_NS)
+    for number in range(1, 1500):
+        assert buffer.push(packet(number), STARTED_NS + HOLD_NS) == []
+    assert (buffer.lost, buffer.late) == (1499, 1499)
+    assert numbers(buffer.push(packet(1501), STARTED_NS + HOLD_NS)) == [1501]
+
+
+def test_bounded_memory() -> None:
+    """However long the hold, no more than a fixed number of packets is held."""
+    buffer = ReorderBuffer(hold_ns=10**15)
+    released = [buffer.push(packet(2 * number), number) for number in range(CAPACITY + 50)]
+    assert sum(len(ordered) for ordered in released) == 50
+
+
+def test_bounded_memory_of_losses() -> None:
+    """However many packets are given up, a fixed number is remembered, and the newest of them still count as late."""
+    buffer = started()
+    for number in range(2, 5 * MAX_JUMP):
+        buffer.push(packet(2 * number), STARTED_NS)
+        buffer.expire(STARTED_NS + HOLD_NS)
+        assert len(buffer._given_up) <= 2 * MAX_JUMP
+    assert buffer.push(packet(2 * number - MAX_JUMP + 1), STARTED_NS) == []
+    assert (buffer.late, buffer.duplicate) == (1, 0)
+
+
+@given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
+def test_any_order(first: int, order: list[int], start_ns: int) -> None:
+    """Packets that arrive within one hold leave in the order they were sent, none missing."""
+    buffer = ReorderBuffer(HOLD_NS)
+    ordered = [
+        one for at, number in enumerate(order) for one in buffer.push(packet(first + number), start_ns + at * 1000)
+    ]
+    ordered += buffer.expire(start_ns + HOLD_NS)
+    assert numbers(ordered) == [(first + number) % 2**16 for number in range(30)]
+    assert gaps(ordered) == []
+    assert (buffer.lost, buffer.late, buffer.duplicate) == (0, 0, 0)
+
+
+ARRIVALS = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 8 * NS_PER_MS)), min_size=1, max_size=80)
+
+
+@given(st.integers(0, 2**16 - 1), ARRIVALS)
+def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
+    """Whatever arrives when: order is kept, gaps are told, each packet is accounted for and held one hold at most."""
+    buffer = ReorderBuffer(HOLD_NS)
+    ordered: Ordered = []
+    now_ns = 0
+    for number, pause_ns in arrivals:
+        now_ns += pause_ns
+        ordered += buffer.push(packet(first + number), now_ns)
+        wake_ns = buffer.next_wake_ns()
+        assert wake_ns is None or now_ns < wake_ns <= now_ns + HOLD_NS
+    ordered += buffer.expire(now_ns + HOLD_NS)
+    assert buffer.next_wake_ns() is None
+    sent = [(number - first) % 2**16 for number in numbers(ordered)]
+    assert sent == sorted(set(sent))
+    assert gaps(ordered) == [(first + after) % 2**16 for before, after in pairwise(sent) if after != before + 1]
+    assert buffer.lost == sent[-1] - sent[0] + 1 - len(sent)
+    assert len(ordered) + buffer.late + buffer.duplicate == len(arrivals)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2**16 - 1), st.integers(0, 1), st.integers(0, HOLD_NS)), max_size=60))
+def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
+    """No sequence numbers and sources break the buffer, and after them an orderly stream goes through."""
+    buffer = ReorderBuffer(HOLD_NS)
+    now_ns = 0
+    for sequence, ssrc, pause_ns in arrivals:
+        now_ns += pause_ns
+        buffer.push(packet(sequence, ssrc), now_ns)
+    buffer.push(packet(0, ssrc=9), now_ns)
+    buffer.expire(now_ns + HOLD_NS)
+    assert numbers(buffer.push(packet(1, ssrc=9), now_ns + HOLD_NS)) == [1]
+
+
+@pytest.mark.parametrize("first", [0, 40_000])
+def test_recovered(first: int) -> None:
+    """A packet made again closes its gap like one that came, and counts as recovered only."""
+    buffer = started(first)
+    assert buffer.push(packet(first + 2), STARTED_NS) == []
+    ordered = buffer.push_recovered(packet(first + 1), STARTED_NS + 1)
+    assert (numbers(ordered), gaps(ordered)) == ([first + 1, first + 2], [])
+    assert numbers(buffer.push_recovered(packet(first + 3), STARTED_NS + 2)) == [first + 3]
+    assert buffer.highest_sequence == first + 3
+    assert (buffer.recovered, buffer.reordered, buffer.lost, buffer.late, buffer.duplicate) == (2, 0, 0, 0, 0)
+    assert buffer.push(packet(first + 1), STARTED_NS + 3) == []
+    assert buffer.duplicate == 1
+
+
+def test_recovered_that_nobody_waits_for() -> None:
+    """A packet made again changes nothing when it is there, was given up, is far away or is of another stream."""
+    buffer = started()
+    assert buffer.push(packet(2), STARTED_NS) == []
+    assert buffer.push_recovered(packet(2), STARTED_NS) == []
+    assert numbers(buffer.expire(STARTED_NS + HOLD_NS)) == [2]
+    for one in (packet(1), packet(2), packet(3, ssrc=8), packet(2 + MAX_JUMP + 1)):
+        assert buffer.push_recovered(one, STARTED_NS + HOLD_NS) == []
+    counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
+    assert counts == (0, 1, 0, 0, 0)
+    assert numbers(buffer.push(packet(3), STARTED_NS + HOLD_NS)) == [3]
+    assert ReorderBuffer(HOLD_NS).push_recovered(packet(0), 0) == []
+
+
+def hold_of(buffer: ReorderBuffer, number: int, now_ns: int) -> int:
+    """Let packet `number` be lost for good at `now_ns`; give how long it was waited for."""
+    assert buffer.push(packet(number + 1), now_ns) == []
+    wake_ns = buffer.next_wake_ns()
+    assert wake_ns is not None
+    assert numbers(buffer.expire(wake_ns)) == [number + 1]
+    return wake_ns - now_ns
+
+
+def test_the_hold_follows_the_network() -> None:
+    """Who has seen packets overtaken by 40 ms waits for the next ones a quarter longer, until that is long ago."""
+    buffer = started(hold_ns=None)
+    assert hold_of(buffer, 1, STARTED_NS) == LEAST_HOLD_NS
+    came_ns = STARTED_NS + 40 * NS_PER_MS
+    assert buffer.push(packet(1), came_ns) == []
+    assert (buffer.late, hold_of(buffer, 3, came_ns)) == (1, 50 * NS_PER_MS)
+    assert hold_of(buffer, 5, came_ns + WINDOW_NS) == 50 * NS_PER_MS
+    assert hold_of(buffer, 7, came_ns + 3 * WINDOW_NS) == LEAST_HOLD_NS
+
+
+def test_the_hold_follows_what_closes_a_gap_in_time() -> None:
+    """A packet that needed 9 ms of the 10 is as much of a sign as one that was late."""
+    buffer = started(hold_ns=None)
+    buffer.push(packet(2), STARTED_NS)
+    assert numbers(buffer.push(packet(1), STARTED_NS + 9 * NS_PER_MS)) == [1, 2]
+    assert hold_of(buffer, 3, STARTED_NS + 9 * NS_PER_MS) == 11_250_000
+
+
+def test_the_hold_follows_repairs() -> None:
+    """A packet that is made again after it was given up would have been waited for with a longer hold."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    assert buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS) == []
+    assert hold_of(buffer, 3, STARTED_NS + 20 * NS_PER_MS) == 25 * NS_PER_MS
+
+
+def test_the_hold_of_an_open_gap_grows_with_what_closes_another() -> None:
+    """While a gap is open, a packet behind it that was overtaken by 9 ms lengthens the hold of that gap too."""
+    buffer = started(hold_ns=None)
+    for number, after_ns in ((2, 0), (4, 0), (3, 9 * NS_PER_MS)):
+        assert buffer.push(packet(number), STARTED_NS + after_ns) == []
+    assert buffer.next_wake_ns() == STARTED_NS + 11_250_000
+
+
+def test_what_was_not_given_up_changes_no_hold() -> None:
+    """A packet from before the start, or one made again that had left already, is dropped and changes no hold."""
+    buffer = started(10, hold_ns=None)
+    assert buffer.push(packet(9), STARTED_NS + 50 * NS_PER_MS) == []
+    assert buffer.push_recovered(packet(10), STARTED_NS + 50 * NS_PER_MS) == []
+    assert (buffer.late, buffer.recovered) == (1, 0)
+    assert hold_of(buffer, 11, STARTED_NS + 50 * NS_PER_MS) == LEAST_HOLD_NS
+
+
+def test_nobody_waits_for_ever() -> None:
+    """What is overtaken by more than makes sense to wait for changes nothing."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    buffer.push(packet(1), STARTED_NS + MOST_HOLD_NS + 1)
+    assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS + 1) == LEAST_HOLD_NS
+
+
+def test_a_loss_does_not_make_what_was_only_swapped_long_overtaken() -> None:
+    """While a lost packet is waited for, others swap places behind it: each was overtaken by that much only."""
+    buffer = started(hold_ns=None)
+    now_ns = STARTED_NS
+    for number in range(2, 2000, 2):
+        lost = number % 200 == 100
+        for each in (number,) if lost else (number, number - 1):
+            now_ns += NS_PER_MS // 5
+            buffer.push(packet(each), now_ns)
+    assert buffer.reordered > 900
+    assert hold_of(buffer, 2001, now_ns + NS_PER_S) == LEAST_HOLD_NS
+
+
+def test_the_hold_stays_what_repairs_need() -> None:
+    """Repairs that take 20 ms are waited for as long as they come, though each comes in time."""
+    buffer = started(hold_ns=None)
+    hold_of(buffer, 1, STARTED_NS)
+    buffer.push_recovered(packet(1), STARTED_NS + 20 * NS_PER_MS)
+    for second in range(1, 200):
+        now_ns, number = STARTED_NS + second * NS_PER_S, 2 * second + 1
+        assert buffer.push(packet(number + 1), now_ns) == []
+        assert buffer.expire(now_ns + 20 * NS_PER_MS) == []
+        assert numbers(buffer.push_recovered(packet(number), now_ns + 20 * NS_PER_MS)) == [number, number + 1]
+    assert buffer.lost == 1
+
+
+@given(ARRIVALS)
+def test_any_arrivals_with_a_hold_that_follows(arrivals: list[tuple[int, int]]) -> None:
+    """Whatever arrives when, no packet is held longer than the longest hold, and each is accounted for."""
+    buffer = ReorderBuffer()
+    left, now_ns = 0, 0
+    for number, pause_ns in arrivals:
+        now_ns += pause_ns
+        left += len(buffer.push(packet(number), now_ns))
+        wake_ns = buffer.next_wake_ns()
+        assert wake_ns is None or now_ns < wake_ns <= now_ns + MOST_HOLD_NS
+    left += len(buffer.expire(now_ns + MOST_HOLD_NS))
+    assert buffer.next_wake_ns() is None
+    assert left + buffer.late + buffer.duplicate == len(arrivals)

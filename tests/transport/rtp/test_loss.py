@@ -1,0 +1,108 @@
+"""Steps 3 to 8 of the life of a frame over a link that loses and reorders: what `complete` promises about a picture."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from lavt.domain import NS_PER_MS, Picture
+from lavt.streams import stream
+from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.rtp import Depacketizer, Packetizer, parse_packet
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
+
+FRAMES = 30
+GOP_FRAMES = 10
+START_NS = 1_790_000_000_000_000_000
+FRAME_NS = 33_333_333
+
+
+def stamp_of(number: int) -> int:
+    return START_NS + number * FRAME_NS
+
+
+class Sent:
+    """30 frames with a keyframe every 10: the datagrams of each, and what a decoder makes of them without loss."""
+
+    def __init__(self) -> None:
+        encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=GOP_FRAMES)
+        packetizer = Packetizer(ssrc=7, first_sequence=65_500)
+        decoder = Decoder()
+        texture = stream(1, "texture").integers(0, 256, (128, 160 + FRAMES, 3), dtype=np.uint8)
+        self.datagrams: list[list[bytes]] = []
+        self.pictures: dict[int, Picture] = {}
+        for number in range(FRAMES):
+            picture = texture[:, number : number + 160].copy()
+            write_stamp(picture, stamp_of(number))
+            access_unit = encoder.encode(picture)
+            self.datagrams.append(packetizer.packetize(access_unit, rtp_timestamp(stamp_of(number))))
+            decoded = decoder.decode(access_unit)
+            assert decoded is not None
+            self.pictures[rtp_timestamp(stamp_of(number))] = decoded.picture
+
+
+@pytest.fixture(scope="module")
+def sent() -> Sent:
+    return Sent()
+
+
+def test_reordered(sent: Sent) -> None:
+    """Over a link that reorders within the hold every frame arrives complete, and its stamp says when it was sent."""
+    random = stream(1, "delay")
+    arrivals = []
+    for number, datagrams in enumerate(sent.datagrams):
+        delays_ns = random.integers(0, LEAST_HOLD_NS - NS_PER_MS, len(datagrams))
+        arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
+    buffer, depacketizer, decoder = ReorderBuffer(), Depacketizer(), Decoder()
+    ordered: Ordered = []
+    for now_ns, datagram in sorted(arrivals):
+        ordered += buffer.push(parse_packet(datagram), now_ns)
+    ordered += buffer.expire(FRAMES * FRAME_NS)
+    stamps = []
+    for packet, lost_before in ordered:
+        for unit in depacketizer.push(packet, lost_before):
+            decoded = decoder.decode(unit.data)
+            assert unit.complete
+            assert decoded is not None
+            stamps.append(read_stamp(decoded.luma))
+            assert stamp_agrees(stamps[-1], unit.timestamp)
+    assert stamps == [stamp_of(number) for number in range(FRAMES)]
+    assert buffer.reordered > 0
+
+
+@settings(max_examples=60)
+@given(st.sets(st.integers(0, 500), max_size=12))
+@example(set())
+def test_lost(sent: Sent, lost: set[int]) -> None:
+    """Pictures up to the first loss after a keyframe are trusted, no others, and each is exactly the one sent."""
+    packets = [parse_packet(datagram) for datagrams in sent.datagrams for datagram in datagrams]
+    lost = {number % len(packets) for number in lost}
+    damaged = {packets[number].timestamp for number in lost}
+    depacketizer, decoder = Depacketizer(), Decoder()
+    in_doubt, before_lost = True, False
+    trusted: list[int] = []
+    for number, packet in enumerate(packets):
+        if number in lost:
+            before_lost = True
+            continue
+        for unit in depacketizer.push(packet, before_lost):
+            in_doubt = not unit.complete or (in_doubt and not unit.keyframe)
+            decoded = decoder.decode(unit.data)
+            if not in_doubt:
+                assert decoded is not None
+                assert np.array_equal(decoded.picture, sent.pictures[unit.timestamp])
+                assert not decoded.corrupt
+                trusted.append(unit.timestamp)
+        before_lost = False
+    assert depacketizer.malformed == 0
+    timestamps = [rtp_timestamp(stamp_of(number)) for number in range(FRAMES)]
+    groups = [timestamps[begin : begin + GOP_FRAMES] for begin in range(0, FRAMES, GOP_FRAMES)]
+    assert trusted == [
+        timestamp for group in groups for timestamp in itertools.takewhile(lambda each: each not in damaged, group)
+    ]

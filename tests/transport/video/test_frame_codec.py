@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import Lane, Picture, SeenLane
+from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, Packetizer, parse_packet
+from lavt.transport.video.frame_codec import KEPT_PICTURES, HandedOver, LaneReceiver, LaneSender
+
+numbers = st.floats(allow_nan=False)
+STAMP_NS = 1_790_000_000_123_456_789
+
+
+def through_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
+    """Send access units as packets, one of which may be lost, and give what arrives."""
+    packetizer, reorder, depacketizer = Packetizer(7, 65_530), ReorderBuffer(), Depacketizer()
+    packets = [each for number, unit in enumerate(access_units) for each in packetizer.packetize(unit, number)]
+    assert len(packets) == len(access_units), "one packet each"
+    ordered = [
+        pair
+        for number, packet in enumerate(packets)
+        if number != lost
+        for pair in reorder.push(parse_packet(packet), number)
+    ]
+    ordered += reorder.expire(10**9)
+    return [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
+
+
+def picture(number: int) -> Picture:
+    return np.random.default_rng(number).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.lists(numbers, min_size=7, max_size=7))
+def test_a_lane_arrives_as_it_was_sent(stamp_ns: int, at_ns: int, values: list[float]) -> None:
+    """A lane goes through RTP bit for bit, with its stamp."""
+    c0, c1, c2, *rest = values
+    sender, receiver = LaneSender(), LaneReceiver()
+    stamped = sender.write_stamp(SeenLane(0, at_ns, Lane((c0, c1, c2), *rest)), stamp_ns)
+    (unit,) = through_rtp([sender.encode(stamped, keyframe=False)])
+    received = receiver.decode(unit.data)
+    assert received is not None
+    assert received.picture == stamped
+    assert receiver.read_stamp(received) == stamp_ns
+
+
+def test_two_lanes_of_a_standing_car_differ() -> None:
+    """The checksum holds the time, so that a car that stands is not taken for a camera that hangs."""
+    lane = Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0)
+    one, same, later = (LaneSender().prepare(SeenLane(0, at_ns, lane))[1] for at_ns in (1, 1, 2))
+    assert one == same
+    assert one != later
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65", b"\x00\x00\x00\x01\x65abc"])
+def test_what_is_no_picture_gives_none(data: bytes) -> None:
+    """Access units of something else give no picture, and raise nothing."""
+    assert LaneReceiver().decode(data) is None
+    assert HandedOver().decode(data) is None
+
+
+def test_pixels_arrive_as_they_were_rendered() -> None:
+    """A picture handed over has every pixel that it had when it was encoded, its stamp can be read, once."""
+    between = HandedOver()
+    shown = between.write_stamp(picture(1), STAMP_NS)
+    (unit,) = through_rtp([between.encode(shown, keyframe=False)])
+    expected = shown.copy()
+    shown[:] = 0  # the camera uses its buffer again
+    received = between.decode(unit.data)
+    assert received is not None
+    assert np.array_equal(received.picture, expected)
+    assert between.read_stamp(received) == STAMP_NS
+    assert between.decode(unit.data) is None
+
+
+def test_a_lost_picture_spoils_no_other() -> None:
+    """Each access unit stands alone: after a loss the next one is complete, and the lost picture is let go."""
+    between = HandedOver()
+    units = through_rtp([between.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
+    assert [unit.complete for unit in units] == [True, True, True]
+    received = [between.decode(unit.data) for unit in units]
+    assert [
+        np.array_equal(each.picture, picture(number)) for each, number in zip(received, (0, 2, 3), strict=True) if each
+    ]
+    assert not between._pictures
+
+
+def test_pictures_that_never_arrive_fill_no_memory() -> None:
+    """When nothing arrives, only so many pictures are kept, the newest."""
+    between = HandedOver()
+    units = [between.encode(picture(0)[:1], keyframe=False) for _ in range(KEPT_PICTURES + 5)]
+    assert between.decode(units[4]) is None
+    assert between.decode(units[5]) is not None

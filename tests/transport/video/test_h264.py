@@ -1,0 +1,253 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lavt.domain import Picture
+from lavt.errors import UserError
+from lavt.streams import stream
+from lavt.transport.rtp.rtp import split_nal_units
+from lavt.transport.video.h264 import Decoder, Encoder
+from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp
+
+WIDTH, HEIGHT = 320, 240
+START_NS = 1_790_000_000_000_000_000
+FRAME_NS = 33_333_333
+
+
+def moving_pictures(count: int) -> list[Picture]:
+    texture = stream(1, "texture").integers(0, 256, (HEIGHT, WIDTH + 4 * count, 3), dtype=np.uint8)
+    texture = np.asarray(cv2.GaussianBlur(texture, (0, 0), 1.5), dtype=np.uint8)
+    pictures = [texture[:, 4 * number : 4 * number + WIDTH].copy() for number in range(count)]
+    for number, picture in enumerate(pictures):
+        write_stamp(picture, START_NS + number * FRAME_NS)
+    return pictures
+
+
+def encoder(**changes: float) -> Encoder:
+    numbers = {"rate_hz": 30, "bit_rate_bps": 1_000_000, "gop_frames": 15} | changes
+    return Encoder(WIDTH, HEIGHT, **numbers)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[Picture]:
+    return moving_pictures(40)
+
+
+@pytest.fixture(scope="module")
+def access_units(pictures: list[Picture]) -> list[bytes]:
+    encode = encoder().encode
+    return [encode(picture) for picture in pictures]
+
+
+def kinds(access_unit: bytes) -> list[int]:
+    return [unit[0] & 0x1F for unit in split_nal_units(access_unit)]
+
+
+def test_no_hidden_frame(pictures: list[Picture]) -> None:
+    """One picture in gives one access unit out, and that one picture out, at once, with the stamp it was given."""
+    sender, receiver = encoder(), Decoder()
+    for number, picture in enumerate(pictures):
+        access_unit = sender.encode(picture)
+        assert sum(kind in {1, 5} for kind in kinds(access_unit)) == 1
+        decoded = receiver.decode(access_unit)
+        assert decoded is not None
+        assert read_stamp(decoded.luma) == START_NS + number * FRAME_NS
+        assert not decoded.corrupt
+
+
+def test_picture_is_the_picture(pictures: list[Picture], access_units: list[bytes]) -> None:
+    """What comes out looks like what went in: same size, blue green red, a few grey levels off."""
+    decoded = Decoder().decode(access_units[0])
+    assert decoded is not None
+    assert decoded.picture.shape == (HEIGHT, WIDTH, 3)
+    assert decoded.luma.shape == (HEIGHT, WIDTH)
+    assert np.abs(decoded.picture.astype(int) - pictures[0]).mean() < 12
+    plain = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    plain[:] = 200, 100, 50
+    plain[:STAMP_PX, :STAMP_PX] = 255
+    plain[-STAMP_PX:, -STAMP_PX:] = 0
+    seen = Decoder().decode(encoder().encode(plain))
+    assert seen is not None
+    assert np.abs(seen.picture[120, 160].astype(int) - (200, 100, 50)).max() < 4
+    assert abs(int(seen.luma[20, 20]) - 235) < 3
+    assert abs(int(seen.luma[-20, -20]) - 16) < 3
+
+
+def test_same_pictures_same_bytes(pictures: list[Picture], access_units: list[bytes]) -> None:
+    """Encoding is deterministic: another encoder makes the same bytes of the same pictures."""
+    encode = encoder().encode
+    assert [encode(picture) for picture in pictures] == access_units
+
+
+def test_pictures_stay_as_they_are(pictures: list[Picture]) -> None:
+    """The encoder does not keep or change the picture it is given, and a decoded one is nobody else's."""
+    sender, receiver = encoder(), Decoder()
+    first = receiver.decode(sender.encode(pictures[0]))
+    assert first is not None
+    copies = first.luma.copy(), first.picture.copy()
+    for picture in pictures[1:5]:
+        receiver.decode(sender.encode(picture))
+    assert np.array_equal(first.luma, copies[0])
+    assert np.array_equal(first.picture, copies[1])
+
+
+def test_keyframes(access_units: list[bytes]) -> None:
+    """A keyframe comes every `gop_frames` frames and carries its parameter sets in band."""
+    for number, access_unit in enumerate(access_units):
+        assert ({7, 8, 5} <= set(kinds(access_unit))) == (number % 15 == 0)
+
+
+def test_keyframe_on_request(pictures: list[Picture]) -> None:
+    """A requested keyframe is that very frame, and decoding can begin with it."""
+    sender = encoder(gop_frames=300)
+    units = [sender.encode(picture, keyframe=number == 7) for number, picture in enumerate(pictures[:10])]
+    assert [number for number, unit in enumerate(units) if 5 in kinds(unit)] == [0, 7]
+    assert kinds(units[7])[:2] == [7, 8]
+    receiver = Decoder()
+    for number in range(7, 10):
+        decoded = receiver.decode(units[number])
+        assert decoded is not None
+        assert read_stamp(decoded.luma) == START_NS + number * FRAME_NS
+
+
+def test_bit_rate(pictures: list[Picture], access_units: list[bytes]) -> None:
+    """The decoder buffer holds: the stream keeps to its rate, and a smaller buffer means a smaller largest frame."""
+    bits = 8 * sum(len(unit) for unit in access_units)
+    assert 0.5e6 < bits / (len(access_units) / 30) < 1.3e6
+    encode = encoder(buffer_s=1 / 30).encode
+    assert max(len(encode(picture)) for picture in pictures) < max(len(unit) for unit in access_units)
+
+
+def test_empty_access_unit(access_units: list[bytes]) -> None:
+    """An empty access unit gives no picture and does not end the stream."""
+    receiver = Decoder()
+    assert receiver.decode(b"") is None
+    assert receiver.decode(access_units[0]) is not None
+    assert receiver.decode(b"") is None
+    assert receiver.decode(access_units[1]) is not None
+
+
+def test_no_keyframe_yet(access_units: list[bytes]) -> None:
+    """Before the first keyframe there is no picture."""
+    receiver = Decoder()
+    assert [receiver.decode(unit) for unit in access_units[1:4]] == [None, None, None]
+    assert receiver.decode(access_units[15]) is not None
+
+
+def test_truncated_access_unit(access_units: list[bytes]) -> None:
+    """A picture of which a part is missing is given with the rest made up, and says so."""
+    receiver = Decoder()
+    receiver.decode(access_units[0])
+    decoded = receiver.decode(access_units[1][: len(access_units[1]) // 2])
+    assert decoded is not None
+    assert decoded.corrupt
+
+
+def test_keyframe_after_damage(access_units: list[bytes]) -> None:
+    """Nothing of a damaged picture, wherever it was cut off, is left in the keyframe after it."""
+    clean = Decoder().decode(access_units[15])
+    assert clean is not None
+    for kept in range(100, len(access_units[14]), 97):
+        receiver = Decoder()
+        receiver.decode(access_units[0])
+        receiver.decode(access_units[14][:kept])
+        decoded = receiver.decode(access_units[15])
+        assert decoded is not None
+        assert np.array_equal(decoded.picture, clean.picture)
+
+
+def test_lost_access_units(access_units: list[bytes]) -> None:
+    """After two lost pictures in a row the next ones come out all the same, and the next keyframe at once."""
+    receiver = Decoder()
+    receiver.decode(access_units[0])
+    for number in range(3, 15):
+        decoded = receiver.decode(access_units[number])
+        assert decoded is not None
+    decoded = receiver.decode(access_units[15])
+    assert decoded is not None
+    assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
+
+
+def test_other_size_on_the_way(access_units: list[bytes]) -> None:
+    """The decoder follows a sender that begins anew with another size."""
+    receiver = Decoder()
+    receiver.decode(access_units[0])
+    other = Encoder(128, 96, rate_hz=30, bit_rate_bps=500_000, gop_frames=15)
+    decoded = receiver.decode(other.encode(np.zeros((96, 128, 3), np.uint8)))
+    assert decoded is not None
+    assert decoded.picture.shape == (96, 128, 3)
+
+
+@settings(max_examples=60)
+@given(st.binary(max_size=200), st.booleans())
+def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> None:
+    """No bytes make the decoder raise, nor keep the next keyframe from being decoded."""
+    receiver = Decoder()
+    receiver.decode(access_units[0])
+    receiver.decode(b"\x00\x00\x00\x01" * start_code + data)
+    decoded = receiver.decode(access_units[15])
+    assert decoded is not None
+    assert read_stamp(decoded.luma) == START_NS + 15 * FRAME_NS
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(st.integers(0, 14), st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=12))
+def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[int, int, int]]) -> None:
+    """What is made of a damaged stream is the same every time: made-up parts come from no stray memory."""
+    units = [bytearray(unit) for unit in access_units[:15]]
+    for number, at, flip in damage:
+        units[number][at % len(units[number])] ^= flip
+    first, second = Decoder(), Decoder()
+    for unit in units:
+        one, other = first.decode(bytes(unit)), second.decode(bytes(unit))
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            assert np.array_equal(one.picture, other.picture)
+            assert one.corrupt == other.corrupt
+
+
+@pytest.mark.parametrize("size", [(321, 240), (320, 241), (62, 240), (320, 62), (8192, 8192)])
+def test_bad_sizes(size: tuple[int, int]) -> None:
+    """Odd sizes, sizes below the stamp's and sizes beyond the decoder's are refused with a sentence."""
+    with pytest.raises(UserError, match="choose"):
+        Encoder(*size, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"rate_hz": 0}, {"rate_hz": float("nan")}, {"bit_rate_bps": 0}, {"gop_frames": 0}, {"buffer_s": 0.0}],
+)
+def test_bad_rates(change: dict[str, float]) -> None:
+    """Rates of nothing are refused with a sentence."""
+    with pytest.raises(UserError, match="choose"):
+        encoder(**change)
+
+
+def test_bad_preset() -> None:
+    """A preset that libx264 does not have is refused, and the sentence names those it has."""
+    with pytest.raises(UserError, match="ultrafast, superfast"):
+        Encoder(WIDTH, HEIGHT, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15, preset="fastest")
+
+
+def test_picture_of_another_size() -> None:
+    """A picture that does not fit the encoder is refused."""
+    with pytest.raises(UserError, match="was made for"):
+        encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))
+
+
+def test_silence(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, access_units: list[bytes]
+) -> None:
+    """Neither a damaged stream nor the end of an encoder prints anything."""
+    receiver = Decoder()
+    receiver.decode(access_units[1])
+    receiver.decode(access_units[0][:500])
+    sender = encoder()
+    sender.encode(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    del sender
+    assert capfd.readouterr() == ("", "")
+    assert caplog.records == []

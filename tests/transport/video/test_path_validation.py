@@ -1,0 +1,355 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import count
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lavt.domain import NS_PER_S
+from lavt.errors import UserError
+from lavt.transport.rtp.rtcp import is_rtcp, is_rtp
+from lavt.transport.video.cipher import SrtpCipher
+from lavt.transport.video.path_validation import (
+    CHALLENGE_LIFETIME_NS,
+    HELLO_AGAIN_NS,
+    HELLO_INTERVAL_NS,
+    REPORT_TIMEOUT_NS,
+    PathClient,
+    PathServer,
+    is_path_datagram,
+)
+
+TOKEN = bytes(range(16))
+OTHER_TOKEN = bytes(16)
+HOME = ("192.0.2.1", 5004)
+ELSEWHERE = ("198.51.100.7", 5004)
+OTHER_PORT = ("192.0.2.1", 5005)
+T0 = 5 * NS_PER_S
+
+
+def secrets() -> Callable[[], bytes]:
+    numbers = count()
+    return lambda: next(numbers).to_bytes(16, "big")
+
+
+def new_server(token: bytes | None = TOKEN) -> PathServer:
+    server = PathServer(secrets())
+    server.set_token(token)
+    return server
+
+
+def answer_for(server: PathServer, address: tuple[str, int], now_ns: int = T0, token: bytes = TOKEN) -> bytes:
+    """Give what the client answers to the challenge that its hello from `address` brings."""
+    client = PathClient(token)
+    challenge = server.receive(client.hello(now_ns), address, now_ns)
+    assert challenge is not None
+    answer = client.answer(challenge)
+    assert answer is not None
+    return answer
+
+
+def opened(address: tuple[str, int] = HOME, now_ns: int = T0) -> PathServer:
+    server = new_server()
+    assert server.receive(answer_for(server, address, now_ns), address, now_ns) is None
+    assert server.open_address(now_ns) == address
+    return server
+
+
+def refused(server: PathServer) -> dict[str, int]:
+    names = ("malformed", "wrong_token", "wrong_address", "stale", "foreign_reports")
+    return {name: getattr(server, name) for name in names if getattr(server, name)}
+
+
+def test_opening() -> None:
+    """Hello, challenge and answer open the path to where they came from, and not before the answer is there."""
+    server, client = new_server(), PathClient(TOKEN)
+    assert server.open_address(T0) is None
+    challenge = server.receive(client.hello(T0), HOME, T0)
+    assert challenge is not None
+    assert server.open_address(T0) is None
+    assert not server.rtcp_admitted(HOME)
+    answer = client.answer(challenge)
+    assert answer is not None
+    assert server.receive(answer, HOME, T0 + 1) is None
+    assert server.open_address(T0 + 1) == HOME
+    assert server.rtcp_admitted(HOME)
+    assert not server.rtcp_admitted(OTHER_PORT)
+    assert refused(server) == {}
+
+
+def test_no_amplification() -> None:
+    """What the server sends to an unproven address is never longer than what came from there."""
+    server, client = new_server(), PathClient(TOKEN)
+    hello = client.hello(T0)
+    challenge = server.receive(hello, HOME, T0)
+    assert challenge is not None
+    assert len(challenge) <= len(hello)
+
+
+def test_told_from_video() -> None:
+    """The datagrams of the path are neither RTP nor RTCP."""
+    server, client = new_server(), PathClient(TOKEN)
+    hello = client.hello(T0)
+    challenge = server.receive(hello, HOME, T0)
+    assert challenge is not None
+    for datagram in (hello, challenge, answer_for(server, HOME)):
+        assert is_path_datagram(datagram)
+        assert not is_rtp(datagram)
+        assert not is_rtcp(datagram)
+
+
+def test_wrong_token() -> None:
+    """Whoever does not know the token gets no challenge, and no answer of theirs opens the path."""
+    server = new_server()
+    stranger = PathClient(OTHER_TOKEN)
+    assert server.receive(stranger.hello(T0), HOME, T0) is None
+    challenge = server.receive(PathClient(TOKEN).hello(T0), HOME, T0)
+    assert challenge is not None
+    assert stranger.answer(challenge) is None
+    right = PathClient(TOKEN).answer(challenge)
+    assert right is not None
+    server.receive(right[:-32] + bytes(32), HOME, T0)
+    assert server.open_address(T0) is None
+    assert refused(server) == {"wrong_token": 2}
+
+
+def test_no_session() -> None:
+    """Without a session there is no token, and nothing opens the path."""
+    server = new_server(None)
+    assert server.receive(PathClient(TOKEN).hello(T0), HOME, T0) is None
+    assert refused(server) == {"wrong_token": 1}
+
+
+@pytest.mark.parametrize("address", [ELSEWHERE, OTHER_PORT])
+def test_answer_from_another_address(address: tuple[str, int]) -> None:
+    """An answer that was overheard and is sent from another address opens and moves nothing."""
+    server = new_server()
+    answer = answer_for(server, HOME)
+    server.receive(answer, address, T0)
+    assert server.open_address(T0) is None
+    server.receive(answer, HOME, T0)
+    server.receive(answer, address, T0)
+    assert server.open_address(T0) == HOME
+    assert refused(server) == {"wrong_address": 2}
+
+
+def test_third_party() -> None:
+    """Even who holds the token cannot aim the video at an address that does not itself receive a challenge."""
+    server = new_server()
+    answer = answer_for(server, ELSEWHERE)
+    server.receive(answer, HOME, T0)
+    assert server.open_address(T0) is None
+
+
+def test_stale_challenge() -> None:
+    """A challenge is worth something for 2 s and not longer."""
+    server = new_server()
+    answer = answer_for(server, HOME, T0)
+    server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS + 1)
+    assert server.open_address(T0 + CHALLENGE_LIFETIME_NS + 1) is None
+    assert refused(server) == {"stale": 1}
+    server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS)
+    assert server.open_address(T0 + CHALLENGE_LIFETIME_NS) == HOME
+
+
+def test_spoofed_hello() -> None:
+    """A hello from anywhere, proven or not, leaves an open path where it is."""
+    server = opened()
+    server.receive(PathClient(TOKEN).hello(T0), ELSEWHERE, T0)
+    server.receive(PathClient(OTHER_TOKEN).hello(T0), ELSEWHERE, T0)
+    assert server.open_address(T0) == HOME
+
+
+def test_new_address() -> None:
+    """A client that comes from a new address is challenged there, and its answer moves the path."""
+    server = opened()
+    answer = answer_for(server, ELSEWHERE, T0 + 1)
+    assert server.open_address(T0 + 1) == HOME
+    server.receive(answer, ELSEWHERE, T0 + 1)
+    assert server.open_address(T0 + 1) == ELSEWHERE
+    assert not server.rtcp_admitted(HOME)
+
+
+def test_replay_after_a_move() -> None:
+    """An answer that opened the path once does not bring it back, not even from its own address."""
+    server = new_server()
+    first = answer_for(server, HOME, T0)
+    server.receive(first, HOME, T0)
+    server.receive(answer_for(server, ELSEWHERE, T0 + 1), ELSEWHERE, T0 + 1)
+    server.receive(first, HOME, T0 + 2)
+    assert server.open_address(T0 + 2) == ELSEWHERE
+    assert refused(server) == {"stale": 1}
+
+
+def test_replay_keeps_nothing_open() -> None:
+    """Repeating the answer does not stand in for receiver reports."""
+    server = new_server()
+    answer = answer_for(server, HOME, T0)
+    server.receive(answer, HOME, T0)
+    server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS)
+    assert server.open_address(T0 + REPORT_TIMEOUT_NS + 1) is None
+
+
+def test_no_reports() -> None:
+    """A path without receiver reports for 2 s is closed, and one that had them stays open as long."""
+    server = opened()
+    server.report(HOME, T0 + REPORT_TIMEOUT_NS)
+    assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS) == HOME
+    assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS + 1) is None
+    assert not server.rtcp_admitted(HOME)
+
+
+def test_report_too_late() -> None:
+    """A report does not open a path again that has been closed; another challenge does."""
+    server = opened()
+    late_ns = T0 + REPORT_TIMEOUT_NS + 1
+    server.report(HOME, late_ns)
+    assert server.open_address(late_ns) is None
+    assert refused(server) == {"foreign_reports": 1}
+    server.receive(answer_for(server, HOME, late_ns), HOME, late_ns)
+    assert server.open_address(late_ns) == HOME
+
+
+def test_report_from_elsewhere() -> None:
+    """Reports from where the path does not go keep nothing open."""
+    server = opened()
+    server.report(ELSEWHERE, T0 + REPORT_TIMEOUT_NS)
+    assert server.open_address(T0 + REPORT_TIMEOUT_NS + 1) is None
+    assert refused(server) == {"foreign_reports": 1}
+
+
+def test_a_challenge_of_nobody_is_not_answered() -> None:
+    """The client answers challenges of who knows the token, each newer than the one before, and no others."""
+    server, client = new_server(), PathClient(TOKEN)
+    challenge = server.receive(client.hello(T0), HOME, T0)
+    newer = server.receive(client.hello(T0 + 1), HOME, T0 + 1)
+    assert challenge is not None
+    assert newer is not None
+    for at in range(len(challenge)):
+        assert client.answer(challenge[:at] + bytes([challenge[at] ^ 1]) + challenge[at + 1 :]) is None
+    assert client.answer(newer) is not None
+    assert client.answer(newer) is None
+    assert client.answer(challenge) is None
+
+
+def encrypted() -> tuple[PathServer, PathClient]:
+    pytest.importorskip("pylibsrtp", reason="an extra: pip install 'lavt[secure]'")
+    server = PathServer(secrets(), partial(SrtpCipher, "server"))
+    server.set_token(TOKEN)
+    return server, PathClient(TOKEN, partial(SrtpCipher, "client"))
+
+
+def reopened(server: PathServer, client: PathClient, address: tuple[str, int], now_ns: int) -> None:
+    challenge = server.receive(client.hello(now_ns), address, now_ns)
+    assert challenge is not None
+    server.receive(client.answer(challenge) or b"", address, now_ns)
+    assert server.open_address(now_ns) == address
+
+
+RTP = bytes.fromhex("80600001000000010000000a") + b"a picture"
+RTCP = bytes.fromhex("80c900010000000b")
+
+
+def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
+    """What either end seals the other opens, and nothing of a picture can be read in between."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    sealed = server.cipher.seal(RTP)
+    assert b"a picture" not in sealed
+    assert client.open(sealed) == RTP
+    assert client.open(sealed) is None
+    assert client.open(RTP) is None
+    assert client.open_control(server.cipher.seal_control(RTCP)) == RTCP
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+    assert server.cipher.open_control(RTCP) is None
+
+
+def test_each_opening_has_keys_of_its_own() -> None:
+    """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    before = server.cipher.seal(RTP)
+    late = server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    reopened(server, client, ELSEWHERE, T0 + 1)
+    after = server.cipher.seal(RTP)
+    assert after != before
+    assert client.open(after) == RTP
+    assert client.open(late) is not None
+    assert client.open(before) == RTP
+    assert client.open(before) is None
+    assert server.cipher.open_control(client.seal_control(RTCP)) is None  # the last that came was under the old keys
+    server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.open(server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+
+
+def test_answers_that_are_lost_do_no_harm() -> None:
+    """A client whose newer answers never arrive still opens what comes under the keys of an older one."""
+    server, client = encrypted()
+    reopened(server, client, HOME, T0)
+    for later_ns in range(1, 4):
+        challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
+        assert client.answer(challenge or b"") is not None
+    assert client.open(server.cipher.seal(RTP)) == RTP
+    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+
+
+@pytest.mark.parametrize("token", [OTHER_TOKEN, TOKEN, None])
+def test_new_token(token: bytes | None) -> None:
+    """A new token closes the path, and challenges from before it are worth nothing."""
+    server = opened()
+    before = answer_for(server, HOME, T0 + 1)
+    server.set_token(token)
+    assert server.open_address(T0 + 1) is None
+    assert not server.rtcp_admitted(HOME)
+    server.receive(before, HOME, T0 + 1)
+    assert server.open_address(T0 + 1) is None
+
+
+def test_bad_token() -> None:
+    """A token that is not 16 bytes long is refused on both sides."""
+    with pytest.raises(UserError, match="16 bytes"):
+        PathClient(b"short")
+    with pytest.raises(UserError, match="16 bytes"):
+        new_server(b"")
+
+
+def test_a_lost_path_is_asked_for_long_before_the_vehicle_misses_a_command() -> None:
+    """A hello comes within half of the 300 ms after which a vehicle without a newer picture's command is degraded."""
+    assert HELLO_AGAIN_NS <= 300_000_000 // 2
+
+
+def test_when_to_say_hello() -> None:
+    """The client says hello at once, then every 500 ms; once video came, whenever none has come for 150 ms."""
+    client = PathClient(TOKEN)
+    assert client.next_hello_ns() == 0
+    client.hello(T0)
+    assert client.next_hello_ns() == T0 + HELLO_INTERVAL_NS
+    client.video_arrived(T0 + 7)
+    assert client.next_hello_ns() == T0 + 7 + HELLO_AGAIN_NS
+    client.hello(T0 + 7 + HELLO_AGAIN_NS)
+    assert client.next_hello_ns() == T0 + 7 + 2 * HELLO_AGAIN_NS
+
+
+@given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT", b"LAVT\x01\x02", b"LAVT\x02\x02", b"LAVT\x03\x02"]))
+def test_any_bytes(data: bytes, head: bytes) -> None:
+    """No bytes make the server answer, open or raise, and every such datagram is counted once."""
+    server = opened()
+    assert server.receive(head + data, ELSEWHERE, T0) is None
+    assert server.open_address(T0) == HOME
+    assert sum(refused(server).values()) == 1
+    assert PathClient(TOKEN).answer(head + data) is None
+
+
+@given(st.integers(0, 61), st.integers(1, 255))
+def test_any_change(at: int, flip: int) -> None:
+    """An answer with any one byte changed opens nothing."""
+    server = new_server()
+    answer = bytearray(answer_for(server, HOME))
+    answer[at] ^= flip
+    server.receive(bytes(answer), HOME, T0)
+    assert server.open_address(T0) is None
+    assert sum(refused(server).values()) == 1

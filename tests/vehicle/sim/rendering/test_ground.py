@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lavt.domain import FloatArray
+from lavt.vehicle.sim.rendering.ground import TILE_M, Ground
+from lavt.vehicle.sim.rendering.light import LIGHTS
+from lavt.vehicle.sim.rendering.textures import SCALES_M
+from lavt.vehicle.sim.road.road import Road, parse_road
+
+BEND = """
+title: a bend
+segments: [{length_m: 70, curvature_per_m: 0.02}]
+lanes: {widths_m: [8]}
+marks: [{offset_m: 2, kind: broken, dash_m: 60, gap_m: 10, width_m: WIDTH}]
+"""
+
+
+def brightness(road: Road, s_m: FloatArray, offset_m: float, level: int) -> FloatArray:
+    """Give the mean of the three colours of the texels at stations and an offset."""
+    ground = Ground(road, LIGHTS["noon"], None)
+    found = []
+    for x_m, y_m in road.across(s_m, offset_m).tolist():
+        column, row = int(x_m // TILE_M[level]), int(y_m // TILE_M[level])
+        tile = ground.tile(level, column, row)
+        texel = tile[int(y_m % TILE_M[level] / SCALES_M[level]), int(x_m % TILE_M[level] / SCALES_M[level])]
+        found.append(float(texel.mean()))
+    return np.array(found)
+
+
+def test_a_long_dash_bends_with_the_road() -> None:
+    """Of a dash of 60 m in a bend of 50 m the paint is found where the mark is, all along."""
+    road = parse_road(BEND.replace("WIDTH", "0.3"), source="x")
+    s_m = np.arange(2.0, 58.0, 0.5)
+    painted, bare = brightness(road, s_m, 2.0, 1), brightness(road, s_m, 0.0, 1)
+    assert np.mean(painted > bare + 40) > 0.95
+
+
+@pytest.mark.parametrize(("width_m", "share"), [(0.125, 0.125 * 1.3 / 0.32), (1.2, 1.0)])
+def test_far_away_a_mark_is_as_bright_as_it_is_wide(width_m: float, share: float) -> None:
+    """At 32 cm a texel a thin line is fainter by as much as it is thinner; a wide one is as white as near by."""
+    road = parse_road(BEND.replace("WIDTH", str(width_m)), source="x")
+    s_m = np.arange(2.0, 58.0, 0.5)
+    near, far = (
+        np.median(brightness(road, s_m, 2.0, level)) - np.median(brightness(road, s_m, 0.0, level)) for level in (0, 4)
+    )
+    assert far / near == pytest.approx(share, abs=0.15)

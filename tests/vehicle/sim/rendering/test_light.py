@@ -1,0 +1,98 @@
+"""What the three lights do to a picture."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
+
+from lavt.domain import FloatArray, Picture
+from lavt.vehicle.sim.rendering import renderer
+from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
+from lavt.vehicle.sim.rendering.pinhole import view_from
+from lavt.vehicle.sim.road.road import Road, load_road
+
+NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
+
+
+@pytest.fixture(scope="module")
+def road() -> Road:
+    return load_road("a_key")
+
+
+@cache
+def asphalt(light: LightName) -> FloatArray:
+    """Return the means (n, 3) of small pieces of the driven lane in front of the car, all along the route."""
+    road = load_road("a_key")
+    camera = camera_on(road, light=light)
+    pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.length_m, 6.0)]
+    return np.array([picture[420:470, 300:340].reshape(-1, 3).mean(axis=0) for picture in pictures])
+
+
+def test_the_low_sun_is_warm_and_dark() -> None:
+    """With a low sun the road is darker than at noon and redder than blue; under clouds it is bluish, if anything."""
+    noon, low, clouds = (np.median(asphalt(light), axis=0) for light in NAMES)
+    assert low.mean() < 0.9 * noon.mean()
+    assert low[2] / low[0] > 1.2 * noon[2] / noon[0]
+    assert clouds[2] <= clouds[0]
+
+
+def test_only_the_sun_throws_shadows() -> None:
+    """With a low sun the lane has pieces in the shade, about half as bright as the others; under clouds it has none."""
+    low, clouds = asphalt("low_sun").mean(axis=1), asphalt("overcast").mean(axis=1)
+    assert low.min() < 0.55 * np.median(low)
+    assert clouds.min() > 0.8 * np.median(clouds)
+
+
+def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, s_m: float) -> float:
+    u_px, v_px, _ = view_from(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
+    return float(picture[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 2 : round(u_px) + 3].mean())
+
+
+def test_a_rails_shadow_is_where_the_sun_throws_it(road: Road) -> None:
+    """Beside the rail on the right the ground is dark as far as the sun throws its top, and bright beyond."""
+    camera = camera_on(road, light="low_sun", scenery="light")
+    picture = picture_of(camera, pose_at(road, 80.0))
+    station_m = 88.0
+    ahead, left = road.across(station_m, [0.0, 1.0])
+    reach_m = 0.76 * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
+    assert reach_m > 3.0  # the sun stands to the right here
+    inside = grey_at(picture, road, station_m, -9.15 + 0.85 * reach_m, 80.0)
+    beyond = grey_at(picture, road, station_m, -9.15 + 1.5 * reach_m, 80.0)
+    assert inside < 0.7 * beyond
+
+
+@pytest.mark.parametrize("light", NAMES)
+def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
+    """In every light a solid mark is at least half as bright again as the asphalt beside it."""
+    picture = picture_of(camera_on(road, light=light), pose_at(road, 0.0)).astype(np.uint8)
+    assert grey_at(picture, road, 7.0, -1.75, 0.0) > 1.5 * grey_at(picture, road, 7.0, -1.2, 0.0)
+
+
+DIGEST = """
+from tests.vehicle.sim.rig import camera_on, digest, picture_of, pose_at
+from lavt.vehicle.sim.road import load_road
+road = load_road("a_key")
+print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.3, 0.1), 5)))
+"""
+
+
+@pytest.mark.parametrize(
+    "light", ["low_sun", *(pytest.param(light, marks=pytest.mark.full) for light in ("noon", "overcast"))]
+)
+def test_a_frame_is_the_same_to_the_byte_everywhere(road: Road, light: LightName) -> None:
+    """Equal pose, number and seed give an equal picture with cold and warm caches, and in another process."""
+    renderer.world.cache_clear()
+    cold = digest(picture_of(camera_on(road, light=light), pose_at(road, 70.0, 0.3, 0.1), 5))
+    warm_camera = camera_on(road, light=light)
+    warm_camera.prepare()
+    for s_m in (20.0, 95.0, 66.0):
+        picture_of(warm_camera, pose_at(road, s_m, -2.0, -0.4))
+    warm = digest(picture_of(warm_camera, pose_at(road, 70.0, 0.3, 0.1), 5))
+    command = [sys.executable, "-c", DIGEST.format(light=light)]
+    elsewhere = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.strip()
+    assert cold == warm == elsewhere

@@ -1,0 +1,113 @@
+import math
+
+import numpy as np
+import pytest
+
+from lavt.errors import UserError
+from lavt.vehicle.sim.road.road import Road, load_road, road_names
+
+ROUTES = {
+    # length, turn between start and end (degrees), smallest radius, start x, y and heading (degrees)
+    "a": (299.93, -90.54, 41.77, 384.36, 53.77, -90.44),
+    "a_key": (122.93, -90.54, 41.77, 384.27, 41.77, -90.44),
+    "b": (591.19, 179.66, 86.54, -414.62, -9.39, -179.63),
+    "b_key": (230.55, 89.27, 86.54, -414.62, -9.39, -179.63),
+    "c": (292.56, -90.17, 134.96, 216.68, 367.69, -0.43),
+    "c_key": (163.68, -61.57, 134.96, 231.83, 367.64, 0.30),
+}
+"""What the map says of the six routes' lane."""
+
+
+@pytest.fixture(scope="module")
+def road() -> Road:
+    return load_road("a_key")
+
+
+def test_the_six_routes_come_along() -> None:
+    """Three routes, their key parts and a straight road come with the package."""
+    assert road_names() == sorted([*ROUTES, "straight"])
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_a_route_has_the_shape_of_the_map(name: str) -> None:
+    """Length, turn, smallest radius and starting pose of a route are those of the map's lane."""
+    length_m, turn_deg, radius_m, *start = ROUTES[name]
+    road = load_road(name)
+    assert road.length_m == pytest.approx(length_m, abs=0.01)
+    _, _, heading_rad, _ = road.point([0.0, road.length_m])
+    assert math.degrees(heading_rad[1] - heading_rad[0]) == pytest.approx(turn_deg, abs=0.02)
+    curvature = road.point(np.arange(0.0, road.length_m, 0.5))[3]
+    assert 1 / np.abs(curvature).max() == pytest.approx(radius_m, abs=0.01)
+    x_m, y_m, start_rad = road.start
+    assert (x_m, y_m, math.degrees(start_rad)) == pytest.approx(start, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
+    """Four lanes of 3.5 m a direction, the third from the left is driven, shoulders of 3.5 m, a barrier, rails."""
+    road = load_road(name)
+    assert (road.lanes.edges_m, road.lanes.driven) == ((-5.25, -1.75, 1.75, 5.25, 8.75), 2)
+    assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(12.25, -8.75), (33.25, 12.25)]
+    assert {mark.offset_m for mark in road.marks if mark.colour == "yellow"} == {8.75, 15.75}
+    assert {mark.offset_m for mark in road.marks if mark.kind == "broken"} >= {5.25, 1.75, -1.75}
+    assert {(rail.offset_m, rail.kind) for rail in road.rails} == {
+        (12.25, "barrier"), (-9.15, "rail"), (33.65, "rail")
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROUTES)
+def test_there_is_road_before_the_start_and_beyond_the_end(name: str) -> None:
+    """At least 20 m lie before the start and 60 m beyond the end, and beyond these it goes straight on."""
+    road = load_road(name)
+    assert road.first_m <= -20.0
+    assert road.last_m > road.length_m + 60.0
+    for s_m in (road.first_m - 30.0, road.last_m):
+        step = np.diff(road.across([s_m, s_m + 20.0, s_m + 30.0], 0.0), axis=0)
+        assert np.hypot(*step.T) == pytest.approx([20.0, 10.0])
+
+
+def test_the_route_ends_where_the_map_says(road: Road) -> None:
+    """The end is the map's centre of lane -3 of road 38 at s = 75 m: 42.464 m along its line, 12.25 m to the right."""
+    heading_rad = 3.1245246695832329
+    x_m = 341.47150492643561 + 42.46406 * math.cos(heading_rad) + 12.25 * math.sin(heading_rad)
+    y_m = -26.389396319849876 + 42.46406 * math.sin(heading_rad) - 12.25 * math.cos(heading_rad)
+    end_x_m, end_y_m, _, _ = road.point(road.length_m)
+    assert (float(end_x_m), float(end_y_m)) == pytest.approx((x_m, y_m), abs=0.001)
+
+
+@pytest.mark.parametrize(
+    ("key", "whole", "from_m"), [("a_key", "a", 12.0), ("b_key", "b", 0.0), ("c_key", "c", 15.155)]
+)
+def test_a_key_part_is_the_same_road_with_other_stations(key: str, whole: str, from_m: float) -> None:
+    """Everything of a key part lies where it lies in its whole: line, marks and their dashes, rails, both ends."""
+    part, road = load_road(key), load_road(whole)
+    stations_m = np.linspace(part.first_m, part.last_m, 50)
+    np.testing.assert_allclose(part.across(stations_m, -3.0), road.across(stations_m + from_m, -3.0), atol=1e-9)
+    assert (part.first_m, part.last_m) == pytest.approx((road.first_m - from_m, road.last_m - from_m))
+    for my_rail, their_rail in zip(part.rails, road.rails, strict=True):
+        assert (my_rail.from_m, my_rail.to_m) == pytest.approx((their_rail.from_m - from_m, their_rail.to_m - from_m))
+    for my_mark, their_mark in zip(part.marks, road.marks, strict=True):
+        assert (my_mark.from_m, my_mark.to_m) == pytest.approx((their_mark.from_m - from_m, their_mark.to_m - from_m))
+        mine_m = my_mark.dashes_m(part.first_m, part.last_m)
+        np.testing.assert_allclose(mine_m + from_m, their_mark.dashes_m(road.first_m, road.last_m))
+
+
+def test_dashes_are_whole_and_in_their_range(road: Road) -> None:
+    """A broken mark begins a dash every dash and gap, and shows no part of one beyond its ends."""
+    mark = next(mark for mark in road.marks if mark.kind == "broken" and math.isfinite(mark.from_m))
+    begin_m = mark.dashes_m(road.first_m, 100.0)
+    assert (np.diff(begin_m) == mark.dash_m + mark.gap_m).all()
+    assert mark.from_m <= begin_m[0] < mark.from_m + mark.dash_m + mark.gap_m
+    assert 100.0 - mark.dash_m - mark.gap_m - mark.dash_m < begin_m[-1] <= 100.0 - mark.dash_m
+
+
+def test_projection_looks_only_near_the_last_station(road: Road) -> None:
+    """A search that begins far away stays in its window and does not jump to the nearest piece of road."""
+    x_m, y_m = road.across(100.0, 0.0).tolist()
+    assert road.project(x_m, y_m, 20.0)[0] <= 35.0
+
+
+def test_an_unknown_road_is_refused_with_the_known_ones() -> None:
+    """The error for an unknown name lists what there is, and that a file would do."""
+    with pytest.raises(UserError, match=r"a, a_key, b, b_key, c, c_key.*\.yaml file"):
+        load_road("nowhere")
