@@ -33,7 +33,7 @@ from lavt.errors import BadPacket
 from lavt.streams import stream
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
 from lavt.transport.rtp.fec import RepairReceiver, RepairSender
-from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import read_clear_stamp, read_stamp, rtp_timestamp, stamp_agrees, write_stamp_i420
@@ -168,7 +168,7 @@ class Receiver:
 
     def __init__(self) -> None:
         self.repair = RepairReceiver()
-        self.reorder = ReorderBuffer()
+        self.reorder = JitterBuffer()
         self.depacketizer = Depacketizer()
 
     def receive(self, datagrams: Sequence[bytes], now_ns: int) -> tuple[int, list[AccessUnit]]:

@@ -18,7 +18,7 @@ from lavt.config import (
     Costs,
     DelayConfig,
     FlowChanges,
-    Impairment,
+    ImpairmentConfig,
     NetworkConfig,
     RelayConfig,
     RendezvousConfig,
@@ -388,6 +388,6 @@ def test_nothing_is_delayed_by_default() -> None:
 def test_every_impairment_can_be_changed_by_a_run() -> None:
     """What a condition can say of a flow a run can replace, within the same bounds, and so a sweep can vary it."""
     changes = FlowChanges.model_json_schema()["properties"]
-    for name, described in Impairment.model_json_schema()["properties"].items():
+    for name, described in ImpairmentConfig.model_json_schema()["properties"].items():
         bounds = {key: each for key, each in described.items() if key not in ("title", "default", "description")}
         assert bounds in changes[name]["anyOf"], name

@@ -13,7 +13,7 @@ from lavt.safety.limits import LIMITS
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
 from lavt.transport.messages import decode, encode
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
 from lavt.transport.video.h264 import Decoder, Encoder
 from lavt.transport.video.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
@@ -91,7 +91,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 6. The packets arrive, are put in order (here the last two changed places), and become H.264 again.
     arrived[-1], arrived[-2] = arrived[-2], arrived[-1]
-    reorder, depacketizer = ReorderBuffer(), Depacketizer()
+    reorder, depacketizer = JitterBuffer(), Depacketizer()
     ordered = [each for packet in arrived for each in reorder.push(parse_packet(packet), now_ns)]
     now_ns += LEAST_HOLD_NS  # the first packets of a stream wait for any that were sent before them
     ordered += reorder.expire(now_ns)

@@ -29,16 +29,16 @@ from lavt.nodes.client_session import ClientSession
 from lavt.nodes.clock_sync import ProbingClockSyncNode
 from lavt.nodes.driver import DriverNode
 from lavt.nodes.injection import InjectionClient
-from lavt.nodes.payloads import PathToken, ReceivedUnit, View
+from lavt.nodes.payloads import DecodedFrame, PathToken, ReceivedUnit
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
 from lavt.streams import stream
 from lavt.transport.clock_sync.probe import ProbeReply, decode_request, encode_reply
-from lavt.transport.emulation.impairment import Flow, Law
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem.injector import Injected
+from lavt.transport.netem.injector import InjectionResult
 from lavt.transport.rtp.fec import RepairSender
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtcp import parse_feedback, sender_report
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer
@@ -124,7 +124,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         bench.give(channel, data)
         bench.go(STEP_NS)
         if inputs % 33 == 0:
-            bench.give("view", View(bench.now.wall_ns, bench.now.wall_ns, picture))
+            bench.give("view", DecodedFrame(bench.now.wall_ns, bench.now.wall_ns, picture))
         if inputs == stops_after:
             bench.give("operator", "emergency_stop")
 
@@ -141,9 +141,14 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
 def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
     """Answers to queries for the network's condition: each is in force or is not, in words."""
     node = InjectionClient(
-        "alice", 7, condition="L4", control=Flow("control", "udp", 7448, "destination", Law(75.0)), video=Law(150.0),
-        state_delay_ms=0.0, start_ns=START.mono_ns,
-    )  # fmt: skip
+        "alice",
+        7,
+        condition="L4",
+        control=ImpairedFlow("control", "udp", 7448, "destination", Impairment(75.0)),
+        video=Impairment(150.0),
+        state_delay_ms=0.0,
+        start_ns=START.mono_ns,
+    )
     bench = Bench(node)
     inputs = told = 0
 
@@ -153,7 +158,7 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no cha
         told += len(of(bench.give(channel, data), "condition_in_force"))
         bench.go(STEP_NS)
         if inputs % 500 == 0:
-            bench.give("injected", Injected(1, "", "", (("control", 75.1),)))
+            bench.give("injected", InjectionResult(1, "", "", (("control", 75.1),)))
 
     def refused() -> int:
         return node.counts["netem_replies_unreadable"]
@@ -208,7 +213,7 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
 
 def video(seed: int) -> Target:
     """Datagrams at the client's video port, a true stream among them: what is reported can be read by the sender."""
-    node = ReceiverNode(ReorderBuffer(), Depacketizer(), 2_000_000)
+    node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000)
     shown = whole = inputs = frame = 0
 
     def hear(send: Send) -> None:
@@ -263,9 +268,9 @@ def pictures(seed: int) -> Target:
     corpus = Corpus([unit for _, unit in true_units], fields=tuple((at, 1) for at in range(64)))
     inputs = views = 0
 
-    def decoded(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[View]:
+    def decoded(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[DecodedFrame]:
         unit = ReceivedUnit(data, rtp_timestamp(stamp_ns), complete, complete, bench.now.mono_ns)
-        shown: Sequence[View] = of(bench.give("access_unit", unit), "view")
+        shown: Sequence[DecodedFrame] = of(bench.give("access_unit", unit), "view")
         for view in shown:
             expect(stamp_agrees(view.stamp_ns, unit.rtp_timestamp), "a picture was shown with another's stamp")
         return shown

@@ -24,11 +24,11 @@ from lavt.nodes.payloads import PathToken
 from lavt.nodes.receiver import ReceiverNode
 from lavt.transport.messages import encode
 from lavt.transport.rtp.fec import RepairSender
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtcp import parse_feedback, picture_loss, sender_report
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer
-from lavt.transport.security.envelope import OperatorSeal, VehicleSeal
-from lavt.transport.security.gateway import ClientDoor, ServerDoor
+from lavt.transport.security.envelope import OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.gateway import ClientGateway, ServerGateway
 from lavt.transport.security.keys import PrivateKey
 from lavt.transport.video.cipher import SrtpCipher
 from lavt.transport.video.path_validation import PathClient, PathServer, is_path_datagram
@@ -57,13 +57,13 @@ def door_of_vehicle(seed: int) -> Target:
     inside: list[tuple[str, bytes]] = []
     outside: list[Send] = []
     sequence = 0
-    door = ServerDoor(
+    door = ServerGateway(
         lambda channel, body, _arrived, _peer: inside.append((channel, body)),
         lambda *sends: outside.extend(sends),
         lambda: (EPOCH, sequence),
-        VehicleSeal("car", vehicle_key, {"alice": operator_key.public}),
+        VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public}),
     )
-    desk = OperatorSeal("car", "alice", operator_key, vehicle_key.public)
+    desk = OperatorAuthenticator("car", "alice", operator_key, vehicle_key.public)
     now = START
 
     def ask(body: bytes, answer: bytes) -> bytes:
@@ -117,13 +117,13 @@ def door_of_vehicle(seed: int) -> Target:
 def door_of_operator(seed: int) -> Target:
     """Altered and replayed states and replies at the operator's door: only what the vehicle says gets in, once."""
     vehicle_key, operator_key = keys(seed)
-    car = VehicleSeal("car", vehicle_key, {"alice": operator_key.public})
+    car = VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public})
     inside: list[bytes] = []
     outside: list[Send] = []
-    door = ClientDoor(
+    door = ClientGateway(
         lambda _channel, body, _arrived, _peer: inside.append(body),
         lambda *sends: outside.extend(sends),
-        OperatorSeal("car", "alice", operator_key, vehicle_key.public),
+        OperatorAuthenticator("car", "alice", operator_key, vehicle_key.public),
     )
     hurry: Any = outside.append
     door._send_soon = hurry  # type: ignore[method-assign]  # noqa: SLF001 (here no thread is needed)
@@ -174,7 +174,7 @@ def door_of_operator(seed: int) -> Target:
 
 def encrypted_video(seed: int) -> Target:
     """Altered and replayed SRTP at the client's video port: not one packet counts that the server has not sent."""
-    node = ReceiverNode(ReorderBuffer(), Depacketizer(), 2_000_000, partial(SrtpCipher, "client"))
+    node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000, partial(SrtpCipher, "client"))
     server = PathServer(lambda: bytes(32), partial(SrtpCipher, "server"))
     server.set_token(TOKEN)
     reported = whole = inputs = frame = sent = 0

@@ -25,14 +25,14 @@ from lavt.domain import (
 from lavt.node import Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.injection import InjectionNode
-from lavt.nodes.payloads import FrameWritten, Rest
+from lavt.nodes.payloads import FrameWritten, StationaryStatus
 from lavt.safety.gate import LARGEST_STORED_NUMBER, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
 from lavt.transport.emulation.impairment import check_flows
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
-from lavt.transport.netem.injector import Inject, Injected
-from lavt.vehicle.vehicle import Capabilities, Reached
+from lavt.transport.netem.injector import InjectionOrder, InjectionResult
+from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
@@ -74,7 +74,7 @@ class Standing:
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Do nothing."""
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Tell nothing."""
         return []
 
@@ -262,7 +262,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
     def hear(send: Send) -> None:
         nonlocal newest
         if send.channel == "inject":
-            order: Inject = send.payload
+            order: InjectionOrder = send.payload
             newest = order.number
             if order.flows:
                 check_flows(order.flows)
@@ -270,7 +270,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
             decode(NetemReply, send.payload)
 
     bench = Bench(node, hear)
-    bench.give("rest", Rest(True, None))
+    bench.give("rest", StationaryStatus(True, None))
     base = NetemRequest("alice", 7, "L4", 5000, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
     lossy = replace(base, condition="x", jitter_ms=20.0, loss=0.05, loss_burst_packets=3.0, rate_bps=10**6, reorder=0.1)
     corpus = Corpus([encode(base), encode(lossy), encode(replace(lossy, lease_ms=0))], packed=True)
@@ -283,7 +283,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
         bench.go(STEP_NS * chance.below(20))
         if inputs % 500 == 0:  # the queues are slow: until then nobody is answered who asked for another condition
             because = "" if chance.below(4) else "there is no such interface"
-            bench.give("injected", Injected(newest, because, "", (("video", 150.2),)))
+            bench.give("injected", InjectionResult(newest, because, "", (("video", 150.2),)))
 
     def refused() -> int:
         return node.counts["netem_requests_unreadable"] + node.counts["netem refused"]

@@ -12,7 +12,7 @@ from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.nodes import build_client, build_server
-from lavt.assembly.vehicles import Plant, build_unpictured
+from lavt.assembly.vehicles import VehicleSetup, build_unpictured
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
@@ -118,7 +118,7 @@ def sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
         }
     )
 
-    def plant(config: ServerConfig) -> Plant:
+    def plant(config: ServerConfig) -> VehicleSetup:
         return replace(build_unpictured(config), camera=LoopCamera(run))
 
     fidelity = replace(VIDEO, plant=plant)

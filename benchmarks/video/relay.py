@@ -22,8 +22,8 @@ from benchmarks.video.run import asked_run, freeze, tell
 from benchmarks.video.sides import WARM_UP_FRAMES
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.emulation.impairment import Law, gilbert
-from lavt.transport.emulation.random_process import Draws, Losses
+from lavt.transport.emulation.impairment import Impairment, gilbert
+from lavt.transport.emulation.random_process import Draws, LossProcess
 
 ONE_WAY_MS = 20
 BUFFER_BYTES = 4 * 1024 * 1024
@@ -56,8 +56,8 @@ class Fate:
     """What becomes of each packet of the video."""
 
     def __init__(self, case: Case) -> None:
-        law = Law(loss=case.loss, loss_burst_packets=case.burst_packets)
-        self._losses = Losses(SEED, "loss", case.loss, gilbert(law) if case.burst_packets else None)
+        law = Impairment(loss=case.loss, loss_burst_packets=case.burst_packets)
+        self._losses = LossProcess(SEED, "loss", case.loss, gilbert(law) if case.burst_packets else None)
         self._jitter = Draws(SEED, "jitter")
         self._jitter_ns = case.jitter_ms * NS_PER_MS
         self._number = 0

@@ -23,8 +23,8 @@ from lavt.clock import MachineClock
 from lavt.config import Section, ServerConfig
 from lavt.config_file import load_config, parse_config, shipped
 from lavt.doctor import checks, probes
-from lavt.doctor.checks import Check, CodecTimes, Heard, Seen, Verdict
-from lavt.doctor.clock_checks import Finding, Opinion
+from lavt.doctor.checks import CameraSample, Check, CodecTimes, StateSample, Verdict
+from lavt.doctor.clock_checks import ClockComparison, ClockEstimate
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, State
 from lavt.node import Message, Send
 from lavt.nodes.clock_sync import ClockSyncNode
@@ -60,15 +60,15 @@ def check_key_file(refusal: str = "", mode: int = 0o600, private: bool = True) -
     return checks.check_key_file("security.key", Path("a.key"), refusal=refusal, mode=mode, private=private)
 
 
-def check_camera(seen: Seen | str) -> Check:
+def check_camera(seen: CameraSample | str) -> Check:
     return checks.check_camera(seen, name="/dev/video0", size="640x480", rate_hz=30.0)
 
 
-def came(rate_hz: float, timed: int = 0) -> Seen:
-    return Seen([round(number * 1e9 / rate_hz) for number in range(61)], timed)
+def came(rate_hz: float, timed: int = 0) -> CameraSample:
+    return CameraSample([round(number * 1e9 / rate_hz) for number in range(61)], timed)
 
 
-FOUND = Finding(True, ("this clock", "these two agree"), None, Opinion(1.0, 0.5), 1.0)
+FOUND = ClockComparison(True, ("this clock", "these two agree"), None, ClockEstimate(1.0, 0.5), 1.0)
 
 VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_versions("3.11", INSTALLED, REQUIREMENTS), "ok", "Python 3.11, lavt 0.1.0, av 14.0.1"),
@@ -90,8 +90,8 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: check_camera(came(30.0)), "ok", "when each was taken is not known"),
     (lambda: check_camera(came(29.0, 61)), "ok", "when each was taken is known"),
     (lambda: check_camera(came(15.0)), "warning", "15.0 pictures a second"),
-    (lambda: check_camera(Seen([], 0)), "warning", "0.0 pictures a second"),
-    (lambda: check_camera(Seen([5], 0)), "warning", "0.0 pictures a second"),
+    (lambda: check_camera(CameraSample([], 0)), "warning", "0.0 pictures a second"),
+    (lambda: check_camera(CameraSample([5], 0)), "warning", "0.0 pictures a second"),
     (lambda: check_camera("/dev/video0 cannot be opened"), "problem", "/dev/video0"),
     (lambda: checks.check_by_wire(300, "", name="socketcan can0"), "ok", "300 frames"),
     (
@@ -130,15 +130,15 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
     (lambda: checks.check_link(Routers(1, ("v1", "v2")), heard=True), "warning", "Zenoh v1, v2"),
     (lambda: checks.check_link(None, heard=True), "not checked", "does not tell"),
     (
-        lambda: checks.check_vehicle(Heard([STATE] * 50), "v-1", "1"),
+        lambda: checks.check_vehicle(StateSample([STATE] * 50), "v-1", "1"),
         "ok",
         "held by op",
     ),
-    (lambda: checks.check_vehicle(Heard([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
-    (lambda: checks.check_vehicle(Heard([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
-    (lambda: checks.check_vehicle(Heard(), "v-1", "1"), "problem", "v-1 tells no state"),
+    (lambda: checks.check_vehicle(StateSample([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
+    (lambda: checks.check_vehicle(StateSample([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
+    (lambda: checks.check_vehicle(StateSample(), "v-1", "1"), "problem", "v-1 tells no state"),
     (
-        lambda: checks.check_vehicle(Heard([], {"of another version": 50}), "v-1", "1"),
+        lambda: checks.check_vehicle(StateSample([], {"of another version": 50}), "v-1", "1"),
         "problem",
         "another version (50)",
     ),
@@ -373,11 +373,11 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, said: tuple[str, str]) -> None:
     """Signed states are opened with the configured keys, without a session; where these do not fit, it is said why."""
     from lavt.assembly.security import vehicle_seal
-    from lavt.transport.security.gateway import ServerDoor
+    from lavt.transport.security.gateway import ServerGateway
 
     security = {"key": str(keys / "vehicle-3.key"), "operators": {"operator-1": str(keys / "operator-1.pub")}}
     seal = vehicle_seal(parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test"))
-    door = ServerDoor(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), seal)
+    door = ServerGateway(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), seal)
     server = ZenohLink(
         MachineClock(), door.let_in, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
         vehicle="vehicle-3", who="server",

@@ -9,11 +9,11 @@ import pytest
 from lavt.cli import console
 from lavt.cli import netem as command
 from lavt.errors import LavtError, WorkError
-from lavt.transport.netem.netem import Netem, Verified
+from lavt.transport.netem.netem import NetemInterface, Verification
 from lavt.transport.netem.tc import Command
 
 
-class Kernel(Netem):
+class Kernel(NetemInterface):
     """A netem whose tc notes what it is told; whatever `refuses` says is refused, and what is measured is as asked."""
 
     def __init__(self, directory: Path, *, held: bool) -> None:
@@ -34,14 +34,14 @@ class Kernel(Netem):
         self.commands.append(line)
         return ""
 
-    def verify(self, *_arguments: object, **_more: object) -> Verified:
+    def verify(self, *_arguments: object, **_more: object) -> Verification:
         """Find everything as asked."""
-        return Verified([], {})
+        return Verification([], {})
 
 
 def apply_to(kernel: Kernel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run `lavt netem apply L4 --role server --interface eth0`."""
-    monkeypatch.setattr(command, "Netem", lambda *_arguments, **_more: kernel)
+    monkeypatch.setattr(command, "NetemInterface", lambda *_arguments, **_more: kernel)
     command.apply("L4", "eth0", "server")
 
 
@@ -96,7 +96,7 @@ def test_clear_says_whose_it_was(
     kernel = Kernel(tmp_path, held=owner == "what was made by hand")
     if not kernel.held:
         apply_to(kernel, monkeypatch)
-    monkeypatch.setattr(command, "Netem", lambda *_arguments: kernel)
+    monkeypatch.setattr(command, "NetemInterface", lambda *_arguments: kernel)
     command.clear("eth0", at_once=True)
 
     assert not kernel.held

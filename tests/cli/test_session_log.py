@@ -7,7 +7,7 @@ import pytest
 from lavt.cli.session_log import (
     FIRST_STATE_NS,
     NO_STATE_YET,
-    Narrator,
+    SessionLog,
     end_words,
     phase_words,
     release_words,
@@ -76,7 +76,7 @@ def test_the_clients_phase_is_said_in_words(phase: Phase, because: str) -> None:
 
 def test_each_change_is_told_once() -> None:
     """A narrator that hears the same state and phase again and again says each of them once."""
-    narrator = Narrator("operator-1")
+    narrator = SessionLog("operator-1")
     for number in range(50):
         narrator.state(DRIVING, number * TICK_NS, holds=True)
         narrator.phase("stopped", "why")
@@ -94,7 +94,7 @@ def test_each_change_is_told_once() -> None:
 
 def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
     """The first refusal is told at once, those of the second after it together."""
-    narrator = Narrator()
+    narrator = SessionLog()
     told = {}
     for number in range(100):
         narrator.refusal("too old")
@@ -107,7 +107,7 @@ def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
 
 def test_a_client_tells_refusals_of_the_state() -> None:
     """A client hears of refusals by the vehicle's state: it tells one when the reason changes."""
-    narrator = Narrator("operator-1")
+    narrator = SessionLog("operator-1")
     narrator.state(STATE, 0)
     narrator.take(0)
     for number in range(10):
@@ -118,7 +118,7 @@ def test_a_client_tells_refusals_of_the_state() -> None:
 
 def test_a_limit_is_told_when_it_begins_to_hold() -> None:
     """A limit is told once while it is in force, though not at every moment, and again after a second without it."""
-    narrator, told = Narrator(), []
+    narrator, told = SessionLog(), []
     narrator.state(STATE, 0)
     narrator.take(0)
     for number in range(200):
@@ -135,7 +135,7 @@ def test_a_limit_is_told_when_it_begins_to_hold() -> None:
 
 def test_a_quiet_vehicle_is_told_of() -> None:
     """A client says that no state has come for a second, once, and when one comes again."""
-    narrator = Narrator("operator-1")
+    narrator = SessionLog("operator-1")
     narrator.state(STATE, 0)
     narrator.take(0)
     assert narrator.take(999 * NS_PER_MS) == []
@@ -149,7 +149,7 @@ def test_a_quiet_vehicle_is_told_of() -> None:
 
 def test_a_vehicle_that_never_told_its_state_is_told_of() -> None:
     """A client that has heard nothing 3 s after its start says what to look for, once; a server says no such thing."""
-    narrator, server = Narrator("operator-1"), Narrator()
+    narrator, server = SessionLog("operator-1"), SessionLog()
     for each in (narrator, server):
         assert each.take(5) == []
         assert each.take(5 + FIRST_STATE_NS - 1) == []

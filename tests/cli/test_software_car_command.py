@@ -21,7 +21,7 @@ from tests.vehicle.software_car.rig import Asked, Hand1, Hand2
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.vehicle.can_frame import Frame, HeardFrame
+from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.bus import CanPort
 from lavt.vehicle.ground_truth_wire import MAX_BYTES, TruthReceiver
 from lavt.vehicle.software_car.frames import unpack
@@ -70,13 +70,13 @@ class Program:
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
 
-    def send(self, *frames: Frame) -> None:
+    def send(self, *frames: CanFrame) -> None:
         """Put frames on the bus."""
         self.port.send(frames, MachineClock().now().mono_ns)
 
-    def hear(self, done: Callable[[list[HeardFrame]], object]) -> list[HeardFrame]:
+    def hear(self, done: Callable[[list[ReceivedCanFrame]], object]) -> list[ReceivedCanFrame]:
         """Hear frames until it is done."""
-        heard: list[HeardFrame] = []
+        heard: list[ReceivedCanFrame] = []
         clock = MachineClock()
         end_ns = clock.now().mono_ns + LONGEST_S * NS_PER_S
         while not done(heard):
@@ -151,8 +151,8 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
     program = start(f"vehicle.dbw.profile={profile}")
     program.told()
 
-    def is_reported(is_set: int) -> Callable[[list[HeardFrame]], object]:
-        def look(heard: list[HeardFrame]) -> bool:
+    def is_reported(is_set: int) -> Callable[[list[ReceivedCanFrame]], object]:
+        def look(heard: list[ReceivedCanFrame]) -> bool:
             frames = [each.frame for each in heard if each.frame.identifier == identifier]
             return bool(frames) and unpack(layout, frames[-1].data)[fault] == is_set
 

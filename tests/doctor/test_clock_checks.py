@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from lavt.doctor.clock_checks import WHAT_TO_DO, Finding, check_host, compare
+from lavt.doctor.clock_checks import WHAT_TO_DO, ClockComparison, check_host, compare
 from lavt.domain import NS_PER_MS
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import ClockProbe, ProbeReply
@@ -34,7 +34,7 @@ def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
 
 def compared(
     delta_ms: float = 250.0, *, reply: ProbeReply = REPLY, round_trip_ms: float = 0.3, **changes: Any
-) -> Finding:
+) -> ClockComparison:
     report = dataclasses.replace(GOOD, **changes)
     return compare(report, report, probes(delta_ms, 5.0, round_trip_ms, 9.0), reply, SERVER)
 

@@ -25,7 +25,7 @@ from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.processes import LAVT, Processes
-from lavt.experiment.runs.real_run import Loop, start_loop
+from lavt.experiment.runs.real_run import LoopProcesses, start_loop
 from lavt.experiment.runs.side_configs import server_config
 
 GROUP = "239.74.163.2"
@@ -207,7 +207,7 @@ class Driven:
     """A drive over CAN that is under way."""
 
     car: Car
-    loop: Loop
+    loop: LoopProcesses
     out: Path
     actuator_pid: int
     stalls: Stalls

@@ -20,7 +20,7 @@ from tests.interop.tools import LIMIT_S, running
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, Picture
 from lavt.streams import stream
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, RtpPacket, parse_packet, split_nal_units
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 from lavt.transport.video.h264 import Decoder
@@ -111,7 +111,7 @@ def packets_from(command: str, raw: Path, said: Path) -> list[tuple[RtpPacket, i
 
 def units_of(packets: Sequence[tuple[RtpPacket, int]]) -> list[AccessUnit]:
     """Put packets in order and access units together, as the receiver's node does."""
-    reorder, depacketizer = ReorderBuffer(), Depacketizer()
+    reorder, depacketizer = JitterBuffer(), Depacketizer()
     ordered = [each for packet, arrived_ns in packets for each in reorder.push(packet, arrived_ns)]
     ordered += reorder.expire(packets[-1][1] + NS_PER_S)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]

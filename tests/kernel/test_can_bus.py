@@ -11,12 +11,12 @@ import pytest
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import BusGone, Frame
+from lavt.vehicle.can_frame import BusGone, CanFrame
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 
 DEADLINE_S = 20
-STEERING = Frame(0x064, bytes(range(8)))
-FAR = Frame(0x1F01, b"\x01", is_extended=True)
+STEERING = CanFrame(0x064, bytes(range(8)))
+FAR = CanFrame(0x1F01, b"\x01", is_extended=True)
 
 
 def ip(*arguments: str) -> None:

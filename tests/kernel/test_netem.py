@@ -29,12 +29,12 @@ from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
 from lavt.experiment.runs.plan import PlannedRun, plan_run
-from lavt.transport.emulation.impairment import Flow, Law, Port
-from lavt.transport.netem.netem import Netem
+from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
+from lavt.transport.netem.netem import NetemInterface
 
 CLOCK = MachineClock()
 VIDEO, CONTROL, PROBE = 5600, 7448, 5602
-NEVER = [Port("udp", PROBE, "the clock probe")]
+NEVER = [ExemptPort("udp", PROBE, "the clock probe")]
 L = ("L0", "L1", "L2", "L3", "L4", "L5")
 MEDIANS = pytest.mark.judges_times(share=MEDIAN_SHARE)
 """For tests whose assertions are about medians or other quantiles of delays."""
@@ -70,16 +70,16 @@ def baseline() -> Iterator[dict[str, float]]:
 
 
 @pytest.fixture
-def sides(baseline: dict[str, float], tmp_path: Path) -> Iterator[dict[str, Netem]]:
+def sides(baseline: dict[str, float], tmp_path: Path) -> Iterator[dict[str, NetemInterface]]:
     """The interfaces of both sides; nothing is left on them."""
     del baseline
-    made = {name: Netem(device, directory=tmp_path) for name, device in DEVICES.items()}
+    made = {name: NetemInterface(device, directory=tmp_path) for name, device in DEVICES.items()}
     yield made
     for name, netem in made.items():
         inside(name, lambda netem=netem: netem.clear(at_once=True, of_anybody=True))  # type: ignore[misc]
 
 
-def hold(sides: dict[str, Netem], name: str) -> None:
+def hold(sides: dict[str, NetemInterface], name: str) -> None:
     """Apply a condition on both sides, each its own part."""
     roles: Sequence[Role] = ("server", "client")
     for role in roles:
@@ -87,9 +87,9 @@ def hold(sides: dict[str, Netem], name: str) -> None:
         inside(role, lambda role=role, flows=flows: sides[role].apply(flows, never=NEVER, condition=name))  # type: ignore[misc]
 
 
-def hold_video(sides: dict[str, Netem], law: Law) -> None:
+def hold_video(sides: dict[str, NetemInterface], law: Impairment) -> None:
     """Give the server's video a law."""
-    inside("server", lambda: sides["server"].apply([Flow("video", "udp", VIDEO, "source", law)]))
+    inside("server", lambda: sides["server"].apply([ImpairedFlow("video", "udp", VIDEO, "source", law)]))
 
 
 def queues(side: str) -> Any:
@@ -98,7 +98,7 @@ def queues(side: str) -> Any:
 
 @MEDIANS
 def test_each_condition_shifts_video_and_control_and_nothing_else(
-    baseline: dict[str, float], sides: dict[str, Netem]
+    baseline: dict[str, float], sides: dict[str, NetemInterface]
 ) -> None:
     """Under L0 to L5 medians of video and control shift as asked within 1 ms, and all others by less than 1 ms."""
     shifts_ms = {}
@@ -115,7 +115,7 @@ def test_each_condition_shifts_video_and_control_and_nothing_else(
 
 
 @MEDIANS
-def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides: dict[str, Netem]) -> None:
+def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides: dict[str, NetemInterface]) -> None:
     """With state_delay with_video, what the server's router sends is held as long as the video, by tcp as by udp."""
     for protocol in ("udp", "tcp"):
         flows = netem_flows(
@@ -131,7 +131,7 @@ def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides
 
 
 @MEDIANS
-def test_control_by_tcp_is_held(sides: dict[str, Netem]) -> None:
+def test_control_by_tcp_is_held(sides: dict[str, NetemInterface]) -> None:
     """Where the routers talk by tcp, the control to the server's router is held, and udp to that port is not."""
     flows = netem_flows(condition("L4"), "client", video_port=VIDEO, control_port=CONTROL, protocol="tcp")
     inside("client", lambda: sides["client"].apply(flows))
@@ -142,13 +142,13 @@ def test_control_by_tcp_is_held(sides: dict[str, Netem]) -> None:
     assert median(flown["udp"].delays_ms) < 1
 
 
-def test_no_packet_is_lost_or_overtaken_by_a_change(sides: dict[str, Netem]) -> None:
+def test_no_packet_is_lost_or_overtaken_by_a_change(sides: dict[str, NetemInterface]) -> None:
     """From 0 to 150 to 30 to 225 ms and cleared, at 200 packets a second: all arrive, in the order of sending."""
-    hold_video(sides, Law())
+    hold_video(sides, Impairment())
 
     def change() -> None:
         for delay_ms in (150, 30, 225):
-            hold_video(sides, Law(delay_ms))
+            hold_video(sides, Impairment(delay_ms))
             pause(400 * NS_PER_MS)
         inside("server", sides["server"].clear)
 
@@ -159,7 +159,7 @@ def test_no_packet_is_lost_or_overtaken_by_a_change(sides: dict[str, Netem]) -> 
     assert queues("server")[0]["kind"] == "noqueue"
 
 
-def test_clearing_leaves_the_queue_as_it_was(sides: dict[str, Netem]) -> None:
+def test_clearing_leaves_the_queue_as_it_was(sides: dict[str, NetemInterface]) -> None:
     """What `tc -j qdisc show` says before a condition is applied and after it is cleared is the same."""
     before = queues("server"), queues("client")
     hold(sides, "L5")
@@ -187,7 +187,7 @@ pause(60_000_000_000)
 
 
 def test_a_delay_whose_owner_was_killed_is_taken_away_at_the_next_start(
-    sides: dict[str, Netem], tmp_path: Path
+    sides: dict[str, NetemInterface], tmp_path: Path
 ) -> None:
     """SIGKILL of the owner leaves the delay; whoever next asks for netem there puts the queue back, and says so."""
     before = queues("server")
@@ -209,13 +209,13 @@ def test_a_delay_whose_owner_was_killed_is_taken_away_at_the_next_start(
     assert inside("server", sides["server"].check) == []
 
 
-def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, Netem]) -> None:
+def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, NetemInterface]) -> None:
     """An interface whose root somebody made is refused, and neither applying nor clearing changes it."""
     command("tc -n server qdisc add dev va root handle 1: prio bands 4")
     there = queues("server")
     try:
         with pytest.raises(UserError, match="va has a queue that is not ours"):
-            hold_video(sides, Law(75))
+            hold_video(sides, Impairment(75))
         with pytest.raises(UserError, match="va has a queue that is not ours"):
             inside("server", lambda: sides["server"].clear(of_anybody=True))
         assert queues("server") == there
@@ -229,11 +229,11 @@ def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, Netem])
     [("normal", 9, 19), ("uniform", 7, 14), ("pareto", 4, 12), ("paretonormal", 4, 12)],
 )
 def test_jitter_spreads_and_keeps_order(
-    sides: dict[str, Netem], distribution: Any, least_ms: float, most_ms: float
+    sides: dict[str, NetemInterface], distribution: Any, least_ms: float, most_ms: float
 ) -> None:
     """Half of the packets are within 13.5 ms (normal) or 10 ms (uniform) under 10 ms of jitter, none is overtaken."""
-    hold_video(sides, Law(75, jitter_ms=5, jitter_distribution="pareto"))  # a table that must not stay
-    hold_video(sides, Law(75, jitter_ms=10, jitter_distribution=distribution))
+    hold_video(sides, Impairment(75, jitter_ms=5, jitter_distribution="pareto"))  # a table that must not stay
+    hold_video(sides, Impairment(75, jitter_ms=10, jitter_distribution=distribution))
     flown = fly([HELD[0]], 100, 30)["video"]
     p5, p25, p75, p95 = (quantiles(flown.delays_ms, n=20)[index] for index in (0, 4, 14, 18))
 
@@ -245,9 +245,9 @@ def test_jitter_spreads_and_keeps_order(
 
 
 @MEDIANS
-def test_jitter_in_order_is_later(sides: dict[str, Netem]) -> None:
+def test_jitter_in_order_is_later(sides: dict[str, NetemInterface]) -> None:
     """At 300 packets a second, 10 ms of normal jitter in order add 3 to 9 ms to the median: the late hold up others."""
-    hold_video(sides, Law(75, jitter_ms=10))
+    hold_video(sides, Impairment(75, jitter_ms=10))
     flown = fly([HELD[0]], 400, 1000 / 300)["video"]
 
     assert flown.inversions == 0
@@ -255,9 +255,9 @@ def test_jitter_in_order_is_later(sides: dict[str, Netem]) -> None:
 
 
 @MEDIANS
-def test_correlated_jitter_wanders(sides: dict[str, Netem]) -> None:
+def test_correlated_jitter_wanders(sides: dict[str, NetemInterface]) -> None:
     """With a correlation of 0.9 the delays of packets 20 ms apart are correlated by 0.6 to 0.97, in order."""
-    hold_video(sides, Law(75, jitter_ms=10, jitter_correlation=0.9))
+    hold_video(sides, Impairment(75, jitter_ms=10, jitter_correlation=0.9))
     flown = fly([HELD[0]], 400, 20)["video"]
     delays_ms = flown.in_order_of_sending_ms
     found = float(spearmanr(delays_ms[:-1], delays_ms[1:]).statistic)  # of ranks: a stall of the machine counts as one
@@ -274,9 +274,9 @@ def runs_of_lost(flown: Flown) -> list[int]:
     return [after - before - 1 for before, after in pairwise(sorted(flown.numbers)) if after - before > 1]
 
 
-def test_loss_is_as_asked(sides: dict[str, Netem]) -> None:
+def test_loss_is_as_asked(sides: dict[str, NetemInterface]) -> None:
     """Of 1000 packets a tenth are lost, within four standard deviations, each by itself."""
-    hold_video(sides, Law(75, loss=0.1))
+    hold_video(sides, Impairment(75, loss=0.1))
     flown = fly([HELD[0]], 1000, 2)["video"]
     lost = 1000 - len(flown.arrived)
 
@@ -284,9 +284,9 @@ def test_loss_is_as_asked(sides: dict[str, Netem]) -> None:
     assert fmean(runs_of_lost(flown)) < 1.5  # 1 / (1 - 0.1) is expected
 
 
-def test_loss_comes_in_bursts_where_asked(sides: dict[str, Netem]) -> None:
+def test_loss_comes_in_bursts_where_asked(sides: dict[str, NetemInterface]) -> None:
     """A tenth lost in bursts of 5: of 3000 packets the mean burst is 3.3 to 7.5 and the loss 5 to 16 %."""
-    hold_video(sides, Law(10, loss=0.1, loss_burst_packets=5))
+    hold_video(sides, Impairment(10, loss=0.1, loss_burst_packets=5))
     flown = fly([HELD[0]], 3000, 1)["video"]
     lost = 3000 - len(flown.arrived)
 
@@ -295,9 +295,9 @@ def test_loss_comes_in_bursts_where_asked(sides: dict[str, Netem]) -> None:
 
 
 @MEDIANS
-def test_rate_spaces_packets(sides: dict[str, Netem]) -> None:
+def test_rate_spaces_packets(sides: dict[str, NetemInterface]) -> None:
     """At 2 Mbit/s packets of 1042 bytes, sent 1 ms apart, leave 4.17 ms apart in the median."""
-    hold_video(sides, Law(20, rate_bps=2_000_000))
+    hold_video(sides, Impairment(20, rate_bps=2_000_000))
     flown = fly([Flight("video", "server", "udp", VIDEO, 40_000, bytes_each=1000)], 60, 1)["video"]
     stamps_ns = [stamp_ns for _, _, stamp_ns in flown.arrived]
     spacing_ms = median(after - before for before, after in pairwise(stamps_ns)) / NS_PER_MS
@@ -308,9 +308,9 @@ def test_rate_spaces_packets(sides: dict[str, Netem]) -> None:
 
 
 @MEDIANS
-def test_reordering_is_as_asked(sides: dict[str, Netem]) -> None:
+def test_reordering_is_as_asked(sides: dict[str, NetemInterface]) -> None:
     """A quarter of 400 packets are not delayed, within four standard deviations, and only these overtake."""
-    hold_video(sides, Law(75, jitter_ms=5, reorder=0.25))
+    hold_video(sides, Impairment(75, jitter_ms=5, reorder=0.25))
     flown = fly([HELD[0]], 400, 5)["video"]
     early = [number for number, delay_ms, _ in flown.arrived if delay_ms < 30]
     held = [number for number, delay_ms, _ in flown.arrived if delay_ms >= 30]
@@ -328,7 +328,7 @@ SCRIPTS: list[tuple[str, Role, str, str]] = [
 
 @pytest.mark.parametrize(("script", "side", "device", "name"), SCRIPTS)
 def test_the_scripts_do_what_the_command_does(
-    sides: dict[str, Netem], script: str, side: Role, device: str, name: str
+    sides: dict[str, NetemInterface], script: str, side: Role, device: str, name: str
 ) -> None:
     """What tc tells after a script of `netem/` is what it tells after the command's code, and clear.sh clears it."""
     folder = shipped("netem/conditions.yaml").parent
@@ -447,7 +447,7 @@ def planned(*changes: str) -> PlannedRun:
 def test_what_holds_a_run_does_as_each_condition_asks(name: str, tmp_path: Path) -> None:
     """Each condition, as a run holds its ports on lo, is read back and measured as asked twice, and lo is as it was."""
     before = command("tc -j qdisc show dev lo")
-    with NetemRun(planned(f"network.condition={name}"), Netem("lo", directory=tmp_path)) as run:
+    with NetemRun(planned(f"network.condition={name}"), NetemInterface("lo", directory=tmp_path)) as run:
         run.apply(video_port=40_100, control_port=40_101)
         report = json.loads(json.dumps(run.report()))
 

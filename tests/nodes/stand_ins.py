@@ -14,7 +14,7 @@ from lavt.domain import NS_PER_S, Actuation, CameraModel, GroundTruth, Now, Pict
 from lavt.node import Message, Node, Send
 from lavt.runtime.pipeline import walk
 from lavt.vehicle.camera import CapturedFrame
-from lavt.vehicle.vehicle import Capabilities, Reached
+from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 MONO_NS = 1_000 * NS_PER_S
 WALL_NS = 1_790_000_000 * NS_PER_S
@@ -83,7 +83,7 @@ class StandingVehicle:
     happens: list[VehicleEvent] = field(default_factory=list)
     obeyed: list[Actuation] = field(default_factory=list)
     wanted: bool = False
-    reached: list[Reached] = field(default_factory=list)
+    reached: list[ReachedCommand] = field(default_factory=list)
 
     @property
     def capabilities(self) -> Capabilities:
@@ -100,7 +100,7 @@ class StandingVehicle:
     def engage(self, wanted: bool, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
         self.wanted = wanted
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         reached, self.reached = self.reached, []
         return reached
 

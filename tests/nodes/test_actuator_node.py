@@ -21,7 +21,7 @@ from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
 from lavt.transport.messages import decode, encode
 from lavt.vehicle.camera import FrameTimes
-from lavt.vehicle.vehicle import Reached
+from lavt.vehicle.vehicle import ReachedCommand
 
 TICK_NS = 20 * NS_PER_MS
 
@@ -341,9 +341,9 @@ def test_what_reaches_the_wheels_is_told_by_command() -> None:
     assert first.applied_mono_ns is not None
     bench.go(TICK_NS)
     applied_ns, reached_ns = second.applied_mono_ns or 0, at(bench.mono_ns).mono_ns
-    bench.vehicle.reached = [Reached(applied_ns + 1, reached_ns)]
+    bench.vehicle.reached = [ReachedCommand(applied_ns + 1, reached_ns)]
     assert of(bench.go(TICK_NS), "wheel") == []
     third = bench.drive()
-    bench.vehicle.reached = [Reached(third.applied_mono_ns or 0, reached_ns)] * 2
+    bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2
     told = of(bench.go(TICK_NS), "wheel")
     assert told == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]

@@ -14,7 +14,7 @@ from lavt.clock import MachineClock
 from lavt.domain import NS_PER_MS, NS_PER_S, Pose
 from lavt.node import WAKE, Send
 from lavt.nodes.camera import CameraNode
-from lavt.safety.issued_stamps import WrittenStamps
+from lavt.safety.issued_stamps import IssuedStamps
 from lavt.transport.rtp.fec import RepairSender
 from lavt.transport.rtp.rtcp import (
     ReceptionReport,
@@ -136,7 +136,7 @@ def test_no_stamp_is_written_twice(walls_ns: list[int]) -> None:
 def test_the_same_buffer_again_and_again_is_seen(*, stuck: bool, fault: bool) -> None:
     """A camera that gives one buffer, stamp of the last frame in it, is frozen at the fifth; a live one is not."""
     node = node_with(NoiseCamera(stuck=noise(0) if stuck else None))
-    written = WrittenStamps(5 * NS_PER_S, 5)
+    written = IssuedStamps(5 * NS_PER_S, 5)
     for number in range(5):
         assert not written.frozen
         (frame,) = of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")

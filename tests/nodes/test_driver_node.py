@@ -28,7 +28,7 @@ from lavt.domain import (
 from lavt.node import WAKE, Send
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.driver import DriverNode
-from lavt.nodes.payloads import PathToken, PictureRead, ReceivedUnit, View
+from lavt.nodes.payloads import DecodedFrame, PathToken, PictureRead, ReceivedUnit
 from lavt.nodes.picture_reader import PictureReader
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS, LaneDetector
 from lavt.transport.messages import decode, encode
@@ -89,7 +89,9 @@ class Bench:
 
     def view(self, picture: Picture | None = None) -> list[Command]:
         shown = noise(1) if picture is None else picture
-        return commands(self.take("view", View(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown))))
+        return commands(
+            self.take("view", DecodedFrame(WALL_NS + self.mono_ns, WALL_NS + self.mono_ns, RenderedPicture(shown)))
+        )
 
     def go(self, duration_ns: int) -> list[tuple[int, Command]]:
         """Wake the node whenever it asked; give its commands with their times."""

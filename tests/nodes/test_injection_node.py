@@ -9,16 +9,16 @@ from tests.nodes.stand_ins import at, give, of
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest
 from lavt.node import WAKE, Send
 from lavt.nodes.injection import LEASE_MS, InjectionClient, InjectionNode
-from lavt.nodes.payloads import InjectionSample, Rest
-from lavt.transport.emulation.impairment import Flow, Law
+from lavt.nodes.payloads import InjectionSample, StationaryStatus
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem.injector import Inject, Injected
+from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 
 L4 = NetemRequest("alice", 7, "L4", LEASE_MS, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
-VIDEO = Flow("video", "udp", 5600, "source", Law(150.0))
-STATE = Flow("state", "udp", 7448, "source", Law())
-CONTROL = Flow("control", "udp", 7448, "destination", Law(75.0))
-STANDS = Rest(True, None)
+VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150.0))
+STATE = ImpairedFlow("state", "udp", 7448, "source", Impairment())
+CONTROL = ImpairedFlow("control", "udp", 7448, "destination", Impairment(75.0))
+STANDS = StationaryStatus(True, None)
 
 
 def server(*, allowed: bool = True, simulated: bool = True) -> InjectionNode:
@@ -31,7 +31,7 @@ def ask(node: InjectionNode, request: NetemRequest, after_ns: int = 0, peer: Any
 
 def done(node: InjectionNode | InjectionClient, number: int, because: str = "", after_ns: int = 0) -> list[Send]:
     measured = () if because else (("video", 150.2),)
-    return give(node, "injected", Injected(number, because, "", measured), at(after_ns))
+    return give(node, "injected", InjectionResult(number, because, "", measured), at(after_ns))
 
 
 def refusals(sends: list[Send]) -> list[str]:
@@ -53,7 +53,7 @@ def in_force(request: NetemRequest = L4) -> InjectionNode:
 def test_a_condition_is_granted_when_the_queues_do_it() -> None:
     """The server's queues are told, and whoever asked is answered when they have said that they do it."""
     node = server()
-    assert ask(node, L4) == [Send("inject", Inject(1, "L4", (VIDEO, STATE)))]
+    assert ask(node, L4) == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
     sends = done(node, 1)
     assert refusals(sends) == [""]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
@@ -66,7 +66,7 @@ def test_a_condition_is_granted_when_the_queues_do_it() -> None:
 def test_the_state_goes_with_the_video_where_that_is_asked() -> None:
     """A state delay is that of what the server's router sends, from the port at which it listens."""
     [send] = ask(server(), replace(L4, state_delay_ms=150.0))
-    assert send.payload.flows == (VIDEO, replace(STATE, law=Law(150.0)))
+    assert send.payload.flows == (VIDEO, replace(STATE, law=Impairment(150.0)))
 
 
 def test_asking_again_renews_the_lease_and_changes_nothing() -> None:
@@ -83,17 +83,17 @@ def test_a_lease_that_is_not_renewed_clears_everything_and_somebody_else_may_ask
     node = in_force()
     bob = replace(L4, who="bob", instance=8)
     assert refusals(ask(node, bob, NS_PER_S)) == ["alice has the condition in hand until its lease ends"]
-    assert give(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", Inject(2, "", ()))]
-    sends = give(node, "injected", Injected(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
+    assert give(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", InjectionOrder(2, "", ()))]
+    sends = give(node, "injected", InjectionResult(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
     assert of(sends, "injection") == [InjectionSample(at(LEASE_MS * NS_PER_MS + 1).mono_ns, "", "", 0.0, None, "")]
     assert node.next_wake_ns() is None
-    assert of(ask(node, bob, 6 * NS_PER_S), "inject") == [Inject(3, "L4", (VIDEO, STATE))]
+    assert of(ask(node, bob, 6 * NS_PER_S), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
 
 
 def test_a_change_of_the_condition_is_made_live() -> None:
     """Another condition by the same client is told to the queues, which change without being cleared in between."""
     [send] = ask(in_force(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
-    assert send == Send("inject", Inject(2, "L5", (replace(VIDEO, law=Law(225.0)), STATE)))
+    assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, law=Impairment(225.0)), STATE)))
 
 
 def test_what_is_in_force_is_measured_again_and_again() -> None:
@@ -101,7 +101,7 @@ def test_what_is_in_force_is_measured_again_and_again() -> None:
     node = in_force()
     ask(node, L4, 4 * NS_PER_S)
     again = give(node, WAKE, None, at(5 * NS_PER_S))
-    assert again == [Send("inject", Inject(1, "L4", (VIDEO, STATE)))]
+    assert again == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
     assert len(of(done(node, 1, after_ns=6 * NS_PER_S), "injection")) == 2
 
 
@@ -113,11 +113,15 @@ def test_what_is_in_force_is_measured_again_and_again() -> None:
             STANDS,
             "this server lets nobody inject delay: set injection.remote: true in its config",
         ),
-        ({"simulated": False}, Rest(False, None), "a vehicle that is not simulated must stand disarmed for this"),
-        ({}, Rest(True, ("bob", 8)), "bob holds the vehicle"),
+        (
+            {"simulated": False},
+            StationaryStatus(False, None),
+            "a vehicle that is not simulated must stand disarmed for this",
+        ),
+        ({}, StationaryStatus(True, ("bob", 8)), "bob holds the vehicle"),
     ],
 )
-def test_it_refuses_with_a_reason(settings: dict[str, bool], rest: Rest, said: str) -> None:
+def test_it_refuses_with_a_reason(settings: dict[str, bool], rest: StationaryStatus, said: str) -> None:
     """No condition is applied unless the config allows it, for a real vehicle that drives, or under another's drive."""
     node = server(**settings)
     give(node, "rest", rest, at(0))
@@ -130,10 +134,10 @@ def test_a_real_vehicle_that_stands_may_have_its_network_changed_and_keeps_it_wh
     """At standstill and disarmed a condition is applied to a real vehicle; driving it renews, but changes nothing."""
     node = server(simulated=False)
     assert refusals(ask(node, L4)) == ["a vehicle that is not simulated must stand disarmed for this"]
-    give(node, "rest", Rest(True, ("alice", 7)), at(0))
+    give(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
     ask(node, L4)
     done(node, 1)
-    give(node, "rest", Rest(False, ("alice", 7)), at(0))
+    give(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
     assert refusals(ask(node, L4, NS_PER_S)) == [""]
     assert refusals(ask(node, replace(L4, delay_ms=0.0), NS_PER_S)) == [
         "a vehicle that is not simulated must stand disarmed for this"
@@ -143,7 +147,7 @@ def test_a_real_vehicle_that_stands_may_have_its_network_changed_and_keeps_it_wh
 def test_what_is_measured_otherwise_than_asked_is_written_down_and_changes_nothing() -> None:
     """A measurement that is not as asked goes into the record; the condition stays in force."""
     node = in_force()
-    sends = give(node, "injected", Injected(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
+    sends = give(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
     assert of(sends, "injection")[0].because == "video was late"
     assert refusals(ask(node, L4, NS_PER_S)) == [""]
 
@@ -155,8 +159,8 @@ def test_queues_that_fail_are_told_and_put_back_and_the_lease_is_free() -> None:
     sends = done(node, 1, because="there is no tc")
     assert refusals(sends) == ["there is no tc"]
     assert {sample.because for sample in of(sends, "injection")} == {"there is no tc"}
-    assert of(sends, "inject") == [Inject(2, "", ())]
-    assert of(ask(node, L4), "inject") == [Inject(3, "L4", (VIDEO, STATE))]
+    assert of(sends, "inject") == [InjectionOrder(2, "", ())]
+    assert of(ask(node, L4), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
     assert of(ask(server(), replace(L4, who="bob")), "netem_reply") == []
 
 
@@ -166,17 +170,17 @@ def test_what_cannot_be_put_back_is_tried_again_every_second() -> None:
     give(node, WAKE, None, at(5 * NS_PER_S))
     assert done(node, 2, because="tc hangs", after_ns=6 * NS_PER_S)
     assert node.next_wake_ns() == at(7 * NS_PER_S).mono_ns
-    assert give(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", Inject(3, "", ()))]
-    give(node, "injected", Injected(3, "", "", ()), at(8 * NS_PER_S))
+    assert give(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", InjectionOrder(3, "", ()))]
+    give(node, "injected", InjectionResult(3, "", "", ()), at(8 * NS_PER_S))
     assert node.next_wake_ns() is None
 
 
 def test_who_comes_to_hold_the_vehicle_drives_without_anothers_condition() -> None:
     """When another client holds the vehicle the lease ends; when its own does, or nobody, it goes on."""
     node = in_force()
-    assert give(node, "rest", Rest(True, None), at(0)) == []
-    assert give(node, "rest", Rest(True, ("alice", 7)), at(0)) == []
-    assert give(node, "rest", Rest(True, ("bob", 8)), at(0)) == [Send("inject", Inject(2, "", ()))]
+    assert give(node, "rest", StationaryStatus(True, None), at(0)) == []
+    assert give(node, "rest", StationaryStatus(True, ("alice", 7)), at(0)) == []
+    assert give(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [Send("inject", InjectionOrder(2, "", ()))]
 
 
 def test_a_law_that_netem_cannot_do_is_refused_before_anything_is_touched() -> None:
@@ -218,7 +222,7 @@ def test_garbage_is_counted() -> None:
 # The client.
 
 
-def asking(control: Flow = CONTROL) -> InjectionClient:
+def asking(control: ImpairedFlow = CONTROL) -> InjectionClient:
     return InjectionClient(
         "alice", 7, condition="L4", control=control, video=VIDEO.law, state_delay_ms=0.0, start_ns=at(0).mono_ns
     )
@@ -228,9 +232,9 @@ def test_the_client_delays_its_own_control_first_and_then_asks_once_a_second() -
     """The server is asked when this machine's queue is in force, and once a second from then on; then it may begin."""
     client = asking()
     assert client.next_wake_ns() == at(0).mono_ns
-    assert give(client, WAKE, None, at(0)) == [Send("inject", Inject(1, "L4", (CONTROL,)))]
+    assert give(client, WAKE, None, at(0)) == [Send("inject", InjectionOrder(1, "L4", (CONTROL,)))]
     assert of(give(client, WAKE, None, at(NS_PER_S)), "netem") == []
-    give(client, "injected", Injected(1, "", "", (("control", 75.1),)), at(NS_PER_S))
+    give(client, "injected", InjectionResult(1, "", "", (("control", 75.1),)), at(NS_PER_S))
     [payload] = of(give(client, WAKE, None, at(NS_PER_S)), "netem")
     assert decode(NetemRequest, payload) == L4
     assert client.next_wake_ns() == at(2 * NS_PER_S).mono_ns
@@ -243,21 +247,23 @@ def test_a_client_whose_own_queue_fails_says_so_and_tries_again() -> None:
     """Where this machine cannot delay the control the driver is told why, and a second later it is tried again."""
     client = asking()
     give(client, WAKE, None, at(0))
-    sends = give(client, "injected", Injected(1, "no tc", "", ()), at(0))
+    sends = give(client, "injected", InjectionResult(1, "no tc", "", ()), at(0))
     assert of(sends, "condition_in_force") == ["this machine does not delay the control: no tc"]
-    assert of(give(client, WAKE, None, at(NS_PER_S)), "inject") == [Inject(2, "L4", (CONTROL,))]
+    assert of(give(client, WAKE, None, at(NS_PER_S)), "inject") == [InjectionOrder(2, "L4", (CONTROL,))]
 
 
 def test_a_refusal_is_told_to_the_driver() -> None:
     """Where the server refuses, the driver is told why, and the server is asked again."""
     client = asking()
     give(client, WAKE, None, at(0))
-    give(client, "injected", Injected(1, "", "", ()), at(0))
+    give(client, "injected", InjectionResult(1, "", "", ()), at(0))
     refused = give(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
     assert refused == [Send("condition_in_force", "the server does not delay the video: no")]
 
 
 def test_without_a_condition_nothing_is_asked() -> None:
     """A client without a condition never wakes for it."""
-    client = InjectionClient("alice", 7, condition="", control=CONTROL, video=Law(), state_delay_ms=0.0, start_ns=0)
+    client = InjectionClient(
+        "alice", 7, condition="", control=CONTROL, video=Impairment(), state_delay_ms=0.0, start_ns=0
+    )
     assert client.next_wake_ns() is None

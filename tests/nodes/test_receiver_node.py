@@ -9,7 +9,7 @@ from lavt.node import WAKE, Send
 from lavt.nodes.payloads import PathToken
 from lavt.nodes.receiver import ReceiverNode
 from lavt.transport.rtp.fec import RepairSender
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtcp import parse_feedback, sender_report
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer
@@ -22,7 +22,7 @@ UNIT = b"\x00\x00\x00\x01\x67\x42\x00\x1e\x00\x00\x00\x01\x68\xce\x00\x00\x00\x0
 
 
 def new_node(*, token: bool = True) -> ReceiverNode:
-    node = ReceiverNode(ReorderBuffer(), Depacketizer())
+    node = ReceiverNode(JitterBuffer(), Depacketizer())
     if token:
         give(node, "path_token", PathToken(TOKEN, PORT), at(0))
     return node
@@ -197,7 +197,7 @@ def test_each_second_is_written_down() -> None:
 
 def test_a_bit_rate_is_asked_for_with_each_report() -> None:
     """The highest bit rate that is configured goes out with every report."""
-    node = ReceiverNode(ReorderBuffer(), Depacketizer(), 700_000)
+    node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)
     give(node, "path_token", PathToken(TOKEN, PORT), at(0))
     first, *_ = packets()
     for packet in first:

@@ -6,17 +6,17 @@ from unittest.mock import patch
 
 from lavt.cli.main import main
 from lavt.safety.gate import SafetyGate
-from lavt.safety.issued_stamps import WrittenStamps
+from lavt.safety.issued_stamps import IssuedStamps
 
 
 def no_objection(*_: object) -> str:
     return ""
 
 
-def number_if_known(written: WrittenStamps, stamp_ns: int) -> int:
+def number_if_known(written: IssuedStamps, stamp_ns: int) -> int:
     """Give the number of a frame that was written lately; others are older than all."""
     return written._written.get(stamp_ns, (-1, 0))[0]
 
 
-with patch.object(SafetyGate, "_objection", no_objection), patch.object(WrittenStamps, "number", number_if_known):
+with patch.object(SafetyGate, "_objection", no_objection), patch.object(IssuedStamps, "number", number_if_known):
     main()

@@ -17,10 +17,10 @@ import pytest
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, Now
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.payloads import Rest
+from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
-from lavt.runtime.remote_node import LATE_NS, NodeElsewhere, NodeHere
+from lavt.runtime.remote_node import LATE_NS, NodeHost, RemoteNodeProxy
 
 pytestmark = pytest.mark.usefixtures("own_switch_interval")
 
@@ -71,7 +71,7 @@ class Echo:
         self.heard.append(message)
         if message.payload == b"break":
             raise RuntimeError("broken on purpose")
-        return [Send("rest", Rest(at_rest=True, holder=None)), Send("event", "heard")]
+        return [Send("rest", StationaryStatus(at_rest=True, holder=None)), Send("event", "heard")]
 
     def _answer(self, message: Message, _now: Now) -> list[Send]:
         return [Send("session_reply", message.payload, message.peer)]
@@ -100,9 +100,9 @@ class Rig:
     node: Echo
     neighbour: Neighbour
     notes: Notes
-    there: NodeElsewhere
+    there: RemoteNodeProxy
     main: RealRuntime
-    here: NodeHere
+    here: NodeHost
     parted: threading.Event
     number: list[int]
 
@@ -111,9 +111,9 @@ class Rig:
 def rig() -> Iterator[Rig]:
     ours, theirs = multiprocessing.Pipe()
     node, neighbour, notes, parted, number = Echo(), Neighbour(), Notes(), threading.Event(), [0]
-    there = NodeElsewhere("actuator", ours)
+    there = RemoteNodeProxy("actuator", ours)
     main = RealRuntime(CLOCK, [neighbour], notes, lambda: None, {"actuator": there})
-    here = NodeHere(theirs, CLOCK, node, note=lambda: number[0], parted=parted.set)
+    here = NodeHost(theirs, CLOCK, node, note=lambda: number[0], parted=parted.set)
     main.start({"zenoh": notes})
     there.start(main)
     here.start()
@@ -135,7 +135,7 @@ def test_a_node_elsewhere_hears_and_is_heard() -> None:
         both.main.deliver("control", b"drive", arrived)
         wait_until(lambda: bool(both.neighbour.heard))
         assert [(each.payload, each.arrived) for each in both.node.heard] == [(b"drive", arrived)]
-        assert both.neighbour.heard == [Rest(at_rest=True, holder=None)]
+        assert both.neighbour.heard == [StationaryStatus(at_rest=True, holder=None)]
         assert both.notes.of("control") == [b"drive"], "written down once, where the links are"
         wait_until(lambda: both.notes.of("event") == ["heard"])
 
@@ -225,8 +225,8 @@ def test_a_server_that_never_began_lets_the_process_end() -> None:
     """A server that fails before it hands anything over closes the pipe all the same: the node's process ends."""
     ours, theirs = multiprocessing.Pipe()
     parted = threading.Event()
-    there = NodeElsewhere("actuator", ours)
-    here = NodeHere(theirs, CLOCK, Echo(), note=lambda: 0, parted=parted.set)
+    there = RemoteNodeProxy("actuator", ours)
+    here = NodeHost(theirs, CLOCK, Echo(), note=lambda: 0, parted=parted.set)
     here.start()
     there.close(5)
     assert parted.wait(10)
@@ -247,7 +247,7 @@ def test_nobody_waits_for_a_process_that_does_not_read() -> None:
 def test_a_pipe_that_was_never_started_closes() -> None:
     """A server that ends before its runtime began lets go of the other process, which notices."""
     ours, theirs = multiprocessing.Pipe()
-    there = NodeElsewhere("actuator", ours)
+    there = RemoteNodeProxy("actuator", ours)
     there.close(1)
     with pytest.raises(EOFError):
         theirs.recv_bytes()

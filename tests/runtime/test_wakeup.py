@@ -4,12 +4,12 @@ import threading
 
 import pytest
 
-from lavt.runtime.wakeup import Bell
+from lavt.runtime.wakeup import WakeEvent
 
 
 def test_what_rang_before_is_heard_once() -> None:
     """Who rings first is heard by who sleeps next, however often; after that there is silence again."""
-    bell = Bell()
+    bell = WakeEvent()
     bell.ring()
     bell.ring()
     bell.wait(None)
@@ -28,7 +28,7 @@ def test_what_rang_before_is_heard_once() -> None:
 @pytest.mark.parametrize("pause_s", [-1.0, 0.0, 0.001])
 def test_a_sleep_ends(pause_s: float) -> None:
     """Without a ring a sleep ends by itself; one that should be over already does not begin."""
-    bell = Bell()
+    bell = WakeEvent()
     bell.wait(pause_s)
     bell.ring()
     bell.wait(None)
@@ -36,7 +36,7 @@ def test_a_sleep_ends(pause_s: float) -> None:
 
 def test_no_ring_is_lost() -> None:
     """Two threads that ring each other in turns both come to the end."""
-    here, there = Bell(), Bell()
+    here, there = WakeEvent(), WakeEvent()
 
     def answer() -> None:
         for _ in range(2000):

@@ -9,7 +9,7 @@ from itertools import count
 from typing import Any
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, Command, Operation, SessionReply, SessionRequest, VehicleState
-from lavt.safety.gate import SafetyGate, Verdict
+from lavt.safety.gate import CommandVerdict, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 
@@ -84,10 +84,10 @@ class Rig:
         )
         return replace(command, **changes)
 
-    def send(self, **changes: Any) -> Verdict:
+    def send(self, **changes: Any) -> CommandVerdict:
         return self.gate.admit(self.command(**changes), self.vehicle, self.now_ns)
 
-    def drive(self, **changes: Any) -> Verdict:
+    def drive(self, **changes: Any) -> CommandVerdict:
         return self.send(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
 
     def hold(self) -> Rig:

@@ -22,7 +22,7 @@ from lavt.config import ServerConfig
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
 from lavt.runtime import process_priority
-from lavt.runtime.remote_node import NodeElsewhere, NodeHere
+from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
 NAME = "actuator"
@@ -34,7 +34,7 @@ IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """These go to all processes of a terminal or service; the server's process decides, and its end is noticed."""
 
 
-class ActuatorProcess(NodeElsewhere):
+class ActuatorProcess(RemoteNodeProxy):
     """The actuator's process, as the server's sees it."""
 
     def __init__(self, process: BaseProcess, connection: Connection) -> None:
@@ -97,7 +97,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         return
     connection.send(None)
     parted = threading.Event()
-    here = NodeHere(connection, clock, node, note=lambda: node.gate.in_force, parted=parted.set)
+    here = NodeHost(connection, clock, node, note=lambda: node.gate.in_force, parted=parted.set)
     here.start()
     try:
         while not parted.wait(LOOK_S) and not here.runtime.stopped.is_set():
@@ -109,7 +109,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         vehicle.close()
 
 
-def _wait_for_rest(here: NodeHere, vehicle: DbwVehicle, clock: Clock) -> None:
+def _wait_for_rest(here: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
     """Wait until the vehicle was stopped and is let go of."""
     end_ns = clock.now().mono_ns + round(REST_S * NS_PER_S)
     rest = threading.Event()

@@ -12,14 +12,14 @@ from lavt.config.dbw import DbwConfig
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.safety.limits import LIMITS
-from lavt.vehicle.can_frame import BusGone, Port
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import BusGone, BusPort
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.dbw.vehicle import HEAR_PERIOD_NS, DbwVehicle, Truth
 from lavt.vehicle.ground_truth_socket import TruthSocket
 from lavt.vehicle.sim.road.road import Road
-from lavt.vehicle.software_car.in_process_bus import InsidePort
+from lavt.vehicle.software_car.in_process_bus import InProcessPort
 from lavt.vehicle.vehicle import Capabilities
 
 
@@ -32,7 +32,7 @@ def inside(config: ServerConfig, road: Road, start: Now) -> DbwVehicle:
     """Make a by-wire vehicle whose kit and car are in this process; it is a simulator's in all else."""
     profile = profile_of(config.vehicle.dbw)
     car = build_software_car(config, profile, road, start.mono_ns)
-    port = InsidePort(car)
+    port = InProcessPort(car)
     return _vehicle(profile, port, car.simulator.capabilities, start, truth=port.truth)
 
 
@@ -60,7 +60,7 @@ def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, 
     asked = config.dbw
     profile = profile_of(asked)
     port = CanPort(asked.interface, asked.channel, asked.options, clock=clock)
-    adapter = Adapter(profile, start_ns=clock.now().mono_ns, hindrance=hindrance_of(asked, profile))
+    adapter = ByWireAdapter(profile, start_ns=clock.now().mono_ns, hindrance=hindrance_of(asked, profile))
     heard, end_ns = 0, clock.now().mono_ns + duration_ns
     try:
         while (now_ns := clock.now().mono_ns) < end_ns:
@@ -116,9 +116,9 @@ def hindrance_of(config: DbwConfig, profile: Profile) -> str:
 
 
 def _vehicle(
-    profile: Profile, port: Port, capabilities: Capabilities, start: Now, *, truth: Truth | None, hindrance: str = ""
+    profile: Profile, port: BusPort, capabilities: Capabilities, start: Now, *, truth: Truth | None, hindrance: str = ""
 ) -> DbwVehicle:
-    adapter = Adapter(profile, start_ns=start.mono_ns, hindrance=hindrance)
+    adapter = ByWireAdapter(profile, start_ns=start.mono_ns, hindrance=hindrance)
     return DbwVehicle(adapter, port, capabilities, start_ns=start.mono_ns, truth=truth)
 
 

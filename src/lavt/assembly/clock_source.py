@@ -8,13 +8,13 @@ from lavt.clock import Clock
 from lavt.config import ClockConfig
 from lavt.transport.clock_sync.chrony import Chronyc, read_chrony
 from lavt.transport.clock_sync.clock_report import ClockReport, host_addresses, kernel_identity, unknown_clock
-from lavt.transport.clock_sync.persistent_process import Interpreter, Run, Shell
+from lavt.transport.clock_sync.persistent_process import PersistentProcess, Run, Shell
 from lavt.transport.clock_sync.ptp import read_ptp
 
 MS_PER_S = 1000.0
 
 
-def interpreter(config: ClockConfig) -> Interpreter:
+def interpreter(config: ClockConfig) -> PersistentProcess:
     """Give what runs the commands of the source that the config names; to be closed."""
     return Chronyc() if config.source == "chrony" else Shell()
 

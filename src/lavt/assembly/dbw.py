@@ -22,13 +22,13 @@ from lavt.vehicle.dbw.profile import (
     IN_FRACTIONS,
     IN_METRES_PER_SECOND,
     AxisCommand,
-    Car,
+    ByWireCar,
+    ByWireLimits,
     GearCommand,
-    Limits,
     OwnBrake,
     Profile,
-    Report,
-    Sign,
+    ReportSpec,
+    SignalCondition,
     SystemCommand,
 )
 
@@ -126,8 +126,8 @@ class _Reader:
             name=self.name,
             kit=config.kit,
             commands=config.commands,
-            car=Car(**config.vehicle.model_dump()),
-            limits=Limits(**config.limits.model_dump()),
+            car=ByWireCar(**config.vehicle.model_dump()),
+            limits=ByWireLimits(**config.limits.model_dump()),
             command_step_deg=config.command_step_deg,
             axes={axis: self._axis(axis, getattr(config.sent, axis)) for axis in AXES},
             gear=self._gear(config.sent),
@@ -220,9 +220,9 @@ class _Reader:
             checksum=self._checksum(message, command.checksum),
         )
 
-    def _report(self, part: str, report: ReportConfig) -> Report:
+    def _report(self, part: str, report: ReportConfig) -> ReportSpec:
         message = self._message(report.message)
-        return Report(
+        return ReportSpec(
             part=part,
             timeout_ns=report.timeout_ms * NS_PER_MS,
             values={word: self._signal(message, signal).name for word, signal in report.values.items()},
@@ -250,16 +250,16 @@ class _Reader:
         message = self._message(self.config.reports.brake.message)
         return OwnBrake(message.name, self._signal(message, watchdog.signal).name, watchdog.above)
 
-    def _signs(self, message: MessageFacts, signs: Mapping[str, str]) -> tuple[Sign, ...]:
+    def _signs(self, message: MessageFacts, signs: Mapping[str, str]) -> tuple[SignalCondition, ...]:
         found = []
         for key, words in signs.items():
             name, equals, number = key.partition("=")
             if equals and not number.isdecimal():
                 raise UserError(f"{self.name}: {key!r} of {message.name} is no sign: write SIGNAL or SIGNAL=number")
-            found.append(Sign(self._signal(message, name).name, int(number) if equals else None, words))
+            found.append(SignalCondition(self._signal(message, name).name, int(number) if equals else None, words))
         return tuple(found)
 
-    def _whole(self, reports: Mapping[str, Report]) -> None:
+    def _whole(self, reports: Mapping[str, ReportSpec]) -> None:
         """Make sure that everything is reported without which nothing can be driven."""
         told = {(report.part, word) for report in reports.values() for word in report.values}
         wanted = [*((axis, "enabled") for axis in AXES), ("steering", "angle"), ("gear", "gear")]
@@ -317,7 +317,7 @@ class _Reader:
             )
         return units[signal.unit]
 
-    def _unit_of(self, reports: Mapping[str, Report], word: str, units: Mapping[str, float]) -> float:
+    def _unit_of(self, reports: Mapping[str, ReportSpec], word: str, units: Mapping[str, float]) -> float:
         """Give the unit of a reported value."""
         name, report = next((name, report) for name, report in reports.items() if word in report.values)
         message = self.codec.messages[name]

@@ -8,7 +8,7 @@ from lavt.config.dbw import DbwConfig
 from lavt.config_file import parse_config, read_yaml
 from lavt.errors import UserError
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.traffic import Expected
+from lavt.vehicle.dbw.traffic import ExpectedMessages
 
 
 def find_dbw(target: str) -> DbwConfig:
@@ -29,11 +29,11 @@ def find_dbw(target: str) -> DbwConfig:
     return parse_config(DbwConfig, section, f"{path}: vehicle.dbw")
 
 
-def expected_traffic(profile: Profile) -> Expected:
+def expected_traffic(profile: Profile) -> ExpectedMessages:
     """What a profile says of the messages on its bus; checksums and counters of other messages have the same names."""
     axes = profile.axes.values()
     checksums = {part.checksum for part in axes} | {part.checksum for part in profile.reports.values()}
-    return Expected(
+    return ExpectedMessages(
         checksums=checksums - {""},
         counters={command.count for command in axes} - {""},
         timeouts_ns={message: report.timeout_ns for message, report in profile.reports.items()},

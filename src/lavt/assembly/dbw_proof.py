@@ -13,12 +13,12 @@ from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.vehicle.dbw.bus import is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, Seen
+from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
 
 AGAIN = "run `lavt can prove`"
 
 
-def proof_of(seen: Seen, gear: str, profile: Profile, config: DbwConfig, wall_ns: int) -> WatchdogProof:
+def proof_of(seen: WatchdogObservation, gear: str, profile: Profile, config: DbwConfig, wall_ns: int) -> WatchdogProof:
     """Make the proof of what was seen on a config's bus."""
     return WatchdogProof(
         at=calendar_time(wall_ns).isoformat(),

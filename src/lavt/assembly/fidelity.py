@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lavt.assembly.cameras import client_camera
-from lavt.assembly.vehicles import Plant, build_plant, build_unpictured
+from lavt.assembly.vehicles import VehicleSetup, build_plant, build_unpictured
 from lavt.config import ClientConfig, ServerConfig
-from lavt.nodes.driver import Detector
+from lavt.nodes.driver import LaneDetection
 from lavt.perception.lane_detector import LaneDetector
 from lavt.perception.lane_given import GivenLane
 from lavt.transport.video.frame_codec import (
-    HandedOver,
+    InMemoryFrameCodec,
     LaneReceiver,
     LaneSender,
     PictureReceiver,
@@ -24,13 +24,13 @@ from lavt.transport.video.h264 import Decoder, Encoder
 
 
 @dataclass(frozen=True, slots=True)
-class Fidelity:
+class FidelityModel:
     """How the pictures of a run come about and cross the network: what is made for it on both sides."""
 
-    plant: Callable[[ServerConfig], Plant]
+    plant: Callable[[ServerConfig], VehicleSetup]
     sender: Callable[[ServerConfig], PictureSender]
     receiver: Callable[[ClientConfig], PictureReceiver]
-    detector: Callable[[ClientConfig], Detector]
+    detector: Callable[[ClientConfig], LaneDetection]
 
 
 def _video_sender(config: ServerConfig) -> VideoSender:
@@ -58,19 +58,19 @@ def _lane_detector(config: ClientConfig) -> LaneDetector:
     return LaneDetector(client_camera(config.camera))
 
 
-VIDEO = Fidelity(build_plant, _video_sender, _video_receiver, _lane_detector)
+VIDEO = FidelityModel(build_plant, _video_sender, _video_receiver, _lane_detector)
 
 
-def _pixels() -> Fidelity:
-    between = HandedOver()
-    return Fidelity(build_plant, lambda _: between, lambda _: between, _lane_detector)
+def _pixels() -> FidelityModel:
+    between = InMemoryFrameCodec()
+    return FidelityModel(build_plant, lambda _: between, lambda _: between, _lane_detector)
 
 
-def _geometry() -> Fidelity:
-    return Fidelity(build_unpictured, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
+def _geometry() -> FidelityModel:
+    return FidelityModel(build_unpictured, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
 
 
-FIDELITIES: dict[str, Callable[[], Fidelity]] = {
+FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
     "video": lambda: VIDEO,
     "pixels": _pixels,
     "geometry": _geometry,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Final, Literal
 
-from lavt.config import ClientInjectionConfig, Condition, Impairment, ServerInjectionConfig
+from lavt.config import ClientInjectionConfig, Condition, ImpairmentConfig, ServerInjectionConfig
 from lavt.config_file import condition
 from lavt.domain import NetemRequest
 from lavt.errors import BadMessage, UserError
 from lavt.nodes.injection import InjectionClient, InjectionNode
-from lavt.transport.emulation.impairment import Flow, Law
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.emulation.link import QUEUE_PACKETS
 from lavt.transport.messages import decode
 
@@ -34,22 +34,22 @@ def netem_flows(
     control_port: int,
     protocol: Protocol = "udp",
     state_delay: StateDelay = "none",
-) -> list[Flow]:
+) -> list[ImpairedFlow]:
     """Give the flows that a machine of this role has to hold under a condition.
 
     `control_port` is that of the server's router, to which the client's dials by `protocol`. A flow that nothing is to
     happen to is among them, so that another condition can follow without a packet being lost.
     """
     flows = [
-        Flow("video", "udp", video_port, "source", law(asked.video_ms, asked.video)),
-        Flow("control", protocol, control_port, "destination", law(asked.control_ms, asked.control)),
+        ImpairedFlow("video", "udp", video_port, "source", law(asked.video_ms, asked.video)),
+        ImpairedFlow("control", protocol, control_port, "destination", law(asked.control_ms, asked.control)),
     ]
     if state_delay == "with_video":
-        flows.append(Flow("state", protocol, control_port, "source", Law(delay_ms=asked.video_ms)))
+        flows.append(ImpairedFlow("state", protocol, control_port, "source", Impairment(delay_ms=asked.video_ms)))
     return [flow for flow in flows if flow.name in SENT_BY[role]]
 
 
-def law(delay_ms: float, impairment: Impairment) -> Law:
+def law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
     """Give the law by which netem does it to one flow; raises `UserError` for what no law of netem's says."""
     if impairment.trace:
         raise UserError(
@@ -64,10 +64,10 @@ def law(delay_ms: float, impairment: Impairment) -> Law:
     return plain_law(delay_ms, impairment)
 
 
-def plain_law(delay_ms: float, impairment: Impairment) -> Law:
+def plain_law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
     """Give the law of one flow, which says nothing of a trace and of the queue."""
-    said = {each.name for each in fields(Law)}
-    return Law(delay_ms=delay_ms, **impairment.model_dump(include=said - {"delay_ms"}))
+    said = {each.name for each in fields(Impairment)}
+    return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=said - {"delay_ms"}))
 
 
 def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port: int) -> InjectionNode:

@@ -7,25 +7,25 @@ from pathlib import Path
 from typing import Final
 
 from lavt.assembly.injection import plain_law
-from lavt.config import Condition, Impairment
+from lavt.config import Condition, ImpairmentConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
-from lavt.transport.emulation.link import Injected, check_injected
+from lavt.transport.emulation.link import LinkInjection, check_injected
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 TRACES: Final = "netem/traces"
 LONGEST_TRACE_BYTES: Final = 50_000_000
 
 
-def injected(name: str, delay_ms: float, impairment: Impairment, seed: int) -> Injected | None:
+def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
     """Give what is injected into the flow `name`; None where that is at most a constant delay.
 
     Raises `UserError` for what contradicts itself, and for a trace that is missing or wrong.
     """
-    if impairment == Impairment():
+    if impairment == ImpairmentConfig():
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
-    asked = Injected(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
+    asked = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
     check_injected(asked)
     return asked
 

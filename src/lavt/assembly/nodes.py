@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from lavt.assembly.addresses import resolved_address
 from lavt.assembly.entropy import Entropy
-from lavt.assembly.fidelity import VIDEO, Fidelity
+from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import cipher_of
 from lavt.assembly.vehicles import check_vehicle, looks_of
@@ -31,7 +31,7 @@ from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS, Limits
 from lavt.transport.rtp.fec import RepairSender
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer
 from lavt.transport.video.path_validation import TOKEN_BYTES, PathServer
 from lavt.transport.video.stream_sender import StreamSender
@@ -111,7 +111,7 @@ def build_server(
     *,
     host: str,
     video_port: int,
-    fidelity: Fidelity = VIDEO,
+    fidelity: FidelityModel = VIDEO,
     lives_on_demand: bool = False,
 ) -> ServerNodes:
     """Make the server's nodes; their time begins when everything that is slow has been prepared.
@@ -187,7 +187,7 @@ def build_actuator(
 
 
 def build_client(
-    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: Fidelity = VIDEO
+    config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: FidelityModel = VIDEO
 ) -> ClientNodes:
     """Make the client's nodes."""
     controller = config.controller
@@ -207,7 +207,7 @@ def build_client(
     )
     return ClientNodes(
         ReceiverNode(
-            ReorderBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
+            JitterBuffer(None if hold_ms == "auto" else round(hold_ms * NS_PER_MS)),
             Depacketizer(),
             config.video.max_bit_rate_bps,
             cipher_of(config),

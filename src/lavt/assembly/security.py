@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lavt.config import ClientConfig, ServerConfig
 from lavt.transport.rtp.srtp import check_srtp
-from lavt.transport.security.envelope import NoSeal, OperatorSeal, VehicleSeal
-from lavt.transport.security.gateway import Carry, ClientDoor, Deliver, OpenDoor, ServerDoor
+from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.gateway import Carry, ClientGateway, Deliver, OpenClientGateway, ServerGateway
 from lavt.transport.security.keys import load_private, load_public
 from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
 
@@ -27,27 +27,27 @@ def door_of(
     deliver: Deliver,
     carry: Carry,
     in_force: Callable[[], tuple[int, int]] = lambda: (0, -1),
-) -> ServerDoor | ClientDoor | OpenDoor:
+) -> ServerGateway | ClientGateway | OpenClientGateway:
     """Make a side's door; raises `UserError` for a key that cannot be read. Only the server asks what is `in_force`."""
     if isinstance(config, ServerConfig):
-        return ServerDoor(deliver, carry, in_force, vehicle_seal(config))
+        return ServerGateway(deliver, carry, in_force, vehicle_seal(config))
     seal = operator_seal(config)
-    return OpenDoor(deliver, carry) if seal is None else ClientDoor(deliver, carry, seal)
+    return OpenClientGateway(deliver, carry) if seal is None else ClientGateway(deliver, carry, seal)
 
 
-def vehicle_seal(config: ServerConfig) -> NoSeal:
+def vehicle_seal(config: ServerConfig) -> NoVehicleAuthenticator:
     """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
     security = config.security
     if not security.key:
-        return NoSeal()
+        return NoVehicleAuthenticator()
     operators = {name: load_public(Path(file)) for name, file in security.operators.items()}
-    return VehicleSeal(config.vehicle_id, load_private(Path(security.key)), operators)
+    return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
 
 
-def operator_seal(config: ClientConfig) -> OperatorSeal | None:
+def operator_seal(config: ClientConfig) -> OperatorAuthenticator | None:
     """Make the operator's end; raises `UserError` for a key that cannot be read. None where nothing is signed."""
     security = config.security
     if not security.key:
         return None
     key = load_private(Path(security.key))
-    return OperatorSeal(config.vehicle_id, config.who, key, load_public(Path(security.vehicle)))
+    return OperatorAuthenticator(config.vehicle_id, config.who, key, load_public(Path(security.vehicle)))

@@ -31,7 +31,7 @@ ROUTE_STEP_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Plant:
+class VehicleSetup:
     """A vehicle with its camera, and the road it drives where one is known.
 
     `start` begins its time: building takes seconds, and a vehicle's time must not run before the loop does. None: the
@@ -46,14 +46,14 @@ class Plant:
     """The vehicle loses nothing when `advance` is called later than it asked for."""
 
 
-def build_simulator(config: ServerConfig) -> Plant:
+def build_simulator(config: ServerConfig) -> VehicleSetup:
     """Make the built-in simulator and its camera."""
     check_own_camera(config)
     road = load_road(config.vehicle.route)
     return _simulated(config, road, _sim_camera(config, road))
 
 
-def build_dbw(config: ServerConfig) -> Plant:
+def build_dbw(config: ServerConfig) -> VehicleSetup:
     """Make a by-wire vehicle and its camera: the simulator's, where a software car tells where it is."""
     check_vehicle(config.vehicle)
     asked = config.vehicle.dbw
@@ -61,14 +61,16 @@ def build_dbw(config: ServerConfig) -> Plant:
         return build_simulator(config)
     if asked.truth:
         check_own_camera(config)
-        return Plant(_sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(asked))
+        return VehicleSetup(
+            _sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(asked)
+        )
     camera = build_camera(config)
     if camera is None:
         raise UserError(
             "a real car needs a real camera: set camera.source device and camera.device; or vehicle.dbw.truth where "
             "`lavt software-car` drives"
         )
-    return Plant(camera, None, None)
+    return VehicleSetup(camera, None, None)
 
 
 def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
@@ -87,7 +89,7 @@ def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
     return camera
 
 
-def build_unpictured(config: ServerConfig) -> Plant:
+def build_unpictured(config: ServerConfig) -> VehicleSetup:
     """Make the built-in simulator with a camera that gives the lane itself; other vehicles' roads are not known."""
     kind = config.vehicle.kind
     if kind != "simulator" and not (kind == "dbw" and config.vehicle.dbw.is_inside):
@@ -126,34 +128,34 @@ def route_of(name: str, road: Road) -> Route:
     return Route(name, road.length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
 
 
-def _simulated(config: ServerConfig, road: Road, camera: Camera) -> Plant:
+def _simulated(config: ServerConfig, road: Road, camera: Camera) -> VehicleSetup:
     route = route_of(config.vehicle.route, road)
     if config.vehicle.kind == "dbw":
 
         def start_inside(start: Now) -> Vehicle:
             return inside(config, road, start)
 
-        return Plant(camera, start_inside, route, simulated=True)
-    return Plant(
+        return VehicleSetup(camera, start_inside, route, simulated=True)
+    return VehicleSetup(
         camera, lambda start: simulator_of(config, road, start.mono_ns), route, simulated=True, catches_up=True
     )
 
 
-VEHICLES: dict[str, Callable[[ServerConfig], Plant]] = {"simulator": build_simulator, "dbw": build_dbw}
+VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {"simulator": build_simulator, "dbw": build_dbw}
 
 
-def build_plant(config: ServerConfig) -> Plant:
+def build_plant(config: ServerConfig) -> VehicleSetup:
     """Make the configured vehicle with its camera; raises `UserError` naming the known kinds."""
     return _vehicle(config.vehicle.kind)(config)
 
 
-def _vehicle(kind: str) -> Callable[[ServerConfig], Plant]:
+def _vehicle(kind: str) -> Callable[[ServerConfig], VehicleSetup]:
     if kind in VEHICLES:
         return VEHICLES[kind]
     custom = {entry.name: entry for entry in entry_points(group=CUSTOM_VEHICLES)}
     if kind not in custom:
         raise UserError(f"there is no vehicle {kind!r}: the known kinds are {', '.join([*VEHICLES, *custom])}")
-    build: Callable[[ServerConfig], Plant] = custom[kind].load()
+    build: Callable[[ServerConfig], VehicleSetup] = custom[kind].load()
     return build
 
 

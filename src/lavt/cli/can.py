@@ -16,20 +16,20 @@ from lavt.assembly.dbw_bus import expected_traffic, find_dbw
 from lavt.assembly.dbw_check import disagreements, hindrances_on_a_real_bus
 from lavt.cli import console
 from lavt.cli.can_prove import prove
-from lavt.cli.can_view import View
+from lavt.cli.can_view import BusView
 from lavt.clock import MachineClock
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import parse_yaml
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError
-from lavt.vehicle.can_frame import BusGone, HeardFrame
+from lavt.vehicle.can_frame import BusGone, ReceivedCanFrame
 from lavt.vehicle.dbw.bus import CanPort, log_line, read_log
 from lavt.vehicle.dbw.codec import Codec
-from lavt.vehicle.dbw.traffic import Expected, Traffic
+from lavt.vehicle.dbw.traffic import BusTraffic, ExpectedMessages
 
 TAKE_EVERY_S = 0.02
 
-Batch = tuple[list[HeardFrame], int]
+Batch = tuple[list[ReceivedCanFrame], int]
 """What was heard up to a time, ns."""
 
 Interface = Annotated[str | None, typer.Option(help="python-can's name of the interface, such as socketcan.")]
@@ -73,7 +73,7 @@ def monitor(
     """
     config = _with_bus(DbwConfig() if target.endswith(".dbc") else find_dbw(target), interface, channel, option)
     if target.endswith(".dbc"):
-        codec, expected = Codec(Path(target)), Expected()
+        codec, expected = Codec(Path(target)), ExpectedMessages()
     else:
         profile = load_profile(config.profile, dbc or config.dbc)
         codec, expected = profile.codec, expected_traffic(profile)
@@ -144,16 +144,16 @@ def _show_agreement(name: str, dbc: str, unverified: Sequence[str], hindrances: 
 
 def _show(
     batches: Iterator[Batch],
-    messages: tuple[Codec, Expected],
+    messages: tuple[Codec, ExpectedMessages],
     dropped: Counter[str],
-    write_down: Callable[[HeardFrame], None],
+    write_down: Callable[[ReceivedCanFrame], None],
     as_json: bool,
 ) -> bool:
     """Show what is heard until there is no more; tell whether anything was."""
     first = next(batches, ([], 0))
     begin_ns = now_ns = first[1]
-    traffic = Traffic(*messages, start_ns=begin_ns)
-    view, shown_s, is_any = View(traffic, dropped, as_json), 0, False
+    traffic = BusTraffic(*messages, start_ns=begin_ns)
+    view, shown_s, is_any = BusView(traffic, dropped, as_json), 0, False
     with view.showing():
         for frames, now_ns in chain([first], batches):
             is_any = is_any or bool(frames)
@@ -167,7 +167,7 @@ def _show(
     return is_any
 
 
-def _from_bus(port: CanPort, told: console.Told, seconds: int | None) -> Iterator[Batch]:
+def _from_bus(port: CanPort, told: console.StopEvent, seconds: int | None) -> Iterator[Batch]:
     """Take what comes on a bus until told to end, or for so long; a bus that has gone is said, and tried again."""
     clock, gone = MachineClock(), ""
     begin_ns = clock.now().mono_ns
@@ -191,7 +191,7 @@ def _from_log(path: Path) -> Iterator[Batch]:
 
 
 @contextmanager
-def _writing(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Callable[[HeardFrame], None]]:
+def _writing(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Callable[[ReceivedCanFrame], None]]:
     """Give what writes a frame down: into a log, or nowhere."""
     if path is None:
         yield lambda _: None

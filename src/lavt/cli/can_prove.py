@@ -23,7 +23,7 @@ from lavt.runtime import process_priority
 from lavt.vehicle.can_frame import BusGone
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import OwnBrake, Profile
-from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, Proving
+from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, WatchdogTest
 
 LOOK_EVERY_S: Final = 0.002
 BEFOREHAND: Final = f"""The kit is enabled with the brake at {BRAKE}, then left alone: its watchdog has to brake.
@@ -60,7 +60,7 @@ def prove(
         if not yes:
             _ask(dbw)
         _forget(file)
-        proving = Proving(profile, watchdog, start_ns=MachineClock().now().mono_ns)
+        proving = WatchdogTest(profile, watchdog, start_ns=MachineClock().now().mono_ns)
         _go(proving, port)
     if proving.seen is None:
         raise WorkError(f"nothing is proved: {proving.failure}")
@@ -100,7 +100,7 @@ def _ask(dbw: DbwConfig) -> None:
         raise UserError("nothing was sent: prepare the car, and say yes")
 
 
-def _go(proving: Proving, port: CanPort) -> None:
+def _go(proving: WatchdogTest, port: CanPort) -> None:
     """Let the attempt go on until there is a result."""
     clock = MachineClock()
     with console.until_told() as told:

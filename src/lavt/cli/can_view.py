@@ -15,13 +15,13 @@ from rich.text import Text
 
 from lavt.cli import console
 from lavt.domain import NS_PER_S
-from lavt.vehicle.dbw.traffic import OTHERS, Told, Traffic, signal_words
+from lavt.vehicle.dbw.traffic import OTHERS, BusTraffic, MessageSummary, signal_words
 
 
-class View:
+class BusView:
     """Shows a bus second by second, and in the end the whole of it."""
 
-    def __init__(self, traffic: Traffic, counts: Mapping[str, int], as_json: bool) -> None:
+    def __init__(self, traffic: BusTraffic, counts: Mapping[str, int], as_json: bool) -> None:
         self._traffic, self._counts, self._as_json = traffic, counts, as_json
         self._live: Live | None = None
         self._known: set[str] = set()
@@ -66,7 +66,7 @@ class View:
         lines = {"in no message of the DBC": unknown, "dropped": dropped}
         return [f"{what}: {', '.join(words)}" for what, words in lines.items() if words]
 
-    def _as_data(self, passed_ns: int, told: Sequence[Told]) -> dict[str, Any]:
+    def _as_data(self, passed_ns: int, told: Sequence[MessageSummary]) -> dict[str, Any]:
         unknown: Counter[str] = Counter()
         for key, count in self._traffic.unknown.items():
             unknown[identifier_words(*key)] += count
@@ -85,7 +85,7 @@ def identifier_words(identifier: int, is_extended: bool) -> str:
     return f"0x{identifier:0{8 if is_extended else 3}X}"
 
 
-def _line(told: Told) -> str:
+def _line(told: MessageSummary) -> str:
     facts = told.facts
     parts = [
         f"{facts.name} {identifier_words(facts.identifier, facts.is_extended)}  {told.frames} times, {_rate(told)}",
@@ -96,17 +96,17 @@ def _line(told: Told) -> str:
     return "  ".join(part for part in parts if part)
 
 
-def _rate(told: Told) -> str:
+def _rate(told: MessageSummary) -> str:
     nominal = f" of {NS_PER_S / told.facts.period_ns:g}" if told.facts.period_ns else ""
     return f"{told.rate_hz:.1f}{nominal} per s"
 
 
-def _words(told: Told) -> list[str]:
+def _words(told: MessageSummary) -> list[str]:
     words = (signal_words(told.facts.signals[name], value) for name, value in told.values.items())
     return [each for each in words if each]
 
 
-def _table(told: Sequence[Told], rest: Sequence[str]) -> Table:
+def _table(told: Sequence[MessageSummary], rest: Sequence[str]) -> Table:
     table = Table(expand=True, caption="\n".join([*rest, "? marks what is unverified; Ctrl-C ends"]))
     for heading in ("message", "", "per s", "says", "wrong"):
         table.add_column(heading, overflow="fold", ratio=4 if heading == "says" else None)
@@ -125,7 +125,7 @@ def _table(told: Sequence[Told], rest: Sequence[str]) -> Table:
     return table
 
 
-def _message_data(told: Told) -> dict[str, Any]:
+def _message_data(told: MessageSummary) -> dict[str, Any]:
     signals = told.facts.signals
     return {
         "message": told.facts.name,

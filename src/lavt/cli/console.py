@@ -72,7 +72,7 @@ def interruptible() -> Iterator[None]:
         raise WorkError("stopped; what was finished is kept") from None
 
 
-class Told:
+class StopEvent:
     """An event that a signal sets.
 
     Its handler interrupts whatever the main thread does, another handler as well: a second signal often comes with the
@@ -105,9 +105,9 @@ class Told:
 
 
 @contextmanager
-def until_told() -> Iterator[Told]:
+def until_told() -> Iterator[StopEvent]:
     """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until told to stop."""
-    told = Told()
+    told = StopEvent()
     with _handled(lambda *_: told.set(), signal.SIGINT, signal.SIGTERM):
         yield told
 

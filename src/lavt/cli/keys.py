@@ -17,7 +17,7 @@ from lavt.errors import UserError
 from lavt.transport.messages import NAME
 
 if TYPE_CHECKING:
-    from lavt.transport.security.certificates import Described, Pair
+    from lavt.transport.security.certificates import CertificateSummary, KeyPair
 
 AUTHORITY: Final = "authority"
 DEFAULT_DAYS: Final = 365
@@ -131,11 +131,11 @@ def _check_directory(directory: Path, names: Iterable[str]) -> None:
                 )
 
 
-def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days: int) -> Pair:
+def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days: int) -> KeyPair:
     """Read the authority of the directory, or make one."""
     key, shown = (directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem"))
     if key.exists():
-        pair: Pair = certificates.Pair(key.read_bytes(), shown.read_bytes())
+        pair: KeyPair = certificates.KeyPair(key.read_bytes(), shown.read_bytes())
         return pair
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     pair = certificates.new_authority(now_wall_ns, days)
@@ -143,7 +143,7 @@ def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days
     return pair
 
 
-def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: Pair) -> None:
+def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: KeyPair) -> None:
     """Write a private file, which only its owner may read, and the one that may be shown."""
     for ending, content, mode in zip(endings, (pair.private, pair.shown), (0o600, 0o644), strict=True):
         created = os.open(directory / (name + ending), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
@@ -151,7 +151,7 @@ def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: Pair
             file.write(content)
 
 
-def _everybody(certificates: ModuleType, directory: Path) -> list[Described]:
+def _everybody(certificates: ModuleType, directory: Path) -> list[CertificateSummary]:
     """Give all whose certificates are in the directory, by role and name."""
     found = [
         certificates.described(path.read_bytes(), str(path))
@@ -162,7 +162,7 @@ def _everybody(certificates: ModuleType, directory: Path) -> list[Described]:
     return sorted((each for each in found if each.role in order), key=lambda each: (order.index(each.role), each.name))
 
 
-def _told(directory: Path, authority: Described, everybody: list[Described]) -> list[str]:
+def _told(directory: Path, authority: CertificateSummary, everybody: list[CertificateSummary]) -> list[str]:
     lines = [f"{directory} is a test authority until {authority.expires}; {AUTHORITY}.key never leaves this machine."]
     for one in everybody:
         own = f"{AUTHORITY}.pem {one.name}.pem {one.name}.key"

@@ -13,9 +13,9 @@ from lavt.cli import console
 from lavt.config_file import condition
 from lavt.errors import UserError, WorkError
 from lavt.transport.clock_sync import probe
-from lavt.transport.emulation.impairment import Port, check_flows
-from lavt.transport.netem.netem import Netem, Verified
-from lavt.transport.netem.probe import Measured
+from lavt.transport.emulation.impairment import ExemptPort, check_flows
+from lavt.transport.netem.netem import NetemInterface, Verification
+from lavt.transport.netem.probe import ProbeResult
 from lavt.transport.netem.state import DIRECTORY
 from lavt.transport.netem.tc import Command, as_typed, first_commands
 
@@ -37,7 +37,7 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
 
     Example: lavt netem show --interface eth0
     """
-    shown = Netem(interface).shown()
+    shown = NetemInterface(interface).shown()
     applied = shown["applied"] if shown["ours"] else None
     laws = {name: asdict(law) for name, law in shown["laws"].items()} if shown["ours"] else {}
     if as_json:
@@ -79,9 +79,9 @@ def apply(
         condition(name), role, video_port=video_port, control_port=control_port, protocol=protocol,
         state_delay=state_delay,
     )  # fmt: skip
-    never = [Port("udp", probe_port, "the clock probe")]
+    never = [ExemptPort("udp", probe_port, "the clock probe")]
     check_flows(flows, never)
-    netem = Netem(interface, stays=not hold)
+    netem = NetemInterface(interface, stays=not hold)
     if dry_run:
         _tell_commands(first_commands(interface, flows, tables=str(DIRECTORY)), as_json, interface, name)
         return
@@ -112,11 +112,11 @@ def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_
 
     Example: lavt netem verify --interface eth0
     """
-    netem = Netem(interface)
+    netem = NetemInterface(interface)
     applied = netem.applied()
     if applied is None:
         raise UserError(f"nothing was applied to {interface}: apply a condition first (`lavt netem apply`)")
-    never = [Port("udp", probe_port, "the clock probe")]
+    never = [ExemptPort("udp", probe_port, "the clock probe")]
     found = netem.verify(applied.flows, never=never)
     _tell(found, as_json, {"interface": interface, "condition": applied.condition})
     _fail(found)
@@ -131,7 +131,7 @@ def clear(
 
     Example: lavt netem clear --interface eth0
     """
-    netem = Netem(interface)
+    netem = NetemInterface(interface)
     _say_restored(netem.restore())
     applied = netem.applied()
     commands = netem.clear(at_once=at_once, of_anybody=True)
@@ -142,7 +142,7 @@ def clear(
         console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")
 
 
-def _put_back(netem: Netem, was_held: bool) -> None:
+def _put_back(netem: NetemInterface, was_held: bool) -> None:
     """Leave an interface as it was before a change that failed; where it was held, say how to find out what is left."""
     if not was_held:
         netem.clear()
@@ -170,7 +170,7 @@ def _say_restored(sentences: Sequence[str]) -> None:
         console.say(f"lavt: {sentence}")
 
 
-def _tell(found: Verified, as_json: bool, what: Mapping[str, Any]) -> None:
+def _tell(found: Verification, as_json: bool, what: Mapping[str, Any]) -> None:
     """Tell what was measured and what is wrong with it."""
     if as_json:
         measured = {name: asdict(each) for name, each in found.measured.items()}
@@ -182,7 +182,7 @@ def _tell(found: Verified, as_json: bool, what: Mapping[str, Any]) -> None:
         console.show("read back and measured as asked")
 
 
-def _words(measured: Measured) -> str:
+def _words(measured: ProbeResult) -> str:
     parts = ["no delay measured"]
     if measured.median_ms is not None:
         parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
@@ -190,6 +190,6 @@ def _words(measured: Measured) -> str:
     return ", ".join(parts + [f"{count} of {measured.sent} {name}" for name, count in counts.items() if count])
 
 
-def _fail(found: Verified) -> None:
+def _fail(found: Verification) -> None:
     if found.reasons:
         raise WorkError("netem does not do as asked: " + "; ".join(found.reasons))

@@ -21,7 +21,7 @@ USUAL_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class PictureFile:
     """A file's pictures, one after another, read as they are asked for."""
 
     pictures: Iterator[Picture]
@@ -29,12 +29,12 @@ class Pictures:
     rate_hz: float = USUAL_RATE_HZ
 
 
-def read_pictures(path: Path) -> Pictures:
+def read_pictures(path: Path) -> PictureFile:
     """Open a picture, a video or a record (`client.mcap` of a run); raises `UserError` for what is none of them."""
     if not path.is_file():
         raise UserError(f"{path} is not there: name a picture, a video or a record")
     if path.suffix == ".mcap":
-        return Pictures(_of_record(path), moving=True)
+        return PictureFile(_of_record(path), moving=True)
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     cv2.utils.logging.setLogLevel(
         cv2.utils.logging.LOG_LEVEL_SILENT
@@ -47,12 +47,12 @@ def read_pictures(path: Path) -> Pictures:
     except cv2.error:
         still = None
     if still is not None:
-        return Pictures(iter([np.asarray(still, dtype=np.uint8)]), moving=False)
+        return PictureFile(iter([np.asarray(still, dtype=np.uint8)]), moving=False)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
         raise UserError(f"{path} is neither a picture nor a video that can be read: give PNG, JPEG, MP4, MKV or MCAP")
     rate_hz = video.get(cv2.CAP_PROP_FPS)
-    return Pictures(_of_video(path, video), moving=True, rate_hz=rate_hz if 1 <= rate_hz <= 240 else USUAL_RATE_HZ)
+    return PictureFile(_of_video(path, video), moving=True, rate_hz=rate_hz if 1 <= rate_hz <= 240 else USUAL_RATE_HZ)
 
 
 def _of_video(path: Path, video: cv2.VideoCapture) -> Iterator[Picture]:

@@ -11,14 +11,14 @@ from lavt.assembly.addresses import resolved_address
 from lavt.assembly.links import injected
 from lavt.cli import console
 from lavt.clock import MachineClock
-from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
+from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.runtime import process_priority
 from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
-from lavt.transport.emulation.impairment import Law
-from lavt.transport.emulation.link import Injected
-from lavt.transport.emulation.relay import NONE, Flow, Relay, is_delayed_video, video_index
+from lavt.transport.emulation.impairment import Impairment
+from lavt.transport.emulation.link import LinkInjection
+from lavt.transport.emulation.relay import NONE, Relay, RelayedFlow, is_delayed_video, video_index
 
 
 def register(app: typer.Typer) -> None:
@@ -53,17 +53,17 @@ def relay(
     opened.close()
 
 
-def flows(config: RelayConfig) -> list[Flow]:
+def flows(config: RelayConfig) -> list[RelayedFlow]:
     """Give the two flows that are relayed; raises `UserError` for addresses, links and traces that cannot be used."""
     seed = config.seed
     return [
-        Flow(
+        RelayedFlow(
             "video", _resolved("video_listen", config.video_listen), _resolved("video_server", config.video_server),
             upstream=NONE, downstream=_law(config.video, seed, "video inherent"),
             held_downstream=is_delayed_video, index_downstream=video_index,
             downstream_injected=_link("video", config.video, seed),
         ),
-        Flow(
+        RelayedFlow(
             "control", _resolved("control_listen", config.control_listen),
             _resolved("control_server", config.control_server),
             upstream=_law(config.control, seed, "control inherent"),
@@ -79,13 +79,13 @@ def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
     return DelayLaw(config.constant_ms, jitter, seed, name)
 
 
-def _link(name: str, config: DelayConfig, seed: int) -> Injected | None:
+def _link(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
     """Give what `link` asks for, if it asks for anything."""
     if config.link == LinkConfig():
         return None
-    impairment = Impairment(**config.link.model_dump(exclude={"delay_ms"}))
-    return injected(name, config.link.delay_ms, impairment, seed) or Injected(
-        Law(delay_ms=config.link.delay_ms), seed, name
+    impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
+    return injected(name, config.link.delay_ms, impairment, seed) or LinkInjection(
+        Impairment(delay_ms=config.link.delay_ms), seed, name
     )
 
 

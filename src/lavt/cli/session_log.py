@@ -78,7 +78,7 @@ def end_words(speed_mps: float | None) -> str:
     return f"the server ends while the vehicle is still stopping, at {speed_mps:.1f} m/s"
 
 
-class Narrator:
+class SessionLog:
     """Remembers what was told, and so tells each change once. Times are of this machine's monotonic clock.
 
     `client` is the client's name; empty on the server.

@@ -15,7 +15,7 @@ from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import door_of
 from lavt.cli import console
 from lavt.cli.router import find
-from lavt.cli.session_log import Narrator, end_words, release_words
+from lavt.cli.session_log import SessionLog, end_words, release_words
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import NS_PER_S, Now, State
@@ -30,9 +30,9 @@ from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
 from lavt.safety.gate import ACTIVE
 from lavt.safety.limits import LIMITS
-from lavt.transport.emulation.impairment import Port
+from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
-from lavt.transport.netem.netem import Netem
+from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.rendezvous.forwarder import FlowName
 from lavt.transport.rendezvous.link import RendezvousLink
 from lavt.transport.udp_link import UdpLink
@@ -169,19 +169,19 @@ class Side:
                 self._writer.close()
 
 
-def _queues(config: ServerConfig | ClientConfig) -> Netem | None:
+def _queues(config: ServerConfig | ClientConfig) -> NetemInterface | None:
     """Give the queues of the configured interface; raises `UserError` where nothing could be applied to it."""
     if not config.injection.interface:
         return None
-    netem = Netem(config.injection.interface)
+    netem = NetemInterface(config.injection.interface)
     for sentence in netem.check():
         console.say(sentence)
     return netem
 
 
-def _never_delayed(config: ServerConfig | ClientConfig) -> list[Port]:
+def _never_delayed(config: ServerConfig | ClientConfig) -> list[ExemptPort]:
     port = config.clock.probe_port
-    return [Port("udp", port, "the clock probe")] if port else []
+    return [ExemptPort("udp", port, "the clock probe")] if port else []
 
 
 def run_side(
@@ -197,7 +197,7 @@ def run_side(
 
     Before it ends a client releases the vehicle, and a server stops it; a second Ctrl-C does not wait for that.
     """
-    narrator = Narrator(side.name if session is not None else "")
+    narrator = SessionLog(side.name if session is not None else "")
     with console.until_told() as told:
         runtime = side.start(nodes)
         if as_json:
@@ -214,7 +214,7 @@ def run_side(
         raise WorkError(f"stopped because a part failed: {runtime.failed}")
 
 
-def _tell(side: Side, narrator: Narrator, session: ClientSession | None, *, as_json: bool, last: str = "") -> None:
+def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as_json: bool, last: str = "") -> None:
     """Print what is new, and `last` at the very end; as JSON also how everything is."""
     for heard, at in side.tap.take_heard():
         if isinstance(heard, State):
@@ -235,7 +235,7 @@ def _tell(side: Side, narrator: Narrator, session: ClientSession | None, *, as_j
         console.show(line)
 
 
-def _release(side: Side, told: console.Told, session: ClientSession) -> str:
+def _release(side: Side, told: console.StopEvent, session: ClientSession) -> str:
     """Release the vehicle while the link is open: it stops at once, and somebody else may have it."""
     if not session.holds:
         return "the client ends; it held no vehicle"
@@ -244,7 +244,7 @@ def _release(side: Side, told: console.Told, session: ClientSession) -> str:
     return release_words(released=session.released)
 
 
-def _stop_vehicle(side: Side, told: console.Told) -> str:
+def _stop_vehicle(side: Side, told: console.StopEvent) -> str:
     """Stop the vehicle, and wait until it stands."""
     side.tell("server_ends", None)
     _wait(side, told, STOP_S, lambda: _moves_mps(side) is None)
@@ -258,7 +258,7 @@ def _moves_mps(side: Side) -> float | None:
     return speed_mps if status.get("safety") in ACTIVE or abs(speed_mps) >= LIMITS.standstill_mps else None
 
 
-def _wait(side: Side, told: console.Told, limit_s: float, done: Callable[[], bool]) -> None:
+def _wait(side: Side, told: console.StopEvent, limit_s: float, done: Callable[[], bool]) -> None:
     """Wait until it is done, but not for long, and not for whom is told once more to end."""
     end_ns = side.clock.now().mono_ns + round(limit_s * NS_PER_S)
     while not done() and side.clock.now().mono_ns < end_ns and not told.wait(LOOK_S):

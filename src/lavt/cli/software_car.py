@@ -28,7 +28,7 @@ from lavt.runtime import process_priority
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.road.road import load_road
-from lavt.vehicle.software_car.event_log import News
+from lavt.vehicle.software_car.event_log import KitEvent
 from lavt.vehicle.software_car.runner import Runner
 
 LONGEST_LINE: Final = 1000
@@ -73,7 +73,7 @@ def software_car(
         with console.until_told() as told, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
             speaker.setblocking(False)
             _show_ready(profile, dbw, as_json=as_json)
-            _live(runner, clock, told, Lines(), tell, lambda datagram: _send(speaker, truth, datagram))
+            _live(runner, clock, told, InputLines(), tell, lambda datagram: _send(speaker, truth, datagram))
     finally:
         port.close()
     if as_json:
@@ -84,9 +84,9 @@ def software_car(
 def _live(
     runner: Runner,
     clock: MachineClock,
-    told: console.Told,
-    lines: Lines,
-    tell: Callable[[News], None],
+    told: console.StopEvent,
+    lines: InputLines,
+    tell: Callable[[KitEvent], None],
     send: Callable[[bytes], None],
 ) -> None:
     """Let the car live until told to stop."""
@@ -103,7 +103,7 @@ def _live(
             runner.act(line, clock.now().mono_ns)
 
 
-class Lines:
+class InputLines:
     """Lines on standard input, as long as there is one; in the background nobody reads the terminal."""
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class Lines:
         self._begun = b""
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
 
-    def wait(self, told: console.Told, pause_s: float) -> list[str]:
+    def wait(self, told: console.StopEvent, pause_s: float) -> list[str]:
         """Wait for lines, at most so long."""
         if not self._is_open:
             told.wait(pause_s)
@@ -151,14 +151,14 @@ def _show_ready(profile: Profile, dbw: DbwConfig, *, as_json: bool) -> None:
     )
 
 
-def _tell_json(news: News) -> None:
+def _tell_json(news: KitEvent) -> None:
     console.show_json({"mono_ns": news.mono_ns, "kind": news.kind, "text": news.text})
 
 
-def _tell_in_words(start_ns: int) -> Callable[[News], None]:
+def _tell_in_words(start_ns: int) -> Callable[[KitEvent], None]:
     """Tell news with the time since the start."""
 
-    def tell(news: News) -> None:
+    def tell(news: KitEvent) -> None:
         at = "" if news.kind == "help" else f"{(news.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
         console.show(f"{at}{news.text}")
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.cli import console
-from lavt.cli.watch_nodes import Sender, Watched
+from lavt.cli.watch_nodes import Sender, WatchNodes
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
@@ -61,7 +61,7 @@ def watch(
     """
     process_priority.take()
     only_from = None if sent_from is None else look_up("--from", sent_from)
-    clock, watched = MachineClock(), Watched(sender, reorder_hold_ms)
+    clock, watched = MachineClock(), WatchNodes(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, watched.nodes, watched, lambda: None)
     link = UdpLink(clock, "rtp", runtime.deliver, bind=(bind, port), only_from=only_from)
     with closing(link), console.until_told() as told:
@@ -88,7 +88,7 @@ def watch(
         console.say("no stamp was accepted: is there one in the pictures, and is --sender what it should be?")
 
 
-def _seconds(clock: MachineClock, told: console.Told, limit_s: int | None) -> Iterator[int]:
+def _seconds(clock: MachineClock, told: console.StopEvent, limit_s: int | None) -> Iterator[int]:
     """Count the seconds as they end, up to the limit or until told."""
     begin_ns = clock.now().mono_ns
     for number in count(1) if limit_s is None else range(1, limit_s + 1):

@@ -13,7 +13,7 @@ from lavt.nodes.payloads import PictureRead
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.receiver import ReceiverNode
 from lavt.nodes.watcher import WatcherNode
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.reception_stats import ReceptionSample
 from lavt.transport.rtp.rtp import Depacketizer
 from lavt.transport.video.frame_codec import VideoReceiver
@@ -24,13 +24,13 @@ from lavt.transport.video.stamp_check import LearnedBase
 Sender = Literal["lavt", "foreign"]
 
 
-class Watched:
+class WatchNodes:
     """A receiver without a path, so that it sends nothing, a watcher, and the recorder that both report to."""
 
     def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
         self._reader = _reader(sender)
         hold_ns = None if reorder_hold_ms is None else reorder_hold_ms * NS_PER_MS
-        self._receiver = ReceiverNode(ReorderBuffer(hold_ns), Depacketizer())
+        self._receiver = ReceiverNode(JitterBuffer(hold_ns), Depacketizer())
         self.nodes = (self._receiver, WatcherNode(self._reader))
         self._latencies_ms = array("d")
         self._jitter_us = 0

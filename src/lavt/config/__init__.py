@@ -14,7 +14,7 @@ from lavt.config.dbw import DbwConfig as DbwConfig
 from lavt.config.injection import ClientInjectionConfig as ClientInjectionConfig
 from lavt.config.injection import Condition as Condition
 from lavt.config.injection import FlowChanges as FlowChanges
-from lavt.config.injection import Impairment as Impairment
+from lavt.config.injection import ImpairmentConfig as ImpairmentConfig
 from lavt.config.injection import InjectionConfig as InjectionConfig
 from lavt.config.injection import LinkConfig as LinkConfig
 from lavt.config.injection import ServerInjectionConfig as ServerInjectionConfig

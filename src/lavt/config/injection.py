@@ -38,7 +38,7 @@ class ClientInjectionConfig(InjectionConfig):
     state_delay: Literal["none", "with_video"] = "none"
 
 
-class Impairment(Section):
+class ImpairmentConfig(Section):
     """What the network does to a flow beside a constant delay; see `docs/network.md`."""
 
     jitter_ms: float = Field(0.0, ge=0, le=10_000)
@@ -64,7 +64,7 @@ class Impairment(Section):
         return self.trace.endswith(".csv")
 
 
-class LinkConfig(Impairment):
+class LinkConfig(ImpairmentConfig):
     """What is injected into one direction of a relayed flow, as a condition has it."""
 
     delay_ms: float = Field(0.0, ge=0, le=60_000)
@@ -89,11 +89,11 @@ class FlowChanges(Section):
         """What is asked for instead of what the condition says."""
         return self.model_dump(exclude_none=True)
 
-    def of(self, delay_ms: float, impairment: Impairment) -> tuple[float, Impairment]:
+    def of(self, delay_ms: float, impairment: ImpairmentConfig) -> tuple[float, ImpairmentConfig]:
         """Give delay and impairment as changed."""
         given = self.given
         delay_ms = given.pop("delay_ms", delay_ms)
-        return delay_ms, Impairment(**{**impairment.model_dump(), **given})
+        return delay_ms, ImpairmentConfig(**{**impairment.model_dump(), **given})
 
 
 class Condition(Section):
@@ -101,11 +101,11 @@ class Condition(Section):
 
     video_ms: float = Field(ge=0, le=60_000)
     control_ms: float = Field(ge=0, le=60_000)
-    video: Impairment = Impairment()
-    control: Impairment = Impairment()
+    video: ImpairmentConfig = ImpairmentConfig()
+    control: ImpairmentConfig = ImpairmentConfig()
 
     @property
-    def flows(self) -> dict[str, tuple[float, Impairment]]:
+    def flows(self) -> dict[str, tuple[float, ImpairmentConfig]]:
         """The delay of each flow, and what else happens to it."""
         return {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
 

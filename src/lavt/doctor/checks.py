@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final, Literal
 
-from lavt.doctor.clock_checks import WHAT_TO_DO, Finding, check_host
+from lavt.doctor.clock_checks import WHAT_TO_DO, ClockComparison, check_host
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, State
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
@@ -53,7 +53,7 @@ class CodecTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class CameraSample:
     """What a camera gave: when each picture came, and of how many was known when it was taken."""
 
     came_ns: Sequence[int]
@@ -61,7 +61,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class StateSample:
     """What came on the state's key within `seconds` of the first: states, and how often what could not be read."""
 
     states: Sequence[State] = ()
@@ -130,7 +130,7 @@ def check_by_wire(heard: int, hindrance: str, *, name: str) -> Check:
     return Check("by wire", "ok", f"{found}, every report of the profile among them", measured={"frames": heard})
 
 
-def check_camera(seen: Seen | str, *, name: str, size: str, rate_hz: float) -> Check:
+def check_camera(seen: CameraSample | str, *, name: str, size: str, rate_hz: float) -> Check:
     """Compare the rate at which pictures came with what is configured; a text says why none can come."""
     if isinstance(seen, str):
         do = "put that right, or end what has the camera: `lavt server` does not start like this (docs/camera.md)"
@@ -275,7 +275,7 @@ def check_link(routers: Routers | None, *, heard: bool) -> Check:
     return Check(name, "ok", found, measured=measured)
 
 
-def check_vehicle(heard: Heard, vehicle: str, version: str) -> Check:
+def check_vehicle(heard: StateSample, vehicle: str, version: str) -> Check:
     """Judge by the states that came whether the vehicle's server is there and understood; nobody takes the vehicle."""
     states = len(heard.states)
     rate_hz = states / heard.seconds
@@ -300,7 +300,7 @@ def check_vehicle(heard: Heard, vehicle: str, version: str) -> Check:
     return Check("vehicle", "ok", found, measured=measured)
 
 
-def check_probe(finding: Finding | None, host: str, port: int) -> Check:
+def check_probe(finding: ClockComparison | None, host: str, port: int) -> Check:
     """Judge the clocks of both machines by probes; None: nobody answered."""
     measured: dict[str, Any] = {"host": host, "port": port}
     if finding is None:

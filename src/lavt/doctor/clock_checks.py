@@ -23,7 +23,7 @@ WHAT_TO_DO = {
 
 
 @dataclass(frozen=True, slots=True)
-class Opinion:
+class ClockEstimate:
     """What somebody says of Delta, and how wrong it can be."""
 
     ms: float
@@ -31,21 +31,21 @@ class Opinion:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ClockComparison:
     """What was found, and whether it will do for a run between two machines."""
 
     good: bool
     says: tuple[str, ...]
-    sources: Opinion | None = None
-    probe: Opinion | None = None
+    sources: ClockEstimate | None = None
+    probe: ClockEstimate | None = None
     round_trip_ms: float | None = None
 
 
-def check_host(report: ClockReport) -> Finding:
+def check_host(report: ClockReport) -> ClockComparison:
     """Tell how this host's clock is."""
     if report.correction_s is None or report.bound_s is None:
         hint = WHAT_TO_DO.get(report.status)
-        return Finding(False, (f"{report.status}: {hint}" if hint else report.status,))
+        return ClockComparison(False, (f"{report.status}: {hint}" if hint else report.status,))
     bound_ms = report.bound_s * 1e3
     reference = (
         f"follows {report.follows}" if report.follows else report.status or "follows a source without an address"
@@ -55,12 +55,12 @@ def check_host(report: ClockReport) -> Finding:
         f"{report.correction_s * 1e3:+.3f} ms, which is known to {bound_ms:.3f} ms"
     )
     good = bound_ms <= CLOCK_BOUND_LIMIT_MS
-    return Finding(good, (words,) if good else (words, _too_wide(bound_ms)))
+    return ClockComparison(good, (words,) if good else (words, _too_wide(bound_ms)))
 
 
 def compare(
     before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str
-) -> Finding:
+) -> ClockComparison:
     """Tell how this host's clock is against that of a server at the address `server` that answered these probes.
 
     `before` and `report` are what this host's source said before and after the probing: the second counts. The
@@ -68,9 +68,11 @@ def compare(
     """
     possible = [probe for probe in probes if probe.round_trip_ns >= 0]
     if not possible:
-        return Finding(False, ("no answer can be used: a clock was set during each, so ask again when none is set",))
+        return ClockComparison(
+            False, ("no answer can be used: a clock was set during each, so ask again when none is set",)
+        )
     best = min(possible, key=lambda probe: probe.round_trip_ns)
-    probe = Opinion(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
+    probe = ClockEstimate(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
     sources = _by_sources(before, report, latest, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
     says = [check_host(report).says[0]]
@@ -99,10 +101,10 @@ def compare(
     used = sources or probe
     if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
         complaints.append(_too_wide(used.bound_ms))
-    return Finding(not complaints, (*says, *complaints), sources, probe, round_trip_ms)
+    return ClockComparison(not complaints, (*says, *complaints), sources, probe, round_trip_ms)
 
 
-def _by_sources(before: ClockReport, report: ClockReport, latest: ProbeReply, server: str) -> Opinion | None:
+def _by_sources(before: ClockReport, report: ClockReport, latest: ProbeReply, server: str) -> ClockEstimate | None:
     known = (report.correction_s, report.bound_s, latest.correction_s, latest.bound_s)
     if before.correction_s is None or known[0] is None or known[1] is None or known[2] is None or known[3] is None:
         return None
@@ -111,7 +113,7 @@ def _by_sources(before: ClockReport, report: ClockReport, latest: ProbeReply, se
     path_s = delay_s / 2 + dispersion_s + (skew_ppm / 1e6 * age_s if age_s else 0.0)
     bound_s = min(known[1], path_s) if report.follows == server else known[1] + known[3]
     moved_s = abs(known[0] - before.correction_s)
-    return Opinion((known[0] - known[2]) * 1e3, (bound_s + moved_s) * 1e3)
+    return ClockEstimate((known[0] - known[2]) * 1e3, (bound_s + moved_s) * 1e3)
 
 
 def _path_complaints(report: ClockReport, round_trip_ms: float, server: str) -> list[str]:

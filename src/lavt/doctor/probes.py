@@ -23,14 +23,14 @@ from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.security import cipher_of, door_of
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
-from lavt.doctor.checks import SHOWN, CodecTimes, Heard, Seen
+from lavt.doctor.checks import SHOWN, CameraSample, CodecTimes, StateSample
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, Picture, State
 from lavt.errors import BadMessage, LavtError, UserError, WorkError
 from lavt.streams import stream
 from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, want_arrival_times
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.messages import decode
-from lavt.transport.netem.netem import Netem, run_tc
+from lavt.transport.netem.netem import NetemInterface, run_tc
 from lavt.transport.security.gateway import Carry
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
 from lavt.transport.zenoh_link import ZenohLink
@@ -98,7 +98,7 @@ def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
         yield cast("Picture", cv2.add(seen, np.roll(noise, 37 * number, axis=0)))
 
 
-def camera_seen(config: ServerConfig, clock: MachineClock) -> Seen | str:
+def camera_seen(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
     """Take what the camera that is plugged in gives in two seconds; a text says why it gives nothing."""
     try:
         camera = build_device(config)
@@ -111,7 +111,7 @@ def camera_seen(config: ServerConfig, clock: MachineClock) -> Seen | str:
             if camera.wait(left_ns / NS_PER_S) and (frame := camera.capture(0, clock.now().mono_ns, None)):
                 came_ns.append(clock.now().mono_ns)
                 timed += frame.capture_ns is not None
-    return Seen(came_ns, timed)
+    return CameraSample(came_ns, timed)
 
 
 def receive_buffer_bytes() -> int:
@@ -174,7 +174,7 @@ def netem_refusal(interface: str) -> str:
         for queue in (("handle", "1:", "prio"), ("netem", "delay", "1ms")):
             run_tc([*apart, *queue])
         if interface:
-            Netem(interface).check()
+            NetemInterface(interface).check()
     except LavtError as error:
         return str(error)
     return ""
@@ -208,7 +208,7 @@ class Listener:
         if channel == "state":
             self._behind.put(payload)
 
-    def hear(self, link: ZenohLink, clock: MachineClock) -> Heard:
+    def hear(self, link: ZenohLink, clock: MachineClock) -> StateSample:
         """Listen for the vehicle's state: some seconds for the first, and one second from there."""
         self._carry = link.send
         link.start()
@@ -228,7 +228,7 @@ class Listener:
                 unreadable[str(error)] += 1
         if self._outside and not states and not unreadable:
             unreadable.update(self._door.counts or {"nothing of it gets through": self._outside})
-        return Heard(states, dict(unreadable), STATES_NS / NS_PER_S)
+        return StateSample(states, dict(unreadable), STATES_NS / NS_PER_S)
 
 
 def key_files(section: Any) -> list[tuple[str, Path, bool]]:

@@ -9,8 +9,8 @@ from typing import Literal
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
-from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Rest, Route
-from lavt.safety.gate import ACTIVE, SafetyGate, Verdict
+from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, StationaryStatus
+from lavt.safety.gate import ACTIVE, CommandVerdict, SafetyGate
 from lavt.transport.messages import decode, encode
 from lavt.value import value
 from lavt.vehicle.camera import FrameTimes
@@ -36,7 +36,7 @@ ENDINGS: dict[str, Ending] = {
 
 
 @value
-class Received:
+class ReceivedCommand:
     """A command as it came in."""
 
     command: Command
@@ -49,12 +49,12 @@ class Received:
 
 
 @value
-class Judged:
+class JudgedCommand:
     """A command with what was decided on it."""
 
-    received: Received
+    received: ReceivedCommand
     stamp_ns: int
-    verdict: Verdict
+    verdict: CommandVerdict
     limited: tuple[str, ...] = ()
 
 
@@ -90,7 +90,7 @@ class ActuatorNode:
         self._look_ns = start_ns
         self._pose_wanted = True
         self._ending: str | None = None
-        self._rest: Rest | None = None
+        self._rest: StationaryStatus | None = None
         self._driving = False
         self._limited: tuple[str, ...] = ()
         self._refused_ns = start_ns
@@ -124,28 +124,28 @@ class ActuatorNode:
 
     # A command comes.
 
-    def _decode(self, message: Message, _now: Now) -> Received | None:
+    def _decode(self, message: Message, _now: Now) -> ReceivedCommand | None:
         try:
-            return Received(decode(Command, message.payload), message.arrived)
+            return ReceivedCommand(decode(Command, message.payload), message.arrived)
         except BadMessage:
             self._counts["commands_unreadable"] += 1
             return None
 
-    def _admit(self, received: Received, _now: Now) -> Judged:
+    def _admit(self, received: ReceivedCommand, _now: Now) -> JudgedCommand:
         verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
         if not verdict.obeyed:
             self._refused_ns = received.arrived.mono_ns
-        return Judged(received, received.stamp_ns, verdict)
+        return JudgedCommand(received, received.stamp_ns, verdict)
 
-    def _apply(self, judged: Judged, now: Now) -> Judged:
+    def _apply(self, judged: JudgedCommand, now: Now) -> JudgedCommand:
         if not judged.verdict.obeyed:
             return judged
         self._act(now.mono_ns)
         self._applied.append((now.mono_ns, judged.received.command.sequence, judged.stamp_ns))
         self._limited = self.gate.limiter.changed
-        return Judged(judged.received, judged.stamp_ns, judged.verdict, self._limited)
+        return JudgedCommand(judged.received, judged.stamp_ns, judged.verdict, self._limited)
 
-    def _report(self, judged: Judged, now: Now) -> list[Send]:
+    def _report(self, judged: JudgedCommand, now: Now) -> list[Send]:
         command, arrived = judged.received.command, judged.received.arrived
         obeyed = judged.verdict.obeyed
         self._counts["commands_limited"] += bool(judged.limited)
@@ -233,7 +233,7 @@ class ActuatorNode:
         if told:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
-            rest = Rest(self.gate.at_rest(self.vehicle.state()), self.gate.holder)
+            rest = StationaryStatus(self.gate.at_rest(self.vehicle.state()), self.gate.holder)
             if rest != self._rest:
                 self._rest = rest
                 sends.append(Send("rest", rest))

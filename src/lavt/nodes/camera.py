@@ -25,7 +25,7 @@ REMEMBERED_POSES = 512
 
 
 @value
-class Stamped:
+class StampedFrame:
     """A picture with its send time in its pixels."""
 
     frame: CapturedFrame
@@ -36,10 +36,10 @@ class Stamped:
 
 
 @value
-class Encoded:
+class EncodedFrame:
     """A stamped picture as H.264."""
 
-    stamped: Stamped
+    stamped: StampedFrame
     stamp_ns: int
     access_unit: bytes
 
@@ -135,7 +135,7 @@ class CameraNode:
         """Do what can be done before the time of the stamp begins, a checksum of the picture among it."""
         return frame, *self._pictures.prepare(frame.picture)
 
-    def _stamp(self, checked: tuple[CapturedFrame, Sight, int], now: Now) -> Stamped:
+    def _stamp(self, checked: tuple[CapturedFrame, Sight, int], now: Now) -> StampedFrame:
         frame, prepared, pixel_crc = checked
         stamp_ns = now.wall_ns
         if stamp_ns > self._highest_stamp_ns:
@@ -145,9 +145,9 @@ class CameraNode:
                 stamp_ns += 1
             self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)
         self._stamps.append(stamp_ns)
-        return Stamped(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(prepared, stamp_ns))
+        return StampedFrame(frame, pixel_crc, stamp_ns, now.mono_ns, self._pictures.write_stamp(prepared, stamp_ns))
 
-    def _encode(self, stamped: Stamped, now: Now) -> Encoded:
+    def _encode(self, stamped: StampedFrame, now: Now) -> EncodedFrame:
         paused = now.mono_ns - self._keyframe_ns < KEYFRAME_PAUSE_NS
         keyframe = self._keyframe_wanted and not paused
         limit_bps = self._stream.bit_rate_limit_bps
@@ -157,9 +157,9 @@ class CameraNode:
         if keyframe:
             self._keyframe_wanted, self._keyframe_ns = False, now.mono_ns
             self._counts["keyframes_on_request"] += 1
-        return Encoded(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
+        return EncodedFrame(stamped, stamped.stamp_ns, self._pictures.encode(stamped.picture, keyframe=keyframe))
 
-    def _packetize(self, encoded: Encoded, now: Now) -> list[Send]:
+    def _packetize(self, encoded: EncodedFrame, now: Now) -> list[Send]:
         stamped, unit = encoded.stamped, encoded.access_unit
         packets = self._stream.packets(unit, encoded.stamp_ns, now)
         proven = self._path.open_address(now.mono_ns)

@@ -13,7 +13,7 @@ from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight,
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.client_session import ClientSession
-from lavt.nodes.payloads import LaneSeen, PathToken, View
+from lavt.nodes.payloads import DecodedFrame, LaneSeen, PathToken
 from lavt.nodes.picture_reader import PictureReader
 from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
@@ -23,7 +23,7 @@ OperatorAsks = Literal["emergency_stop", "release"]
 """What a person beside the client can ask for, on the channel `operator`."""
 
 
-class Detector(Protocol):
+class LaneDetection(Protocol):
     """Finds the lane in one picture after another."""
 
     def forget(self) -> None:
@@ -36,10 +36,10 @@ class Detector(Protocol):
 
 
 @value
-class Seen:
+class PerceivedFrame:
     """A view and the lane that perception found in it."""
 
-    view: View
+    view: DecodedFrame
     stamp_ns: int
     lane: Lane
 
@@ -56,7 +56,7 @@ class DriverNode:
     def __init__(
         self,
         reader: PictureReader,
-        detector: Detector,
+        detector: LaneDetection,
         controller: DriveController,
         session: ClientSession,
         limits: ClientLimits,
@@ -69,7 +69,7 @@ class DriverNode:
         self._watch = LaneWatch()
         self._limits = limits
         self._sequence = 0
-        self._view: View | None = None
+        self._view: DecodedFrame | None = None
         self._view_ns = 0
         self._looked_at_ns = 0
         self._decision: Decision | None = None
@@ -101,23 +101,23 @@ class DriverNode:
 
     # A picture is looked at.
 
-    def _perceive(self, message: Message, _now: Now) -> Seen:
-        view: View = message.payload
+    def _perceive(self, message: Message, _now: Now) -> PerceivedFrame:
+        view: DecodedFrame = message.payload
         since_last_ns = view.stamp_ns - self._looked_at_ns
         self._looked_at_ns = view.stamp_ns
         # After a stop or a gap, what lies where the lane was may be another one. A gap is one between
         # the times at which pictures were sent, as the car went on; of a clock put back nobody knows how long.
         if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
             self._detector.forget()
-        return Seen(view, view.stamp_ns, self._detector.detect(view.received.picture))
+        return PerceivedFrame(view, view.stamp_ns, self._detector.detect(view.received.picture))
 
-    def _decide(self, seen: Seen, now: Now) -> Seen:
+    def _decide(self, seen: PerceivedFrame, now: Now) -> PerceivedFrame:
         self._lane_says = self._watch.check(seen.lane.confidence, now.mono_ns)
         self._decision = self._controller.decide(seen.lane, self._speed_mps, now.mono_ns)
         self._view, self._view_ns = seen.view, now.mono_ns
         return seen
 
-    def _command_now(self, seen: Seen, now: Now) -> list[Send]:
+    def _command_now(self, seen: PerceivedFrame, now: Now) -> list[Send]:
         return [*self._command(now), Send("lane", LaneSeen(seen.stamp_ns, seen.lane))]
 
     # A command is due.

@@ -14,10 +14,10 @@ from typing import Literal
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError
 from lavt.node import WAKE, Hop, Message, Peer, Send
-from lavt.nodes.payloads import InjectionSample, Rest
-from lavt.transport.emulation.impairment import Flow, Law, check_flows
+from lavt.nodes.payloads import InjectionSample, StationaryStatus
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment, check_flows
 from lavt.transport.messages import decode, encode
-from lavt.transport.netem.injector import Inject, Injected
+from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
@@ -34,14 +34,14 @@ class _Queues:
     """What this machine's queues were told, and whether they do it."""
 
     def __init__(self) -> None:
-        self.flows: tuple[Flow, ...] = ()
+        self.flows: tuple[ImpairedFlow, ...] = ()
         self.condition = ""
         self.in_force = False
         self.again_ns: int | None = None
         """When the order is given again: to measure what is in force, or because it failed."""
         self._number = 0
 
-    def tell(self, condition: str, flows: tuple[Flow, ...]) -> list[Send]:
+    def tell(self, condition: str, flows: tuple[ImpairedFlow, ...]) -> list[Send]:
         self.condition, self.flows, self.in_force, self.again_ns = condition, flows, False, None
         self._number += 1
         return self._inject()
@@ -52,7 +52,7 @@ class _Queues:
         self.again_ns = None  # set anew by the answer
         return self._inject() if self.in_force else self.tell(self.condition, self.flows)
 
-    def note(self, done: Injected, now: Now) -> list[Send] | None:
+    def note(self, done: InjectionResult, now: Now) -> list[Send] | None:
         """Take in what became of the newest order; None where it was an older one."""
         if done.number != self._number:
             return None
@@ -74,7 +74,7 @@ class _Queues:
         ]
 
     def _inject(self) -> list[Send]:
-        return [Send("inject", Inject(self._number, self.condition, self.flows))]
+        return [Send("inject", InjectionOrder(self._number, self.condition, self.flows))]
 
 
 @value
@@ -108,7 +108,7 @@ class InjectionNode:
         self._control = control
         self._queues = _Queues()
         self._lease: Lease | None = None
-        self._rest = Rest(False, None)
+        self._rest = StationaryStatus(False, None)
         self._waiting: deque[Peer] = deque(maxlen=QUESTIONS_KEPT)
         self.chains: Mapping[str, Sequence[Hop]] = {
             "netem": (("answer", self._answer),),
@@ -156,8 +156,8 @@ class InjectionNode:
             return str(error)
         return ""
 
-    def _flows(self, request: NetemRequest) -> tuple[Flow, ...]:
-        video = Law(
+    def _flows(self, request: NetemRequest) -> tuple[ImpairedFlow, ...]:
+        video = Impairment(
             request.delay_ms,
             request.jitter_ms,
             request.jitter_correlation,
@@ -168,8 +168,8 @@ class InjectionNode:
             request.reorder,
         )
         return (
-            Flow("video", "udp", self._video_port, "source", video),
-            Flow("state", *self._control, "source", Law(request.state_delay_ms)),
+            ImpairedFlow("video", "udp", self._video_port, "source", video),
+            ImpairedFlow("state", *self._control, "source", Impairment(request.state_delay_ms)),
         )
 
     def _note_rest(self, message: Message, _now: Now) -> list[Send]:
@@ -180,7 +180,7 @@ class InjectionNode:
         return self._end_lease()
 
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
-        done: Injected = message.payload
+        done: InjectionResult = message.payload
         sends = self._queues.note(done, now)
         if sends is None:
             return []
@@ -218,8 +218,8 @@ class InjectionClient:
         instance: int,
         *,
         condition: str,
-        control: Flow,
-        video: Law,
+        control: ImpairedFlow,
+        video: Impairment,
         state_delay_ms: float,
         start_ns: int,
     ) -> None:
@@ -252,7 +252,7 @@ class InjectionClient:
         return [*sends, Send("netem", self.request)] if self._queues.in_force else sends
 
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
-        done: Injected = message.payload
+        done: InjectionResult = message.payload
         sends = self._queues.note(done, now) or []
         if done.because:
             self.counts["netem_failed"] += 1

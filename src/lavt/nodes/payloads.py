@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lavt.domain import Lane
-from lavt.transport.video.frame_codec import Received
+from lavt.transport.video.frame_codec import ReceivedPicture
 from lavt.value import value
 
 
@@ -41,12 +41,12 @@ class ReceivedUnit:
 
 
 @value
-class View:
+class DecodedFrame:
     """A decoded picture with a stamp that could be read."""
 
     stamp_ns: int
     read_wall_ns: int
-    received: Received
+    received: ReceivedPicture
 
 
 @value
@@ -137,7 +137,7 @@ class PathToken:
 
 
 @value
-class Rest:
+class StationaryStatus:
     """Whether the vehicle stands and nobody drives it, and who holds it."""
 
     at_rest: bool

@@ -8,18 +8,18 @@ from collections.abc import Callable, Sequence
 from lavt.domain import Now
 from lavt.errors import BadPacket
 from lavt.node import Hop, Message, Send
-from lavt.nodes.payloads import PictureRead, ReceivedUnit, VideoUnit, View
-from lavt.transport.video.frame_codec import PictureReceiver, Received
+from lavt.nodes.payloads import DecodedFrame, PictureRead, ReceivedUnit, VideoUnit
+from lavt.transport.video.frame_codec import PictureReceiver, ReceivedPicture
 from lavt.transport.video.stamp import stamp_agrees
 from lavt.value import value
 
 
 @value
-class Decoded:
+class DecodedUnit:
     """A received access unit and the picture that came of it."""
 
     unit: ReceivedUnit
-    picture: Received | None
+    picture: ReceivedPicture | None
     decoded_mono_ns: int
 
 
@@ -27,7 +27,7 @@ class Decoded:
 class StampRead:
     """A decoded picture with its stamp; 0 where it could not be read."""
 
-    decoded: Decoded
+    decoded: DecodedUnit
     stamp_ns: int
     reason: str
 
@@ -55,15 +55,15 @@ class PictureReader:
         self._reads_doubtful = reads_doubtful
         self._in_doubt = True
 
-    def _decode(self, message: Message, now: Now) -> Decoded:
+    def _decode(self, message: Message, now: Now) -> DecodedUnit:
         unit: ReceivedUnit = message.payload
         picture = self._pictures.decode(unit.data)
         whole = unit.complete and picture is not None and not picture.corrupt
         self._in_doubt = not whole or (self._in_doubt and not unit.keyframe)
-        return Decoded(unit, picture, now.mono_ns)
+        return DecodedUnit(unit, picture, now.mono_ns)
 
-    def _read_stamp(self, decoded: Decoded, now: Now) -> StampRead:
-        decoded = Decoded(decoded.unit, decoded.picture, now.mono_ns)
+    def _read_stamp(self, decoded: DecodedUnit, now: Now) -> StampRead:
+        decoded = DecodedUnit(decoded.unit, decoded.picture, now.mono_ns)
         if decoded.picture is None:
             return StampRead(decoded, 0, "no picture")
         if self._in_doubt and not self._reads_doubtful:
@@ -97,5 +97,5 @@ class PictureReader:
         if decoded.picture is None or decoded.picture.corrupt:
             sends.append(Send("picture_lost", None))
         if decoded.picture is not None and readable:
-            sends.append(Send("view", View(read.stamp_ns, now.wall_ns, decoded.picture)))
+            sends.append(Send("view", DecodedFrame(read.stamp_ns, now.wall_ns, decoded.picture)))
         return sends

@@ -10,7 +10,7 @@ from lavt.errors import BadPacket
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.nodes.payloads import PathToken, ReceivedUnit
 from lavt.transport.rtp.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
-from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.reception_stats import Reception
 from lavt.transport.rtp.rtcp import is_rtcp, max_bit_rate, parse_announcement, picture_loss, receiver_report
 from lavt.transport.rtp.rtp import Depacketizer, parse_packet
@@ -41,7 +41,7 @@ class ReceiverNode:
 
     def __init__(
         self,
-        reorder: ReorderBuffer,
+        reorder: JitterBuffer,
         depacketizer: Depacketizer,
         max_bit_rate_bps: int | None = None,
         new_cipher: NewCipher = plain_cipher,

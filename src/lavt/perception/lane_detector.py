@@ -47,7 +47,7 @@ LEFT_AT_WIDTHS = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class DetectionTrace:
     """What one picture gave, step by step: for whoever wants to look at it."""
 
     mask: Mask
@@ -84,7 +84,7 @@ class LaneDetector:
         self._shape = (known.height_px, known.width_px, 3)
         self._scale = known.scale
         self.view = bird_eye(known, grid, stamped=stamped)
-        self.sight: Sight | None = None
+        self.sight: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER
@@ -112,16 +112,18 @@ class LaneDetector:
                 self.forget()
         return self._lane
 
-    def _near_last(self, mask: Mask, points: Points) -> Sight:
+    def _near_last(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
         fit = fit_lane(points, sides, self.view.grid, self._lane.width_m, self._lane.centre)
-        return Sight(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
+        return DetectionTrace(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
-    def _anywhere(self, mask: Mask, points: Points) -> Sight:
+    def _anywhere(self, mask: Mask, points: Points) -> DetectionTrace:
         grid = self.view.grid
         start = start_line(points, grid, self._lane_width_m)
         if start is None:
-            return Sight(mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None)
+            return DetectionTrace(
+                mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
+            )
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
         # The windows follow any curve, also that of a line which leads aside; the start is rough, but of all the paint.
         fits = (
@@ -130,7 +132,7 @@ class LaneDetector:
         )
         lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and stands_in(fit)]
         found = max(lanes, key=lambda fit: fit.confidence, default=None)
-        return Sight(mask, points, sides, start, self._lane_width_m, windows, found)
+        return DetectionTrace(mask, points, sides, start, self._lane_width_m, windows, found)
 
     def _followed(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
         return fit_lane(points, sides_near(points, centre, width_m), self.view.grid, width_m, centre)

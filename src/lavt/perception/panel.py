@@ -11,7 +11,7 @@ import numpy as np
 from lavt.domain import FloatArray, Lane, Picture
 from lavt.perception.bird_eye import BirdEye, GroundGrid
 from lavt.perception.calibration import CalibratedCamera, ground_to_picture, picture_points
-from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector, Sight
+from lavt.perception.lane_detector import TRACK_CONFIDENCE, DetectionTrace, LaneDetector
 from lavt.perception.lane_fit import CORRIDOR_M, WINDOW_M
 from lavt.perception.lane_pixels import edge_pixels, grey_of, lane_pixels, white_pixels, yellow_pixels
 
@@ -114,7 +114,7 @@ def _parallel(centre: tuple[float, float, float], offset_m: float, near_m: float
     return np.column_stack([x, centre[0] + (centre[1] + centre[2] * x) * x]) + offset_m * across
 
 
-def _points(sight: Sight, grid: GroundGrid) -> Picture:
+def _points(sight: DetectionTrace, grid: GroundGrid) -> Picture:
     """Draw whose point is whose, and the windows or corridors in which they were looked for."""
     drawn = np.zeros((*sight.mask.shape, 3), dtype=np.uint8)
     cells = np.round(_cells(np.column_stack([sight.points.x_m, sight.points.y_m]), grid)).astype(int)
@@ -139,7 +139,7 @@ def _points(sight: Sight, grid: GroundGrid) -> Picture:
     return drawn
 
 
-def _fitted(sight: Sight, lane: Lane, view: BirdEye) -> Picture:
+def _fitted(sight: DetectionTrace, lane: Lane, view: BirdEye) -> Picture:
     """Draw the lane of this picture alone over its marks, and the average's centre."""
     drawn = _grey_to_colour(sight.mask // 2)
     if sight.fit is not None:
@@ -169,7 +169,7 @@ def _lane_in(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
     return drawn
 
 
-def _words(sight: Sight, lane: Lane) -> Picture:
+def _words(sight: DetectionTrace, lane: Lane) -> Picture:
     """Write the confidence and what it is made of."""
     drawn = np.full((TILE_PX[1], TILE_PX[0], 3), 30, dtype=np.uint8)
     enough = lane.confidence >= TRACK_CONFIDENCE

@@ -24,7 +24,7 @@ class Timeline:
 
 
 @value
-class Walked:
+class PipelineResult:
     """What came of a message: what to send, when the node was done, and the timeline where there is a stamp."""
 
     sends: list[Send]
@@ -34,7 +34,7 @@ class Walked:
     """How many hops were called."""
 
 
-def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> Walked:
+def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
     """Call hop after hop; `ends`, asked after each, gives the time when it was done."""
     value: object = message
     now = start
@@ -50,4 +50,4 @@ def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, ends: Ite
     timeline = None
     if stamp_ns:
         timeline = Timeline(node, message.channel, stamp_ns, message.arrived.mono_ns, tuple(done))
-    return Walked(value if isinstance(value, list) else [], now, timeline, len(done) - 1)
+    return PipelineResult(value if isinstance(value, list) else [], now, timeline, len(done) - 1)

@@ -18,7 +18,7 @@ from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.inbox import Inbox
 from lavt.runtime.pipeline import walk
 from lavt.runtime.recorder import Recorder
-from lavt.runtime.wakeup import Bell
+from lavt.runtime.wakeup import WakeEvent
 from lavt.transport.clock_sync.clock_report import ClockReport
 
 SWITCH_INTERVAL_S = 0.0005
@@ -27,7 +27,7 @@ SWITCH_INTERVAL_S = 0.0005
 log = logging.getLogger(__name__)
 
 
-class Link(Protocol):
+class MessageLink(Protocol):
     """What carries messages to the other side."""
 
     def send(self, *sends: Send) -> None:
@@ -58,7 +58,7 @@ class RealRuntime:
         clock_source: Callable[[], ClockReport | None],
         elsewhere: Mapping[str, Receiver] = MappingProxyType({}),
     ) -> None:
-        self.links: dict[str, Link] = {}
+        self.links: dict[str, MessageLink] = {}
         self.failed: BaseException | None = None
         self.stopped = threading.Event()
         self._clock = clock
@@ -67,7 +67,7 @@ class RealRuntime:
         self._workers = {node.name: _Worker(self, node) for node in nodes}
         self._receivers: dict[str, Receiver] = {**elsewhere, **self._workers}
 
-    def start(self, links: Mapping[str, Link]) -> None:
+    def start(self, links: Mapping[str, MessageLink]) -> None:
         """Begin: from here on nodes are woken and messages delivered."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
@@ -161,7 +161,7 @@ class _Worker:
         self._runtime = runtime
         self._turn = threading.Lock()
         self._inbox_turn = threading.Lock()
-        self._bell = Bell()
+        self._bell = WakeEvent()
         self._wake_ns: int | None = 0
         """When the node wants to be woken, as it said when it was walked last; written by who has the turn."""
         self._sleeps_until_ns: int | None = 0

@@ -17,7 +17,7 @@ from lavt.domain import NS_PER_MS, Now
 from lavt.errors import WorkError
 from lavt.node import Message, Node, Peer, Send
 from lavt.runtime.pipe import Pipe
-from lavt.runtime.realtime import Link, RealRuntime
+from lavt.runtime.realtime import MessageLink, RealRuntime
 
 LATE_NS: Final = 60 * NS_PER_MS
 """A command that took longer from process to process is not obeyed: one of the two did not run meanwhile."""
@@ -30,7 +30,7 @@ Tell = tuple[Any, ...]
 topic, payload, when), ("note", what `note` gave), ("failed", why)."""
 
 
-class NodeElsewhere:
+class RemoteNodeProxy:
     """Stands for the node where the other nodes are: takes its messages, and does what its process tells."""
 
     def __init__(self, name: str, connection: Connection) -> None:
@@ -115,7 +115,7 @@ class _Outside:
         self._pipe.send(("deliver", message.channel, message.payload, message.arrived))
 
 
-class NodeHere:
+class NodeHost:
     """The node's process: a runtime of this node alone. `note` is asked before it sends, and told when it changed.
 
     `parted` is called when the other process has ended, or lets this one end.
@@ -133,7 +133,7 @@ class NodeHere:
         outside = _Outside(self._pipe, clock, self._look)
         receivers = {receiver for row in CHANNELS.values() for receiver in row.receivers} - {node.name}
         self.runtime = RealRuntime(clock, [node], outside, lambda: None, dict.fromkeys(receivers, outside))
-        self._links: dict[str, Link] = {row.carrier: outside for row in CHANNELS.values()}
+        self._links: dict[str, MessageLink] = {row.carrier: outside for row in CHANNELS.values()}
 
     def start(self) -> None:
         """Begin."""

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from typing import ClassVar, Literal
 
 from lavt.domain import Actuation, Command, Operation, SafetyState, SessionReply, SessionRequest, VehicleState
-from lavt.safety.issued_stamps import WrittenStamps
+from lavt.safety.issued_stamps import IssuedStamps
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import Limits
 from lavt.safety.path_follower import PathFollower
-from lavt.safety.takeover_requests import Claims
+from lavt.safety.takeover_requests import TakeoverRequests
 from lavt.value import value
 
 Trigger = Literal[
@@ -69,14 +69,14 @@ BECAUSE: dict[Trigger, str] = {
 
 
 @value
-class Verdict:
+class CommandVerdict:
     """What became of a command; `reason` is empty when it was obeyed."""
 
     obeyed: bool
     reason: str
 
 
-OBEYED = Verdict(True, "")
+OBEYED = CommandVerdict(True, "")
 
 NOT_ARMED = "the vehicle is not armed"
 NOT_STANDING = "arming needs standstill"
@@ -105,13 +105,13 @@ class SafetyGate:
     ) -> None:
         self.limits = limits
         self.limiter = limiter
-        self.written = WrittenStamps(limits.stamp_memory_ns, limits.frozen_frames)
+        self.written = IssuedStamps(limits.stamp_memory_ns, limits.frozen_frames)
         self.state: SafetyState = "disarmed"
         self.because = "nobody has armed the vehicle yet"
         self.refused = ""
         self.counts: Counter[str] = Counter()
         self.holder: tuple[str, int] | None = None
-        self.claims = Claims(ask_lapses_ns=limits.ask_lapses_ns, kept_ns=limits.kept_ns)
+        self.claims = TakeoverRequests(ask_lapses_ns=limits.ask_lapses_ns, kept_ns=limits.kept_ns)
         self.token = b""
         self.applied_sequence = -1
         self._new_epoch = new_epoch
@@ -223,7 +223,7 @@ class SafetyGate:
 
     # What is obeyed.
 
-    def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> Verdict:
+    def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> CommandVerdict:
         """Obey `command` or refuse it, at `now_ns`, when it was received."""
         self._feel(vehicle)
         self.watch(now_ns)  # a command that comes with the end of a silence comes too late
@@ -235,7 +235,7 @@ class SafetyGate:
                 self._trigger("arming broken")
             self.refused = f"{reason}: {vehicle.hindrance}" if reason == HINDERED else reason
             self.counts[f"refused: {reason}"] += 1
-            return Verdict(False, self.refused)
+            return CommandVerdict(False, self.refused)
         self._sequence = self.applied_sequence = command.sequence
         newer = self._newer(command)
         if newer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 
-class WrittenStamps:
+class IssuedStamps:
     """Remembers each stamp with its frame number, when it was written, and when its picture was taken.
 
     Times are of the server's monotonic clock.

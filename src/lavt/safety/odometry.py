@@ -17,7 +17,7 @@ CURVATURE_WITHIN_PER_M = 1.0
 
 
 @value
-class Fix:
+class PoseFix:
     """Where the rear axle was at a time, in the frame of the first fix, and how it went on from there."""
 
     mono_ns: int
@@ -26,11 +26,11 @@ class Fix:
     speed_mps: float
     curvature_per_m: float
 
-    def at(self, mono_ns: int) -> Fix:
+    def at(self, mono_ns: int) -> PoseFix:
         """Tell where it is at another time if it goes on like this; never before this fix."""
         step_m = self.speed_mps * max(0, mono_ns - self.mono_ns) / NS_PER_S
         place = moved(self.place, step_m, self.curvature_per_m)
-        return Fix(mono_ns, self.travelled_m + step_m, place, self.speed_mps, self.curvature_per_m)
+        return PoseFix(mono_ns, self.travelled_m + step_m, place, self.speed_mps, self.curvature_per_m)
 
 
 class Odometry:
@@ -43,14 +43,14 @@ class Odometry:
     def __init__(self, wheelbase_m: float, memory_ns: int) -> None:
         self._wheelbase_m = wheelbase_m
         self._memory_ns = memory_ns
-        self._fixes: deque[Fix] = deque()
+        self._fixes: deque[PoseFix] = deque()
 
     def note(self, vehicle: VehicleState) -> None:
         """Take over what the vehicle reports; a report that is not newer than the last one is left out.
 
         A speed or an angle that is no number is taken as the one before.
         """
-        last = self._fixes[-1] if self._fixes else Fix(vehicle.mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
+        last = self._fixes[-1] if self._fixes else PoseFix(vehicle.mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
         if self._fixes and vehicle.mono_ns <= last.mono_ns:
             return
         speed_mps, bend_per_m = last.speed_mps, last.curvature_per_m
@@ -60,16 +60,16 @@ class Odometry:
             bend_per_m = limited(curvature_per_m(vehicle.steering_rad, self._wheelbase_m), CURVATURE_WITHIN_PER_M)
         step_m = (last.speed_mps + speed_mps) / 2 * (vehicle.mono_ns - last.mono_ns) / NS_PER_S
         place = moved(last.place, step_m, (last.curvature_per_m + bend_per_m) / 2)
-        self._fixes.append(Fix(vehicle.mono_ns, last.travelled_m + step_m, place, speed_mps, bend_per_m))
+        self._fixes.append(PoseFix(vehicle.mono_ns, last.travelled_m + step_m, place, speed_mps, bend_per_m))
         while len(self._fixes) > 1 and self._fixes[1].mono_ns <= vehicle.mono_ns - self._memory_ns:
             self._fixes.popleft()
 
-    def at(self, mono_ns: int) -> Fix:
+    def at(self, mono_ns: int) -> PoseFix:
         """Tell where the vehicle was at a time, or will be if it goes on as it last did.
 
         A time before all that is remembered is taken as the first of that.
         """
         if not self._fixes:
-            return Fix(mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
+            return PoseFix(mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
         after = bisect_right(self._fixes, mono_ns, key=attrgetter("mono_ns"))
         return self._fixes[max(0, after - 1)].at(mono_ns)

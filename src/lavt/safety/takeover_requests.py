@@ -8,7 +8,7 @@ from lavt.domain import SessionRequest
 
 
 @dataclass(frozen=True, slots=True)
-class _Claim:
+class _TakeoverRequest:
     who: str
     instance: int
     until_ns: int
@@ -17,7 +17,7 @@ class _Claim:
         return (request.who, request.instance) == (self.who, self.instance)
 
 
-class Claims:
+class TakeoverRequests:
     """One client at a time asks, the first that does; then it is kept for that one. Both lapse by themselves.
 
     Times are of the server's monotonic clock.
@@ -26,14 +26,14 @@ class Claims:
     def __init__(self, *, ask_lapses_ns: int, kept_ns: int) -> None:
         self._ask_lapses_ns = ask_lapses_ns
         self._kept_ns = kept_ns
-        self._asking: _Claim | None = None
-        self._kept: _Claim | None = None
+        self._asking: _TakeoverRequest | None = None
+        self._kept: _TakeoverRequest | None = None
 
     def ask(self, request: SessionRequest, now_ns: int) -> str:
         """Note that somebody asks, or asks on; give why not, empty: it is noted."""
         if self._asking is not None and now_ns < self._asking.until_ns and not self._asking.is_of(request):
             return f"{self._asking.who} asks for it already"
-        self._asking = _Claim(request.who, request.instance, now_ns + self._ask_lapses_ns)
+        self._asking = _TakeoverRequest(request.who, request.instance, now_ns + self._ask_lapses_ns)
         return ""
 
     def asked_by(self, now_ns: int) -> str:
@@ -43,7 +43,7 @@ class Claims:
     def release(self, now_ns: int) -> None:
         """Keep the vehicle, which is free now, for who asks for it."""
         asked = self.asked_by(now_ns) and self._asking
-        self._kept = _Claim(asked.who, asked.instance, now_ns + self._kept_ns) if asked else None
+        self._kept = _TakeoverRequest(asked.who, asked.instance, now_ns + self._kept_ns) if asked else None
         self._asking = None
 
     def kept_from(self, request: SessionRequest, now_ns: int) -> str:

@@ -9,7 +9,7 @@ from lavt.value import value
 
 
 @value
-class Frame:
+class CanFrame:
     """A CAN data frame; its length (DLC) is that of `data`, 0 to 8 bytes."""
 
     identifier: int
@@ -18,10 +18,10 @@ class Frame:
 
 
 @value
-class HeardFrame:
+class ReceivedCanFrame:
     """A frame that came from the bus, and when (this host's monotonic clock)."""
 
-    frame: Frame
+    frame: CanFrame
     arrived_ns: int
 
 
@@ -29,7 +29,7 @@ class BusGone(Exception):
     """The bus cannot be written to or read from; the text says why."""
 
 
-class Port(Protocol):
+class BusPort(Protocol):
     """One side's access to a bus."""
 
     @property
@@ -37,11 +37,11 @@ class Port(Protocol):
         """What was counted."""
         ...
 
-    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Send frames that were made at a time, in order, without waiting; raises `BusGone`."""
         ...
 
-    def take(self, now_ns: int) -> list[HeardFrame]:
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Take what has come since the last call, in order; own frames are not among it. Raises `BusGone`."""
         ...
 

@@ -11,7 +11,7 @@ from lavt.value import value
 
 
 @value
-class Reached:
+class ReachedCommand:
     """At `reached_ns` the vehicle said that it steers by what was applied at `applied_ns`."""
 
     applied_ns: int
@@ -60,7 +60,7 @@ class Vehicle(Protocol):
         """
         ...
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Take what of the applied was seen to reach the wheels since the last call; empty where it cannot be seen."""
         ...
 

@@ -55,7 +55,7 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 @value
-class Offer:
+class DeviceFormat:
     """What a device gives: its pictures' size, and their rate as it says itself; None where it does not."""
 
     width_px: int
@@ -154,8 +154,8 @@ class VideoDevice:
                 "(`v4l2-ctl --list-formats-ext` names them), or none"
             )
         said_hz = capture.get(cv2.CAP_PROP_FPS)
-        offer = Offer(picture.shape[1], picture.shape[0], said_hz if 0 < said_hz <= KNOWN_RATE_HZ else None)
-        asked = Offer(self.model.width_px, self.model.height_px, self.rate_hz)
+        offer = DeviceFormat(picture.shape[1], picture.shape[0], said_hz if 0 < said_hz <= KNOWN_RATE_HZ else None)
+        asked = DeviceFormat(self.model.width_px, self.model.height_px, self.rate_hz)
         if not _is_as_asked(offer, self.model, self.rate_hz):
             capture.release()
             raise UserError(
@@ -259,7 +259,7 @@ def _read(capture: cv2.VideoCapture) -> Picture | None:
     return cast("Picture", picture) if good and picture.ndim == 3 and picture.dtype == np.uint8 else None
 
 
-def _is_as_asked(offer: Offer, model: CameraModel, rate_hz: float) -> bool:
+def _is_as_asked(offer: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
     """Whether a device gives what it was asked for; a rate that it does not tell is not held against it."""
     is_of_size = (offer.width_px, offer.height_px) == (model.width_px, model.height_px)
     return is_of_size and (offer.rate_hz is None or math.isclose(offer.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))

@@ -14,8 +14,8 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clock_offset import (
     DRIFT_ALLOWANCE,
     NO_OFFSET,
-    Exchanges,
-    Offset,
+    ClockOffset,
+    ProbeExchanges,
     by_probe,
     by_sources,
     exchanges,
@@ -39,7 +39,7 @@ def samples(ahead: Ahead, *, begin_ms: int = 0, seconds: int = 30, **fields: Any
     return table_of(rows, [0] * len(rows), [0] * len(rows))
 
 
-def errors_ns(offset: Offset, client: Ahead, server: Ahead, *, seconds: int = 29) -> tuple[Any, Any]:
+def errors_ns(offset: ClockOffset, client: Ahead, server: Ahead, *, seconds: int = 29) -> tuple[Any, Any]:
     """Give how wrong Delta is every 10 ms, and how wrong it says it can be."""
     true_ns = np.arange(NS_PER_S, seconds * NS_PER_S, 10 * NS_PER_MS)
     client_wall_ns = np.array([TRUE_NS + at + client(at) for at in true_ns.tolist()])
@@ -65,7 +65,7 @@ def rows_of(rows: list[dict[str, Any]]) -> Table:
 def test_an_offset_by_hand() -> None:
     """Delta is linear between moments and constant outside of them; its bound is linear too, and grows outside."""
     times_ns = np.array([0, 100, 200])
-    offset = Offset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
+    offset = ClockOffset(TRUE_NS + times_ns, np.array([10.0, 30.0, 20.0]), np.array([4.0, 8.0, 6.0]), 0.5)
     at_ns = TRUE_NS + np.array([-20, 0, 3, 50, 99, 100, 200, 260])
     assert offset.at(at_ns).tolist() == [10, 10, 11, 20, 30, 30, 20, 20]
     assert offset.bound_at(at_ns).tolist() == pytest.approx([14.0, 4.0, 4.12, 6.0, 7.96, 8.0, 6.0, 36.0])
@@ -73,7 +73,7 @@ def test_an_offset_by_hand() -> None:
 
 def test_a_missing_time_stays_missing() -> None:
     """Times of the client become times of the server by Delta at their own moments; a missing one stays missing."""
-    offset = Offset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
+    offset = ClockOffset(TRUE_NS + np.array([0, 100]), np.array([10.0, 30.0]), np.zeros(2), 0.0)
     client_ns = np.array([TRUE_NS, MISSING, TRUE_NS + 100])
     assert offset.on_server_ns(client_ns).tolist() == [TRUE_NS + 10, MISSING, TRUE_NS + 130]
 
@@ -304,7 +304,7 @@ def test_samples_count_from_the_first_that_is_known(known: str, first: int | Non
 
 def probed(
     client: Ahead, server: Ahead, ways_ms: Callable[[int], tuple[float, float]], *, seconds: int = 30
-) -> Exchanges:
+) -> ProbeExchanges:
     """Make two exchanges a second with given times there and back."""
     rows = []
     for number in range(2 * seconds):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lavt.experiment.analysis.latency import picture_age, rtp_timestamp
-from lavt.experiment.analysis.metrics import Measured, count, driving_interval, measure
+from lavt.experiment.analysis.metrics import RunMeasurement, count, driving_interval, measure
 from lavt.experiment.analysis.steering import steering_reversals
 from lavt.experiment.analysis.tracking import (
     cross_track,
@@ -25,7 +25,7 @@ MakeRun = Callable[..., Path]
 MICROSECOND_MS = 1e-3
 
 
-def measured(make_run: MakeRun, directory: Path, **settings: Any) -> Measured:
+def measured(make_run: MakeRun, directory: Path, **settings: Any) -> RunMeasurement:
     make_run(directory, **settings)
     return measure(read_record(directory / "server.mcap"), read_record(directory / "client.mcap"))
 

@@ -8,7 +8,7 @@ import pytest
 
 from lavt.assembly.links import injected
 from lavt.cli.relay import flows
-from lavt.config import Condition, Impairment, RunConfig
+from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
 from lavt.experiment.runs.real_run import _asked_ms, _relay_config, relay_reasons
@@ -79,7 +79,7 @@ def test_asked_of_the_relay() -> None:
 def test_least() -> None:
     """A latency is too short for a condition only where jitter and overtaking do not explain it."""
     assert injected_entry(conditions()["L4"]) == {"injected_ms": {"video": 150, "control": 75}}
-    jitter, early = Impairment(jitter_ms=10), Impairment(reorder=0.5)
+    jitter, early = ImpairmentConfig(jitter_ms=10), ImpairmentConfig(reorder=0.5)
     asked = Condition(video_ms=75, control_ms=30, video=jitter, control=jitter)
     assert injected_entry(asked)["injected_least_ms"] == {"video": 35, "control": 0}
     asked = Condition(video_ms=75, control_ms=30, video=early)

@@ -32,7 +32,7 @@ from lavt.experiment.boundary.boundary import (
 from lavt.experiment.boundary.oscillation_growth import growth_per_s
 from lavt.experiment.report.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.report.table_format import html_of
-from lavt.experiment.runs.monitored_run import WatchedDrive, watched
+from lavt.experiment.runs.monitored_run import MonitoredRun, watched
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.statistics.boundary_summary import groups_of, summary
 from lavt.experiment.sweep.workers import Workers
@@ -334,10 +334,10 @@ def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
 def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Departure is searched where drives begin: found or not there, and what never begins beyond says nothing of it."""
 
-    def fake(planned: PlannedRun) -> WatchedDrive:
+    def fake(planned: PlannedRun) -> MonitoredRun:
         delay_ms = planned.config.network.video.delay_ms or 0.0
         begins = delay_ms <= 250
-        return WatchedDrive(
+        return MonitoredRun(
             ending="completed" if begins else "time_limit",
             lane_invasions=int(begins and delay_ms >= leaves_ms),
             total_delay_ms=delay_ms + 10 if begins else math.nan,
@@ -364,7 +364,7 @@ def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatc
 def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told with its reason, and what the others found is there."""
 
-    def fake(asked: boundary_module.Search) -> dict[str, Any]:
+    def fake(asked: boundary_module.BoundarySearch) -> dict[str, Any]:
         if asked.name.endswith("01"):
             raise WorkError("the vehicle was never armed")
         return run_entry("a_key", 0)
@@ -378,7 +378,7 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
 
 
-def killed_by(asked: boundary_module.Search) -> dict[str, Any]:
+def killed_by(asked: boundary_module.BoundarySearch) -> dict[str, Any]:
     """Search as if it were one of repetition 1 that its process does not survive, and of 2 that dies the first time."""
     repetition = int(asked.name[-2:])
     mark = Path(asked.planned.config.study.participant or "") / str(repetition)

@@ -18,7 +18,7 @@ from lavt.experiment.boundary.oscillation_growth import (
     half_swings,
     straight_growth,
 )
-from lavt.experiment.runs.monitored_run import WatchedDrive
+from lavt.experiment.runs.monitored_run import MonitoredRun
 from lavt.vehicle.sim.simulator import start_of
 
 LOOPBACK_MS = 11.8
@@ -29,10 +29,10 @@ CASES = list(itertools.product((0.74, 1.01, 1.3), (15, 30), (6.0, 10.0)))
 QUICK = (1.01, 30, 6.0)
 
 
-def swinging(rate_per_s: float, *, size_m: float = 0.01, limited_s: tuple[float, ...] = ()) -> WatchedDrive:
+def swinging(rate_per_s: float, *, size_m: float = 0.01, limited_s: tuple[float, ...] = ()) -> MonitoredRun:
     """Make a drive that swings once in 2 s, at full speed after 5 s."""
     time_s = np.arange(0, 40, 0.02)
-    return WatchedDrive(
+    return MonitoredRun(
         ending=None,
         lane_invasions=0,
         total_delay_ms=0.0,

@@ -17,7 +17,7 @@ from lavt.experiment.report.groups import axes_of, differing, in_order, is_of, t
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_figures import drawn_points
 from lavt.experiment.report.sections import (
-    Report,
+    ReportContext,
     axis_parts,
     conditions_parts,
     contrast_parts,
@@ -79,12 +79,12 @@ def campaign(**changes: Any) -> list[dict[str, Any]]:
     ]
 
 
-def report_of(summary: dict[str, Any], directory: Path) -> Report:
+def report_of(summary: dict[str, Any], directory: Path) -> ReportContext:
     names = {str(run["condition"]) for run in summary["runs"]}
-    return Report(summary, directory, condition_colours(names))
+    return ReportContext(summary, directory, condition_colours(names))
 
 
-def all_parts(report: Report) -> dict[str, str]:
+def all_parts(report: ReportContext) -> dict[str, str]:
     parts = {
         "head": head(report), "conditions": conditions_parts(report), "contrasts": contrast_parts(report),
         "differences": difference_parts(report), "injected": injected_parts(report),

@@ -14,14 +14,14 @@ from lavt.config_file import load_config, shipped
 from lavt.errors import UserError
 from lavt.experiment.runs.netem_run import NetemRun, netem_reasons
 from lavt.experiment.runs.plan import plan_run
-from lavt.transport.emulation.impairment import Flow, Law, Port
-from lavt.transport.netem.netem import Netem
-from lavt.transport.netem.probe import Measured, probes
-from lavt.transport.netem.state import Applied, StateFiles, boot, namespace, started
+from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
+from lavt.transport.netem.netem import NetemInterface
+from lavt.transport.netem.probe import ProbeResult, probes
+from lavt.transport.netem.state import AppliedState, StateFiles, boot, namespace, started
 from lavt.transport.netem.tc import Command
 
 
-class Kernel(Netem):
+class Kernel(NetemInterface):
     """A netem whose tc notes what it is told, and that measures what is asked and `more_ms`."""
 
     def __init__(self, directory: Path) -> None:
@@ -39,10 +39,12 @@ class Kernel(Netem):
         self.commands.append(" ".join(command))
         return ""
 
-    def measure(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), count: int = 50) -> dict[str, Measured]:
+    def measure(
+        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+    ) -> dict[str, ProbeResult]:
         """Measure nothing."""
         return {
-            each.name: Measured(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
+            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
             for each in probes(flows, never)
         }
 
@@ -50,13 +52,13 @@ class Kernel(Netem):
         """Doubt what is said to have stopped."""
         return self.stopped
 
-    def read_back(self, flows: Sequence[Flow]) -> list[str]:
+    def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
         """Read nothing back."""
         del flows
         return []
 
 
-def run_by(kernel: Netem, condition: str) -> NetemRun:
+def run_by(kernel: NetemInterface, condition: str) -> NetemRun:
     changes = ["time=real", "network.injection=netem", f"network.condition={condition}"]
     return NetemRun(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), kernel)
 
@@ -95,7 +97,7 @@ def test_a_run_that_is_refused_leaves_what_another_holds(tmp_path: Path) -> None
     kernel = Kernel(tmp_path)
     kernel.commands = ["tc qdisc add dev lo root"]
     owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(Applied("lo", namespace(), boot(), owner, "L3", ()))
+    StateFiles(tmp_path).write(AppliedState("lo", namespace(), boot(), owner, "L3", ()))
     with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
         pass
     assert kernel.commands == ["tc qdisc add dev lo root"]
@@ -127,6 +129,6 @@ def test_a_broken_report_of_netem_is_no_measurement(report: dict[str, Any]) -> N
 
 def test_a_flow_that_was_not_measured_is_said() -> None:
     """A flow of the report without a measurement is a reason of its own."""
-    flow = Flow("video", "udp", 5600, "source", Law(75))
+    flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
     report = {"flows": [asdict(flow)], "read_back": [], "before": {}, "after": {}}
     assert "before the drive: video: no packet came through" in netem_reasons(report)

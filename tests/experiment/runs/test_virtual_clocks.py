@@ -12,8 +12,8 @@ import pytest
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.analysis.clock_offset import Offset
-from lavt.experiment.analysis.metrics import Measured, measure
+from lavt.experiment.analysis.clock_offset import ClockOffset
+from lavt.experiment.analysis.metrics import RunMeasurement, measure
 from lavt.experiment.analysis.results import run_result
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive
@@ -25,7 +25,9 @@ Change = Callable[[VirtualLoop], None]
 APART = ("clocks.offset_ms=250.0", "clocks.drift_ppm=30.0")
 
 
-def drive_with(out: Path, *changes: str, change: Change = lambda _: None) -> tuple[Measured, dict[str, Any], HostClock]:
+def drive_with(
+    out: Path, *changes: str, change: Change = lambda _: None
+) -> tuple[RunMeasurement, dict[str, Any], HostClock]:
     """Drive without pictures; give what was measured, `result.json`, and the server's clock (the client's is true)."""
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), ("fidelity=geometry", *APART, *changes)))
     loop = build_loop(planned, out)
@@ -36,7 +38,7 @@ def drive_with(out: Path, *changes: str, change: Change = lambda _: None) -> tup
     return measure(server, client), result, loop.runtime.hosts["server"].clock
 
 
-def errors_ms(measured: Measured, offset: Offset | None, server: HostClock) -> tuple[Any, Any]:
+def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: HostClock) -> tuple[Any, Any]:
     """Give how wrong Delta is at every 10 ms of the drive, and how wrong it says it can be."""
     assert offset is not None
     began_ns, ended_ns = measured.clocks.client_wall_ns.tolist()

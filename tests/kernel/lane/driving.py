@@ -10,7 +10,7 @@ from typing import Any
 
 from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
 
-from lavt.experiment.analysis.metrics import Measured, measure
+from lavt.experiment.analysis.metrics import RunMeasurement, measure
 from lavt.experiment.runs.join import join
 from lavt.recording.record import Record, read_record
 
@@ -44,7 +44,7 @@ class Drive:
     out: Path
     server: Record
     client: Record
-    measured: Measured
+    measured: RunMeasurement
     result: dict[str, Any]
 
 

@@ -14,7 +14,7 @@ from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync.chrony import ABSENT, NOT_RUNNING, NOT_SYNCHRONISED, Chronyc, parse_chrony, read_chrony
 from lavt.transport.clock_sync.clock_report import ClockReport
-from lavt.transport.clock_sync.persistent_process import Ended, Run
+from lavt.transport.clock_sync.persistent_process import Completed, Run
 from lavt.transport.clock_sync.ptp import read_ptp
 
 TRACKING = (
@@ -39,7 +39,7 @@ LOCAL = "7F7F0101,,8,1795292419.031279233,0.000000000,0.000000000,0.000000000,0.
 BEFORE, AFTER = Now(0, 1795292432 * NS_PER_S), Now(20_000_000, 1795292432 * NS_PER_S + 20_000_000)
 
 
-def answering(ended: Ended | None) -> Run:
+def answering(ended: Completed | None) -> Run:
     return lambda _command, _timeout_s: ended
 
 
@@ -187,7 +187,7 @@ def test_one_client_of_chrony_stays_and_is_asked_again(tmp_path: Path, monkeypat
         answers = [chronyc.run(("tracking", "ntpdata"), 10) for _ in range(2)]
     assert answers[0] is not None
     process = answers[0].output.split()[1]
-    assert answers == [Ended(0, f"tracking, {process}\nntpdata, {process}\n")] * 2
+    assert answers == [Completed(0, f"tracking, {process}\nntpdata, {process}\n")] * 2
 
 
 def test_no_chrony(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,7 +213,7 @@ class Jumping:
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])
 def test_an_answer_that_is_read_late(read: Callable[[Clock, Run], ClockReport | None]) -> None:
     """Where a busy machine takes 3 s from the question to the answer nobody knows to when it belongs: a missed poll."""
-    assert read(Jumping(), answering(Ended(0, TRACKING))) is None
+    assert read(Jumping(), answering(Completed(0, TRACKING))) is None
 
 
 @pytest.mark.parametrize("read", [read_chrony, read_ptp])

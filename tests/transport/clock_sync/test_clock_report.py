@@ -15,7 +15,7 @@ from lavt.transport.clock_sync.clock_report import (
     plain_address,
     unknown_clock,
 )
-from lavt.transport.clock_sync.persistent_process import Ended
+from lavt.transport.clock_sync.persistent_process import Completed
 
 ROUTES = """Main:
   +-- 0.0.0.0/1 2 0 2
@@ -74,9 +74,9 @@ def test_an_answer_may_take_two_seconds(took_ns: int, *, in_time: bool) -> None:
     """An answer within 2 s is parsed with the clocks before and after it; a later one is a missed poll."""
     asked: list[tuple[Sequence[str], float]] = []
 
-    def run(command: Sequence[str], timeout_s: float) -> Ended:
+    def run(command: Sequence[str], timeout_s: float) -> Completed:
         asked.append((command, timeout_s))
-        return Ended(0, "answer")
+        return Completed(0, "answer")
 
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from lavt.clock import MachineClock
 from lavt.domain import Now
 from lavt.transport.clock_sync.clock_report import ClockReport
-from lavt.transport.clock_sync.persistent_process import NOT_FOUND, Ended
+from lavt.transport.clock_sync.persistent_process import NOT_FOUND, Completed
 from lavt.transport.clock_sync.ptp import ABSENT, NO_MASTER, NOT_RUNNING, parse_ptp, read_ptp
 
 SLAVE = """sending: GET PORT_DATA_SET
@@ -105,6 +105,6 @@ def test_any_answer(rows: list[tuple[str, str]]) -> None:
 
 def test_no_linuxptp() -> None:
     """Where pmc is not installed, the report says so and has no correction."""
-    report = read_ptp(MachineClock(), lambda _command, _timeout_s: Ended(NOT_FOUND, ""))
+    report = read_ptp(MachineClock(), lambda _command, _timeout_s: Completed(NOT_FOUND, ""))
     assert report is not None
     assert (report.source, report.status, report.correction_s) == ("ptp", ABSENT, None)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
-from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Law
-from lavt.transport.emulation.link import HEADER_BYTES, Injected, Link, check_injected
+from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
+from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injected
 from lavt.transport.emulation.random_process import LARGEST, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
@@ -26,32 +26,36 @@ SLOW_NS = NS_PER_S
 TABLES = Path("/usr/lib/x86_64-linux-gnu/tc")
 
 
-def link(law: Law, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any) -> Link:
-    return Link(Injected(law, seed, name, trace, **keys))
+def link(
+    law: Impairment, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any
+) -> EmulatedLink:
+    return EmulatedLink(LinkInjection(law, seed, name, trace, **keys))
 
 
-def times(made: Link, *, count: int = COUNT, period_ns: int = SLOW_NS, size_bytes: int = 1000) -> list[int | None]:
+def times(
+    made: EmulatedLink, *, count: int = COUNT, period_ns: int = SLOW_NS, size_bytes: int = 1000
+) -> list[int | None]:
     """For how long each packet of a steady flow was held; None: it was lost."""
     left = [made.leaves_ns(number * period_ns, 0, size_bytes) for number in range(count)]
     return [None if each is None else each - number * period_ns for number, each in enumerate(left)]
 
 
-def held_ms(made: Link, **keys: Any) -> NDArray[np.float64]:
+def held_ms(made: EmulatedLink, **keys: Any) -> NDArray[np.float64]:
     """The same in milliseconds, where nothing is lost."""
     return np.array([each for each in times(made, **keys) if each is not None]) / MS
 
 
 def test_nothing() -> None:
     """Without a law a packet leaves when it comes, after the delay that is there anyway; a constant is exact."""
-    assert set(times(link(Law()), count=1000)) == {0}
-    assert link(Law()).leaves_ns(5, 7, 1000) == 12
-    assert set(times(link(Law(delay_ms=0.25)), count=1000)) == {250_000}
+    assert set(times(link(Impairment()), count=1000)) == {0}
+    assert link(Impairment()).leaves_ns(5, 7, 1000) == 12
+    assert set(times(link(Impairment(delay_ms=0.25)), count=1000)) == {250_000}
 
 
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
 def test_share_of_losses(loss: float) -> None:
     """Of many packets the share that was asked for is lost, each by itself, within four standard deviations."""
-    made = link(Law(loss=loss))
+    made = link(Impairment(loss=loss))
     lost = np.array([each is None for each in times(made)])
     assert lost.mean() == pytest.approx(loss, abs=4 * (loss * (1 - loss) / COUNT) ** 0.5)
     both = (lost[:-1] & lost[1:]).mean()
@@ -64,7 +68,8 @@ def test_more_loss_takes_what_less_loss_took(burst: float) -> None:
     """With the same seed every packet that is lost at 1 % is lost at 5 %, and those at 10 %, in bursts or not."""
     shares = [0.01, 0.05, 0.1]
     lost = [
-        np.array([each is None for each in times(link(Law(loss=share, loss_burst_packets=burst)))]) for share in shares
+        np.array([each is None for each in times(link(Impairment(loss=share, loss_burst_packets=burst)))])
+        for share in shares
     ]
     assert [int(less.sum()) > 100 for less in lost] == [True] * 3
     assert [int((less & ~more).sum()) for less, more in itertools.pairwise(lost)] == [0, 0]
@@ -79,7 +84,9 @@ def runs_of(lost: NDArray[np.bool_]) -> NDArray[np.int64]:
 @pytest.mark.parametrize(("loss", "burst"), [(0.02, 5.0), (0.1, 5.0), (0.1, 2.0), (0.3, 20.0)])
 def test_bursts(loss: float, burst: float) -> None:
     """Lost in bursts, the share and the mean length are those asked for; lengths are geometric."""
-    lost = np.array([each is None for each in times(link(Law(loss=loss, loss_burst_packets=burst)), count=5 * COUNT)])
+    lost = np.array(
+        [each is None for each in times(link(Impairment(loss=loss, loss_burst_packets=burst)), count=5 * COUNT)]
+    )
     lengths = runs_of(lost)
     deviation = (burst * (burst - 1)) ** 0.5
     assert lengths.mean() == pytest.approx(burst, abs=4 * deviation / len(lengths) ** 0.5)
@@ -102,7 +109,7 @@ DEVIATIONS = {
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
 def test_jitter(distribution: Distribution) -> None:
     """Packets far apart have delays around the constant, with the mean and deviation of netem's distribution."""
-    delays = (held_ms(link(Law(delay_ms=100, jitter_ms=10, jitter_distribution=distribution))) - 100) / 10
+    delays = (held_ms(link(Impairment(delay_ms=100, jitter_ms=10, jitter_distribution=distribution))) - 100) / 10
     mean, deviation = DEVIATIONS[distribution]
     assert delays.mean() == pytest.approx(mean, abs=4 * deviation / COUNT**0.5 + 5e-4)
     assert delays.std() == pytest.approx(deviation, rel=0.03)
@@ -121,7 +128,7 @@ def test_tables_are_those_of_tc(distribution: Distribution) -> None:
 
 def test_correlated_jitter() -> None:
     """Correlated jitter has the deviation asked for, and the correlation with itself 20 ms before, 40 ms before, ..."""
-    law = Law(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
     delays = held_ms(link(law), count=5 * COUNT, period_ns=20 * MS) - 1000
     assert delays.std() == pytest.approx(1, rel=0.03)
     for steps in (1, 2, 3):
@@ -131,7 +138,7 @@ def test_correlated_jitter() -> None:
 
 def test_correlated_jitter_goes_by_time() -> None:
     """Within 20 ms the delay stays; how many packets come does not change how it goes on."""
-    law = Law(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
     many = held_ms(link(law), count=1000, period_ns=4 * MS)
     few = held_ms(link(law), count=200, period_ns=20 * MS)
     assert (many.reshape(200, 5)[:, 0] == few).all()
@@ -140,26 +147,26 @@ def test_correlated_jitter_goes_by_time() -> None:
 
 def test_jitter_beyond_the_delay() -> None:
     """No delay is below zero: what jitter would take away from more than there is, inherent delay included, is cut."""
-    made = link(Law(jitter_ms=10))
+    made = link(Impairment(jitter_ms=10))
     delays = held_ms(made)
     assert delays.min() == 0
     assert (delays == 0).mean() == pytest.approx(0.5, abs=0.01)
-    above = link(Law(jitter_ms=10))
+    above = link(Impairment(jitter_ms=10))
     left = [above.leaves_ns(number * SLOW_NS, 50 * MS, 0) for number in range(1000)]
     assert [each and each - number * SLOW_NS > 10 * MS for number, each in enumerate(left)] == [True] * 1000
 
 
 def test_rate() -> None:
     """Packets that come at once leave one after the other, headers counted; a link that is not full adds one packet."""
-    made = link(Law(delay_ms=5, rate_bps=2_000_000))
+    made = link(Impairment(delay_ms=5, rate_bps=2_000_000))
     takes_ns = round(8 * (1000 + HEADER_BYTES) * NS_PER_S / 2_000_000)
     assert [made.leaves_ns(0, 0, 1000) for _ in range(4)] == [5 * MS + takes_ns * (number + 1) for number in range(4)]
-    assert set(times(link(Law(rate_bps=2_000_000)), count=100)) == {takes_ns}
+    assert set(times(link(Impairment(rate_bps=2_000_000)), count=100)) == {takes_ns}
 
 
 def test_throughput() -> None:
     """Through a link that is too slow comes what its rate lets through, however much is sent."""
-    made = link(Law(rate_bps=1_000_000), queue_packets=20)
+    made = link(Impairment(rate_bps=1_000_000), queue_packets=20)
     left = [each for each in (made.leaves_ns(number * MS, 0, 958) for number in range(20_000)) if each is not None]
     assert 8000 * (len(left) - 1) / ((left[-1] - left[0]) / NS_PER_S) == pytest.approx(1_000_000, rel=1e-6)
     assert made.dropped == 20_000 - len(left) > 0
@@ -167,7 +174,7 @@ def test_throughput() -> None:
 
 def test_full_queue() -> None:
     """A queue with room for three holds three, the one being sent among them; the next is dropped and counted."""
-    made = link(Law(rate_bps=8000), queue_packets=3)  # 1 s for 1000 bytes
+    made = link(Impairment(rate_bps=8000), queue_packets=3)  # 1 s for 1000 bytes
     size_bytes = 1000 - HEADER_BYTES
     assert [made.leaves_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
     assert made.leaves_ns(NS_PER_S, 0, size_bytes) == 4 * NS_PER_S
@@ -177,7 +184,7 @@ def test_full_queue() -> None:
 
 def test_the_queue_is_behind_the_delay() -> None:
     """What is still under way to the queue takes no room in it."""
-    made = link(Law(delay_ms=5000, rate_bps=8000), queue_packets=1)
+    made = link(Impairment(delay_ms=5000, rate_bps=8000), queue_packets=1)
     left = [made.leaves_ns(number * NS_PER_S, 0, 1000 - HEADER_BYTES) for number in range(5)]
     assert left == [(6 + number) * NS_PER_S for number in range(5)]
 
@@ -185,14 +192,14 @@ def test_the_queue_is_behind_the_delay() -> None:
 @pytest.mark.parametrize("reorder", [0.05, 0.25])
 def test_share_that_overtakes(reorder: float) -> None:
     """The share asked for is not delayed, and overtakes where others are under way; the rest keep their order."""
-    made = link(Law(delay_ms=75, reorder=reorder))
+    made = link(Impairment(delay_ms=75, reorder=reorder))
     held = held_ms(made, period_ns=3 * MS)
     early = held == 0
     assert set(held) == {0.0, 75.0}
     assert early.mean() == pytest.approx(reorder, abs=4 * (reorder * (1 - reorder) / COUNT) ** 0.5)
     # it overtakes unless none of the 24 before it was delayed
     assert made.overtook == pytest.approx(early.sum(), abs=1)
-    alone = link(Law(delay_ms=75, reorder=reorder))
+    alone = link(Impairment(delay_ms=75, reorder=reorder))
     held_ms(alone)
     assert alone.overtook == 0
 
@@ -200,7 +207,7 @@ def test_share_that_overtakes(reorder: float) -> None:
 def test_capacity_by_hand() -> None:
     """Opportunities are used up byte by byte: by a large packet several, by small ones one; unused ones are gone."""
     trace = parse_mahimahi("10\n20\n20\n30\n", "t")
-    made = link(Law(), trace=trace)
+    made = link(Impairment(), trace=trace)
 
     def send(at_ms: float, size_bytes: int) -> float:
         left_ns = made.leaves_ns(round(at_ms * MS), 0, size_bytes - HEADER_BYTES)
@@ -220,14 +227,16 @@ def test_capacity_by_hand() -> None:
 
 def test_capacity_counts_from_the_beginning_of_the_link() -> None:
     """A trace begins when its link does, and follows the delay."""
-    made = Link(Injected(Law(delay_ms=3), 1, "video", parse_mahimahi("10\n", "t")), start_ns=500 * MS)
+    made = EmulatedLink(
+        LinkInjection(Impairment(delay_ms=3), 1, "video", parse_mahimahi("10\n", "t")), start_ns=500 * MS
+    )
     assert made.leaves_ns(500 * MS, 0, 100) == 510 * MS
     assert made.leaves_ns(508 * MS, 0, 100) == 520 * MS
 
 
 def test_a_full_queue_of_capacity() -> None:
     """The queue in front of a capacity has a bound, too."""
-    made = link(Law(), trace=parse_mahimahi("10\n", "t"), queue_packets=2)
+    made = link(Impairment(), trace=parse_mahimahi("10\n", "t"), queue_packets=2)
     size_bytes = 1500 - HEADER_BYTES
     assert [made.leaves_ns(0, 0, size_bytes) for _ in range(3)] == [10 * MS, 20 * MS, None]
     assert made.leaves_ns(10 * MS, 0, size_bytes) == 30 * MS
@@ -236,7 +245,7 @@ def test_a_full_queue_of_capacity() -> None:
 def test_delays_by_hand() -> None:
     """A trace of delay comes on top of the constant; a delay that falls faster than time goes lets nothing overtake."""
     trace = parse_delays("time_s,delay_ms\n0,0\n1,100\n1.05,0\n2,0\n", "t")
-    made = link(Law(delay_ms=20), trace=trace)
+    made = link(Impairment(delay_ms=20), trace=trace)
     left = [made.leaves_ns(at_ms * MS, 0, 100) for at_ms in (0, 500, 1000, 1025, 1050, 1100, 1500, 2500)]
     assert [each and each / MS for each in left] == [20, 570, 1120, 1120, 1120, 1120, 1520, 2570]
 
@@ -257,7 +266,7 @@ LAWS: dict[str, dict[str, Any]] = {
 )
 def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) -> None:
     """Nothing overtakes but by `reorder`, and nothing leaves before it came, whatever else is asked for."""
-    made = link(Law(delay_ms=10, **{key: value for name in names for key, value in LAWS[name].items()}))
+    made = link(Impairment(delay_ms=10, **{key: value for name in names for key, value in LAWS[name].items()}))
     now_ns, last_ns = 0, 0
     for pause_ns, inherent_ns, size_bytes in packets:
         now_ns += pause_ns
@@ -271,7 +280,7 @@ def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) ->
 @pytest.mark.parametrize("name", LAWS)
 def test_it_repeats(name: str) -> None:
     """One seed gives the same to the nanosecond; another seed or flow gives something else where there is chance."""
-    law = Law(delay_ms=75, **LAWS[name])
+    law = Impairment(delay_ms=75, **LAWS[name])
     first = times(link(law), count=2000)
     assert times(link(law), count=2000) == first
     for other in (link(law, seed=2), link(law, name="control")):
@@ -282,7 +291,7 @@ def test_it_repeats(name: str) -> None:
 @pytest.mark.parametrize("added", ["loss", "bursts", "reorder"])
 def test_runs_stay_paired(name: str, added: str) -> None:
     """A law more leaves the delays of the packets that it does not concern as they were."""
-    law = Law(delay_ms=75, **LAWS[name])
+    law = Impairment(delay_ms=75, **LAWS[name])
     alone = times(link(law), count=2000)
     both = times(link(replace(law, **LAWS[added])), count=2000)
     assert sum(each in (None, 0) for each in both) > 50
@@ -291,21 +300,21 @@ def test_runs_stay_paired(name: str, added: str) -> None:
 
 def test_more_loss_takes_more() -> None:
     """With more loss the packets that were lost with less are lost again, and others."""
-    little, much = (np.array(times(link(Law(loss=loss)), count=5000)) == None for loss in (0.01, 0.05))  # noqa: E711
+    little, much = (np.array(times(link(Impairment(loss=loss)), count=5000)) == None for loss in (0.01, 0.05))  # noqa: E711
     assert not (little & ~much).any()
     assert much.sum() > little.sum() > 0
 
 
 def test_loss_does_not_move_overtaking() -> None:
     """The same packets overtake whether others are lost or not."""
-    law = Law(delay_ms=75, reorder=0.2)
+    law = Impairment(delay_ms=75, reorder=0.2)
     alone, both = times(link(law), count=2000), times(link(replace(law, loss=0.1)), count=2000)
     assert all(each in (None, before) for before, each in zip(alone, both, strict=True))
 
 
 def test_a_line_with_a_link() -> None:
     """A line gives out what its link lets through when that says, early ones first, and tells when each is due."""
-    law = Law(delay_ms=75, loss=0.1, reorder=0.2)
+    law = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
     line, made = DelayLine(DelayLaw(12.0), link(law)), link(law)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
     assert due == [made.leaves_ns(number * MS, 12 * MS, 100) for number in range(500)]
@@ -314,36 +323,40 @@ def test_a_line_with_a_link() -> None:
     assert [number for _, number in order] != sorted(number for _, number in order)
 
 
-CONTRADICTIONS: list[tuple[Law, str | None, str]] = [
-    (Law(loss=1.0), None, "shares below 1"),
-    (Law(loss=0.9, loss_burst_packets=2), None, "leaves no room"),
-    (Law(delay_ms=9, jitter_ms=1, jitter_correlation=0.5, jitter_distribution="pareto"), None, "distribution normal"),
-    (Law(reorder=0.1), None, "needs a delay"),
-    (Law(reorder=0.1), "10\n", "needs a delay"),
-    (Law(rate_bps=1000), "10\n", "give one of the two"),
-    (Law(rate_bps=7), None, "between 8 and"),
-    (Law(delay_ms=float("nan")), None, "below zero or infinite"),
+CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
+    (Impairment(loss=1.0), None, "shares below 1"),
+    (Impairment(loss=0.9, loss_burst_packets=2), None, "leaves no room"),
+    (
+        Impairment(delay_ms=9, jitter_ms=1, jitter_correlation=0.5, jitter_distribution="pareto"),
+        None,
+        "distribution normal",
+    ),
+    (Impairment(reorder=0.1), None, "needs a delay"),
+    (Impairment(reorder=0.1), "10\n", "needs a delay"),
+    (Impairment(rate_bps=1000), "10\n", "give one of the two"),
+    (Impairment(rate_bps=7), None, "between 8 and"),
+    (Impairment(delay_ms=float("nan")), None, "below zero or infinite"),
 ]
 
 
 @pytest.mark.parametrize(("law", "trace", "said"), CONTRADICTIONS)
-def test_contradictions(law: Law, trace: str | None, said: str) -> None:
+def test_contradictions(law: Impairment, trace: str | None, said: str) -> None:
     """What contradicts itself is refused with the flow's name."""
-    asked = Injected(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
+    asked = LinkInjection(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
     with pytest.raises(UserError, match=rf"^video: .*{said}"):
         check_injected(asked)
 
 
 def test_what_the_kernel_refuses_is_allowed() -> None:
     """Jitter beyond the delay, correlation without jitter, and overtaking what only a trace delays are no nonsense."""
-    check_injected(Injected(Law(jitter_ms=10), 1, "video"))
-    check_injected(Injected(Law(jitter_correlation=0.9), 1, "video"))
-    check_injected(Injected(Law(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
+    check_injected(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
+    check_injected(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))
+    check_injected(LinkInjection(Impairment(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
 
 
 def test_early_ones_keep_their_order() -> None:
     """What overtakes by not being delayed still has the delay that is there anyway, and keeps order with its like."""
-    made = link(Law(delay_ms=75, reorder=0.999))
+    made = link(Impairment(delay_ms=75, reorder=0.999))
     early = [made.leaves_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))]
     assert early == [40 * MS, 40 * MS, 52 * MS]
 
@@ -351,7 +364,7 @@ def test_early_ones_keep_their_order() -> None:
 @pytest.mark.parametrize("added", [{"loss": 0.5}, {"reorder": 0.5}])
 def test_chances_have_nothing_to_do_with_each_other(added: dict[str, Any]) -> None:
     """Which packets are lost, or overtake, says nothing of the jitter of the others."""
-    delays = held_ms(link(Law(delay_ms=100, jitter_ms=10, **added)))
+    delays = held_ms(link(Impairment(delay_ms=100, jitter_ms=10, **added)))
     delayed = delays[delays > 0]
     assert len(delayed) == pytest.approx(COUNT / 2, rel=0.05)
     assert delayed.mean() == pytest.approx(100, abs=4 * 10 / len(delayed) ** 0.5)

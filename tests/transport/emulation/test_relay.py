@@ -11,11 +11,11 @@ from tests.support.clocks import ManualClock
 
 from lavt.assembly.links import injected
 from lavt.cli.relay import flows
-from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
+from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.streams import stream
-from lavt.transport.emulation.link import Link
+from lavt.transport.emulation.link import EmulatedLink
 from lavt.transport.emulation.relay import Relay
 
 ARRIVES_S = 5.0
@@ -289,9 +289,9 @@ def test_the_relay_does_what_the_link_says(name: str) -> None:
     """Through the relay each packet is lost, or leaves, as the model of the link has it, and that is counted."""
     law = LINKS[name]
     with closing(Net(video=DelayConfig(link=law))) as net:
-        asked = injected("video", law.delay_ms, Impairment(**law.model_dump(exclude={"delay_ms"})), 1)
+        asked = injected("video", law.delay_ms, ImpairmentConfig(**law.model_dump(exclude={"delay_ms"})), 1)
         assert asked is not None
-        model = Link(asked)
+        model = EmulatedLink(asked)
         came = through(net, law, count := 60, 10.0)
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]

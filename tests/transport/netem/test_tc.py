@@ -22,13 +22,20 @@ from lavt.clock import MachineClock, pause
 from lavt.config_file import condition
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError, WorkError
-from lavt.transport.emulation.impairment import DISTRIBUTIONS, Flow, Law, Port, check_flows, check_law
-from lavt.transport.netem.correlated_jitter import Wander, wandering
-from lavt.transport.netem.netem import Netem, run_tc
-from lavt.transport.netem.probe import Measured, judge, measure, probes, summary
+from lavt.transport.emulation.impairment import (
+    DISTRIBUTIONS,
+    ExemptPort,
+    ImpairedFlow,
+    Impairment,
+    check_flows,
+    check_law,
+)
+from lavt.transport.netem.correlated_jitter import CorrelatedJitter, wandering
+from lavt.transport.netem.netem import NetemInterface, run_tc
+from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summary
 from lavt.transport.netem.state import (
     NOBODY,
-    Applied,
+    AppliedState,
     Owner,
     StateFiles,
     boot,
@@ -52,8 +59,8 @@ from lavt.transport.netem.tc import (
     set_law,
 )
 
-VIDEO = Flow("video", "udp", 5600, "source", Law(150))
-CONTROL = Flow("control", "udp", 7448, "destination", Law(75))
+VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150))
+CONTROL = ImpairedFlow("control", "udp", 7448, "destination", Impairment(75))
 
 QDISCS = json.dumps([
     {"kind": "prio", "handle": "4c56:", "root": True, "options": {"bands": 6}, "qlen": 0},
@@ -106,31 +113,33 @@ def test_the_commands_of_a_condition_are_these() -> None:
 @pytest.mark.parametrize(
     ("law", "words"),
     [
-        (Law(), "delay 0ms rate 10gbit"),
-        (Law(75, 10), "delay 75ms 10ms distribution normal rate 10gbit"),
-        (Law(75, 10, jitter_correlation=0.9), "delay 75ms rate 10gbit"),
-        (Law(75, 10, jitter_distribution="pareto"), "delay 75ms 10ms distribution pareto rate 10gbit"),
-        (Law(75, loss=0.1), "delay 75ms loss random 10% rate 10gbit"),
-        (Law(75, loss=0.1, loss_burst_packets=5), "delay 75ms loss gemodel 2.222222% 20% rate 10gbit"),
-        (Law(75, rate_bps=2_000_000), "delay 75ms rate 2000000bit"),
-        (Law(75, reorder=0.25), "delay 75ms reorder 25% rate 10gbit"),
-        (Law(0.123), "delay 0.123ms rate 10gbit"),
+        (Impairment(), "delay 0ms rate 10gbit"),
+        (Impairment(75, 10), "delay 75ms 10ms distribution normal rate 10gbit"),
+        (Impairment(75, 10, jitter_correlation=0.9), "delay 75ms rate 10gbit"),
+        (Impairment(75, 10, jitter_distribution="pareto"), "delay 75ms 10ms distribution pareto rate 10gbit"),
+        (Impairment(75, loss=0.1), "delay 75ms loss random 10% rate 10gbit"),
+        (Impairment(75, loss=0.1, loss_burst_packets=5), "delay 75ms loss gemodel 2.222222% 20% rate 10gbit"),
+        (Impairment(75, rate_bps=2_000_000), "delay 75ms rate 2000000bit"),
+        (Impairment(75, reorder=0.25), "delay 75ms reorder 25% rate 10gbit"),
+        (Impairment(0.123), "delay 0.123ms rate 10gbit"),
     ],
 )
-def test_a_law_in_the_words_of_netem(law: Law, words: str) -> None:
+def test_a_law_in_the_words_of_netem(law: Impairment, words: str) -> None:
     """Each law has exactly these arguments, always with limit, delay and rate, as a change keeps what is not named."""
     assert " ".join(netem_arguments(law)) == f"netem limit 10000 {words}"
 
 
 def test_a_long_delay_has_room_for_its_packets() -> None:
     """Of 60 s of delay, 2000 packets a second have room; of less than 5 s there are 10 000."""
-    assert netem_arguments(Law(60_000))[:3] == ["netem", "limit", "120000"]
-    assert netem_arguments(Law(4_900))[:3] == ["netem", "limit", "10000"]
+    assert netem_arguments(Impairment(60_000))[:3] == ["netem", "limit", "120000"]
+    assert netem_arguments(Impairment(4_900))[:3] == ["netem", "limit", "10000"]
 
 
 def test_a_uniform_law_names_the_directory_of_its_table() -> None:
     """A uniform jitter is given by a table of ours: without any, a change would keep that of the law before."""
-    command = set_law("lo", "video", Law(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt")
+    command = set_law(
+        "lo", "video", Impairment(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt"
+    )
     assert command[:3] == ["env", "TC_LIB_DIR=/run/lavt", "tc"]
     assert command[-5:-2] == ["10ms", "distribution", "uniform"]
 
@@ -155,7 +164,7 @@ def options_of(words: list[str]) -> dict[str, Any]:
 
 
 LAWS = st.builds(
-    Law,
+    Impairment,
     delay_ms=st.floats(1, 1000),
     jitter_ms=st.just(0.0) | st.floats(0.1, 1),
     jitter_distribution=st.sampled_from(DISTRIBUTIONS),
@@ -167,11 +176,11 @@ LAWS = st.builds(
 
 
 @given(LAWS)
-def test_any_law_is_read_back_as_it_was_told(law: Law) -> None:
+def test_any_law_is_read_back_as_it_was_told(law: Impairment) -> None:
     """What a netem tells that was given the arguments of a law does not differ from that law."""
     options = options_of(netem_arguments(law))
     there = [Qdisc("prio", "4c56:", "root", {}, 0), Qdisc("netem", "4c01:", "4c56:4", options, 0)]
-    flow = Flow("video", "udp", 5600, "source", law)
+    flow = ImpairedFlow("video", "udp", 5600, "source", law)
     assert difference(flow, there, [expected_filter(each) for each in filters(flow)]) == []
     if law.loss and law.loss_burst_packets > 1:
         assert read_law(options).loss_burst_packets == pytest.approx(law.loss_burst_packets, rel=1e-3)
@@ -185,7 +194,7 @@ def test_what_tc_tells_is_read() -> None:
         ("prio", "4c56:", "root", 0),
         ("netem", "4c01:", "4c56:4", 7),
     ]
-    assert read_law(qdiscs[1].options) == Law(150)
+    assert read_law(qdiscs[1].options) == Impairment(150)
     assert found == [expected_filter(each) for each in filters(VIDEO)]
     assert difference(VIDEO, qdiscs, found) == []
 
@@ -238,18 +247,18 @@ def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("law", "said"),
     [
-        (Law(-1), "below zero"),
-        (Law(float("nan")), "below zero or infinite"),
-        (Law(5, loss=1), "shares below 1"),
-        (Law(5, jitter_ms=6), "delays below zero"),
-        (Law(0, reorder=0.1), "needs a delay"),
-        (Law(5, loss=0.9, loss_burst_packets=2), "longer bursts or less loss"),
-        (Law(5, rate_bps=4), "rate_bps"),
-        (Law(5, 1, 0.5, "pareto"), "correlated jitter is normal"),
-        (Law(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
+        (Impairment(-1), "below zero"),
+        (Impairment(float("nan")), "below zero or infinite"),
+        (Impairment(5, loss=1), "shares below 1"),
+        (Impairment(5, jitter_ms=6), "delays below zero"),
+        (Impairment(0, reorder=0.1), "needs a delay"),
+        (Impairment(5, loss=0.9, loss_burst_packets=2), "longer bursts or less loss"),
+        (Impairment(5, rate_bps=4), "rate_bps"),
+        (Impairment(5, 1, 0.5, "pareto"), "correlated jitter is normal"),
+        (Impairment(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
     ],
 )
-def test_what_netem_cannot_do_is_refused(law: Law, said: str) -> None:
+def test_what_netem_cannot_do_is_refused(law: Impairment, said: str) -> None:
     """A law that netem cannot do is refused in one sentence that names the flow."""
     with pytest.raises(UserError, match=said) as refused:
         check_law("video", law)
@@ -259,19 +268,19 @@ def test_what_netem_cannot_do_is_refused(law: Law, said: str) -> None:
 @pytest.mark.parametrize(
     ("flows", "said"),
     [
-        ([Flow("video", "udp", 5602, "source", Law(5))], "would cover the clock probe"),
-        ([Flow("control", "udp", 5602, "destination", Law(5))], "would cover the clock probe"),
-        ([Flow("video", "udp", 123, "source", Law(5))], "would cover NTP"),
-        ([Flow("control", "tcp", 22, "destination", Law(5))], "would cover ssh"),
-        ([Flow("video", "udp", 0, "source", Law(5))], "is no port"),
-        ([VIDEO, Flow("state", "udp", 5600, "source", Law(5))], "the same packets as video"),
+        ([ImpairedFlow("video", "udp", 5602, "source", Impairment(5))], "would cover the clock probe"),
+        ([ImpairedFlow("control", "udp", 5602, "destination", Impairment(5))], "would cover the clock probe"),
+        ([ImpairedFlow("video", "udp", 123, "source", Impairment(5))], "would cover NTP"),
+        ([ImpairedFlow("control", "tcp", 22, "destination", Impairment(5))], "would cover ssh"),
+        ([ImpairedFlow("video", "udp", 0, "source", Impairment(5))], "is no port"),
+        ([VIDEO, ImpairedFlow("state", "udp", 5600, "source", Impairment(5))], "the same packets as video"),
         ([], "no flow"),
     ],
 )
-def test_flows_that_must_not_be_held_are_refused(flows: list[Flow], said: str) -> None:
+def test_flows_that_must_not_be_held_are_refused(flows: list[ImpairedFlow], said: str) -> None:
     """A flow on a port of NTP, ssh or the clock probe is refused at either end, as are two with the same packets."""
     with pytest.raises(UserError, match=said):
-        check_flows(flows, [Port("udp", 5602, "the clock probe")])
+        check_flows(flows, [ExemptPort("udp", 5602, "the clock probe")])
 
 
 class Tc:
@@ -294,8 +303,8 @@ class Tc:
 def test_a_change_touches_only_what_differs(tmp_path: Path) -> None:
     """A new delay is one change and no filter; what is no longer asked for is held no more, and its filters go."""
     tc = Tc(QDISCS, FILTERS)
-    netem = Netem("eth0", directory=tmp_path, run=tc, stays=True)
-    netem.apply([Flow("video", "udp", 5600, "source", Law(30))])
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc, stays=True)
+    netem.apply([ImpairedFlow("video", "udp", 5600, "source", Impairment(30))])
     one = list(tc.told)
     netem.apply([CONTROL])
 
@@ -314,7 +323,7 @@ def test_a_first_application_that_fails_is_undone(tmp_path: Path) -> None:
     """Where a filter is refused on a free interface, the root is deleted again and nothing is written down."""
     tc = Tc()
     tc.refuses = lambda command: "filter" in command
-    netem = Netem("eth0", directory=tmp_path, run=tc)
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     with pytest.raises(WorkError, match="refused"):
         netem.apply([VIDEO])
 
@@ -325,7 +334,7 @@ def test_a_first_application_that_fails_is_undone(tmp_path: Path) -> None:
 def test_somebody_elses_root_is_refused(tmp_path: Path) -> None:
     """A root with a handle that is not ours is refused, and tc is told nothing."""
     tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
-    netem = Netem("eth0", directory=tmp_path, run=tc)
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(of_anybody=True), netem.check]
     for use in uses:
         with pytest.raises(UserError, match=r"\(fq_codel 8001:\)"):
@@ -337,12 +346,12 @@ def test_what_another_program_owns_is_refused(tmp_path: Path) -> None:
     """A delay that a living process owns, or that was left in place, is not changed by another program of ours."""
     tc = Tc(QDISCS, FILTERS)
     owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(Applied("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
     with pytest.raises(UserError, match=f"there is L3 on eth0, of process {owner[0]}"):
-        Netem("eth0", directory=tmp_path, run=tc).apply([VIDEO])
+        NetemInterface("eth0", directory=tmp_path, run=tc).apply([VIDEO])
     StateFiles(tmp_path).forget("eth0")
     with pytest.raises(UserError, match="a delay on eth0, left in place"):
-        Netem("eth0", directory=tmp_path, run=tc).check()
+        NetemInterface("eth0", directory=tmp_path, run=tc).check()
     assert tc.told == []
 
 
@@ -351,9 +360,9 @@ def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner
     """A program clears neither another's delay nor one left in place, with a file or without; on demand it does."""
     tc, files = Tc(QDISCS, FILTERS), StateFiles(tmp_path)
     if owner is not None:
-        files.write(Applied("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+        files.write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
     there = files.read("eth0")
-    with pytest.raises(UserError, match="there is"), Netem("eth0", directory=tmp_path, run=tc) as netem:
+    with pytest.raises(UserError, match="there is"), NetemInterface("eth0", directory=tmp_path, run=tc) as netem:
         netem.check()
 
     assert netem.clear() == []
@@ -368,8 +377,8 @@ def test_what_was_left_in_place_is_cleared_by_who_leaves_in_place(tmp_path: Path
     """What `lavt netem apply` or a script left, the command that leaves in place owns, and clears."""
     tc = Tc(QDISCS, FILTERS)
     if written:
-        StateFiles(tmp_path).write(Applied("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
-    assert Netem("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
+        StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
+    assert NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
 
 
 @pytest.mark.parametrize("dead", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}])
@@ -377,8 +386,8 @@ def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) 
     """What belongs to an earlier boot, or a process that is no more, is cleared, also where its number came again."""
     tc = Tc(QDISCS, FILTERS)
     fields = {"boot": boot(), "owner": this_process(), **dead}
-    StateFiles(tmp_path).write(Applied("eth0", namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,)))
-    said = Netem("eth1", directory=tmp_path, run=tc).restore()
+    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,)))
+    said = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
 
     assert len(said) == 1
     assert "eth0 was still held (L3 on eth0" in said[0]
@@ -398,9 +407,9 @@ def test_what_cannot_be_put_back_is_said_and_kept(
     tmp_path: Path, interface: str, qdiscs: str, became: str, kept: bool
 ) -> None:
     """What cannot be put back is said with its reason and tried again; an interface that is gone is forgotten."""
-    dead = Applied(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
+    dead = AppliedState(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
     StateFiles(tmp_path).write(dead)
-    said = Netem("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
+    said = NetemInterface("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
 
     assert len(said) == 1
     assert (
@@ -415,9 +424,9 @@ def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: 
     tc = Tc(QDISCS, FILTERS)
     file = {"state": f"netem-{namespace()}-eth0.json", "table": "uniform.dist"}[name]
     (tmp_path / f"{file}.part").mkdir()
-    flow = Flow("video", "udp", 5600, "source", Law(75, 10, jitter_distribution="uniform"))
+    flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, jitter_distribution="uniform"))
     with pytest.raises(UserError, match=r"\(Is a directory\)"):
-        Netem("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
+        NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
 
     assert tc.told == []
     assert not (tmp_path / f"netem-{namespace()}-eth0.json").exists()
@@ -429,7 +438,7 @@ def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: 
 def test_a_broken_file_is_no_application(tmp_path: Path, text: str) -> None:
     """A file that is not one of ours counts as nothing, and is written anew."""
     (tmp_path / f"netem-{namespace()}-eth0.json").write_text(text)
-    netem = Netem("eth0", directory=tmp_path, run=Tc())
+    netem = NetemInterface("eth0", directory=tmp_path, run=Tc())
     assert netem.applied() is None
     netem.apply([VIDEO], condition="L2")
     applied = netem.applied()
@@ -446,14 +455,14 @@ def test_flows_are_read_as_they_were_written() -> None:
 def test_a_name_that_no_interface_has_is_refused(name: str) -> None:
     """An interface's name is up to 15 characters without space and slash, and no option of tc."""
     with pytest.raises(UserError, match="no name of an interface"):
-        Netem(name)
+        NetemInterface(name)
 
 
 def test_correlated_jitter_needs_somebody_who_stays(tmp_path: Path) -> None:
     """What ends at once cannot let a delay wander: refused with what to do instead."""
     with pytest.raises(UserError, match="--hold"):
-        Netem("eth0", directory=tmp_path, run=Tc(), stays=True).apply(
-            [Flow("video", "udp", 5600, "source", Law(75, 5, 0.9))]
+        NetemInterface("eth0", directory=tmp_path, run=Tc(), stays=True).apply(
+            [ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 5, 0.9))]
         )
 
 
@@ -463,7 +472,7 @@ def test_a_wandering_delay_is_correlated_as_asked_and_repeats() -> None:
     def walk(seed: int) -> list[float]:
         values, before = [], None
         for index in range(4000):
-            values.append(wandering(Law(75, 10, 0.9), seed, "video", index, before))
+            values.append(wandering(Impairment(75, 10, 0.9), seed, "video", index, before))
             before = index, values[-1]
         return values
 
@@ -475,7 +484,7 @@ def test_a_wandering_delay_is_correlated_as_asked_and_repeats() -> None:
     assert walk(4) != values
 
 
-WANDERING = Flow("video", "udp", 5600, "source", Law(75, 10, 0.9))
+WANDERING = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, 0.9))
 
 
 def tc_that(does: str, folder: Path) -> dict[str, str]:
@@ -491,7 +500,7 @@ def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) ->
     said = tmp_path / "said"
     does = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
     does += f"; echo $pid $session > {said}"
-    Wander("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
+    CorrelatedJitter("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
     pid, session = said.read_text().split()
 
     assert session == pid
@@ -501,7 +510,7 @@ def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, mo
     """Where the tc that steps a delay has ended by itself, that is a doubt of its flow, and clearing goes on."""
     monkeypatch.setenv("PATH", tc_that("exit 1", tmp_path)["PATH"])
     tc = Tc()
-    netem = Netem("eth0", directory=tmp_path, run=tc)
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     netem.apply([WANDERING, CONTROL])
     limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
     while not netem.doubts() and MachineClock().now().mono_ns < limit_ns:
@@ -519,7 +528,7 @@ def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkey
     monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
     monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
     clock = ManualClock()
-    wander = Wander("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    wander = CorrelatedJitter("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
     clock.mono_ns = NS_PER_S
     now = wander.doubts()
     clock.mono_ns += 1
@@ -532,7 +541,7 @@ def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkey
 
 def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A verification tells what has stopped, beside what was read back and measured."""
-    netem = Netem("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
+    netem = NetemInterface("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
     monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: JUDGED)
     monkeypatch.setattr(netem, "doubts", lambda: ["stopped"])
     assert netem.verify([VIDEO]).reasons == ["stopped"]
@@ -540,7 +549,7 @@ def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pyte
 
 def test_what_is_probed_beside_the_flows() -> None:
     """Beside L4's flows are probed: challenges, the other directions, NTP, ssh and the clock probe."""
-    asked = probes([VIDEO, CONTROL], [Port("udp", 5602, "the clock probe")])
+    asked = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
     assert [(each.name, each.source, each.destination, each.law.delay_ms) for each in asked] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
@@ -556,16 +565,16 @@ def test_what_is_probed_beside_the_flows() -> None:
 def test_frames_are_summed_up() -> None:
     """Of 10 frames one is lost, one passed by a later one and one early; the delays are of those that were held."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
-    found = summary(Law(75, reorder=0.25), 10, delays)
+    found = summary(Impairment(75, reorder=0.25), 10, delays)
 
     assert (found.sent, found.lost, found.early) == (10, 1, 1)
     assert found.reordered == 5
     assert found.median_ms == 75.0
-    assert summary(Law(), 10, []) == Measured(10, 10, 0, 0, None, None, None)
+    assert summary(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
 
 
 JUDGED = {
-    each.name: Measured(50, 0, 0, 0, each.law.delay_ms, each.law.delay_ms, each.law.delay_ms)
+    each.name: ProbeResult(50, 0, 0, 0, each.law.delay_ms, each.law.delay_ms, each.law.delay_ms)
     for each in probes([VIDEO])
 }
 
@@ -573,24 +582,56 @@ JUDGED = {
 @pytest.mark.parametrize(
     ("law", "name", "found", "said"),
     [
-        (Law(150), "video", Measured(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms where 150 ms"),
-        (Law(150), "NTP", Measured(50, 0, 0, 0, 150.0, 150.0, 150.0), "NTP was delayed by 150.00 ms where 0 ms"),
-        (Law(150), "video", Measured(50, 1, 0, 0, 150.0, 150.0, 150.0), "1 of 50 packets were lost where 0.0%"),
-        (Law(150), "video", Measured(50, 0, 2, 0, 150.0, 150.0, 150.0), "2 packets were overtaken"),
-        (Law(150), "video", Measured(50, 50, 0, 0, None, None, None), "no packet came through"),
-        (Law(150, loss=0.5), "video", Measured(50, 5, 0, 0, 150.0, 150.0, 150.0), "5 of 50 packets were lost"),
-        (Law(150, reorder=0.5), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.0), "0 of 50 packets overtook"),
-        (Law(150, 10), "video", Measured(50, 0, 0, 0, 150.0, 150.0, 150.5), "jitter of 0.50 ms"),
-        (Law(150, 10), "video", Measured(50, 0, 0, 0, 90.0, 150.0, 170.0), "delayed by 90.00 ms (p5)"),
-        (Law(150, 10), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
-        (Law(150, 10, 0.9), "video", Measured(50, 0, 0, 0, 140.0, 191.1, 195.0), "191.10 ms (median) where 191.00 ms"),
-        (Law(150, loss=0.1), "video", Measured(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
+        (Impairment(150), "video", ProbeResult(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms where 150 ms"),
+        (
+            Impairment(150),
+            "NTP",
+            ProbeResult(50, 0, 0, 0, 150.0, 150.0, 150.0),
+            "NTP was delayed by 150.00 ms where 0 ms",
+        ),
+        (
+            Impairment(150),
+            "video",
+            ProbeResult(50, 1, 0, 0, 150.0, 150.0, 150.0),
+            "1 of 50 packets were lost where 0.0%",
+        ),
+        (Impairment(150), "video", ProbeResult(50, 0, 2, 0, 150.0, 150.0, 150.0), "2 packets were overtaken"),
+        (Impairment(150), "video", ProbeResult(50, 50, 0, 0, None, None, None), "no packet came through"),
+        (
+            Impairment(150, loss=0.5),
+            "video",
+            ProbeResult(50, 5, 0, 0, 150.0, 150.0, 150.0),
+            "5 of 50 packets were lost",
+        ),
+        (
+            Impairment(150, reorder=0.5),
+            "video",
+            ProbeResult(50, 0, 0, 0, 150.0, 150.0, 150.0),
+            "0 of 50 packets overtook",
+        ),
+        (Impairment(150, 10), "video", ProbeResult(50, 0, 0, 0, 150.0, 150.0, 150.5), "jitter of 0.50 ms"),
+        (Impairment(150, 10), "video", ProbeResult(50, 0, 0, 0, 90.0, 150.0, 170.0), "delayed by 90.00 ms (p5)"),
+        (
+            Impairment(150, 10),
+            "video",
+            ProbeResult(50, 0, 0, 0, 140.0, 191.1, 195.0),
+            "191.10 ms (median) where 191.00 ms",
+        ),
+        (
+            Impairment(150, 10, 0.9),
+            "video",
+            ProbeResult(50, 0, 0, 0, 140.0, 191.1, 195.0),
+            "191.10 ms (median) where 191.00 ms",
+        ),
+        (Impairment(150, loss=0.1), "video", ProbeResult(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
     ],
-)  # fmt: skip
-def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, found: Measured, said: str) -> None:
+)
+def test_what_is_measured_otherwise_than_asked_is_said(
+    law: Impairment, name: str, found: ProbeResult, said: str
+) -> None:
     """Each quantity that is not as asked is one sentence, and what is as asked is none."""
-    flow = Flow("video", "udp", 5600, "source", law)
-    good = Measured(50, round(50 * law.loss), 5 * bool(law.reorder), round(50 * law.reorder), 140.0, 150.0, 160.0)
+    flow = ImpairedFlow("video", "udp", 5600, "source", law)
+    good = ProbeResult(50, round(50 * law.loss), 5 * bool(law.reorder), round(50 * law.reorder), 140.0, 150.0, 160.0)
     reasons = judge([flow], [], {**JUDGED, "video": good, name: found})
 
     assert len(reasons) == 1
@@ -601,16 +642,16 @@ def test_what_is_measured_otherwise_than_asked_is_said(law: Law, name: str, foun
 @pytest.mark.parametrize(
     ("law", "found"),
     [
-        (Law(150, loss=0.1, loss_burst_packets=5), Measured(10, 10, 0, 0, None, None, None)),
-        (Law(150, loss=0.5), Measured(10, 9, 0, 0, None, None, None)),
-        (Law(150, reorder=0.5), Measured(10, 0, 8, 9, None, None, None)),
-        (Law(150, 10), Measured(50, 0, 0, 0, 140.0, 191.0, 195.0)),
-        (Law(150, 10, rate_bps=20_000), Measured(50, 0, 0, 0, 150.0, 400.0, 600.0)),
+        (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(10, 10, 0, 0, None, None, None)),
+        (Impairment(150, loss=0.5), ProbeResult(10, 9, 0, 0, None, None, None)),
+        (Impairment(150, reorder=0.5), ProbeResult(10, 0, 8, 9, None, None, None)),
+        (Impairment(150, 10), ProbeResult(50, 0, 0, 0, 140.0, 191.0, 195.0)),
+        (Impairment(150, 10, rate_bps=20_000), ProbeResult(50, 0, 0, 0, 150.0, 400.0, 600.0)),
     ],
 )
-def test_what_a_law_may_do_is_no_reason(law: Law, found: Measured) -> None:
+def test_what_a_law_may_do_is_no_reason(law: Impairment, found: ProbeResult) -> None:
     """Possible shares of losses and overtaking, a late median that jitter allows, and any where there is a rate."""
-    flow = Flow("video", "udp", 5600, "source", law)
+    flow = ImpairedFlow("video", "udp", 5600, "source", law)
     assert judge([flow], [], {**JUDGED, "video": found}) == []
 
 

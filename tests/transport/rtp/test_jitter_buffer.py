@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import RtpPacket
 
 CAPACITY, MAX_JUMP = 1024, 3000
@@ -29,9 +29,9 @@ def gaps(ordered: Ordered) -> list[int]:
     return [one.sequence for one, lost_before in ordered if lost_before]
 
 
-def started(first: int = 0, hold_ns: int | None = HOLD_NS) -> ReorderBuffer:
+def started(first: int = 0, hold_ns: int | None = HOLD_NS) -> JitterBuffer:
     """Give a buffer past its start: packet `first` has left it, at `STARTED_NS`."""
-    buffer = ReorderBuffer(hold_ns)
+    buffer = JitterBuffer(hold_ns)
     buffer.push(packet(first), 0)
     assert numbers(buffer.expire(STARTED_NS)) == [first % 2**16]
     return buffer
@@ -39,7 +39,7 @@ def started(first: int = 0, hold_ns: int | None = HOLD_NS) -> ReorderBuffer:
 
 def test_start() -> None:
     """The first packets wait one hold, so that the stream begins with the first sent and not the first to arrive."""
-    buffer = ReorderBuffer(HOLD_NS)
+    buffer = JitterBuffer(HOLD_NS)
     assert buffer.next_wake_ns() is None
     assert buffer.highest_sequence == 0
     assert buffer.push(packet(11), 100) == []
@@ -194,7 +194,7 @@ def test_delay_spike() -> None:
 
 def test_bounded_memory() -> None:
     """However long the hold, no more than a fixed number of packets is held."""
-    buffer = ReorderBuffer(hold_ns=10**15)
+    buffer = JitterBuffer(hold_ns=10**15)
     released = [buffer.push(packet(2 * number), number) for number in range(CAPACITY + 50)]
     assert sum(len(ordered) for ordered in released) == 50
 
@@ -213,7 +213,7 @@ def test_bounded_memory_of_losses() -> None:
 @given(st.integers(0, 2**16 - 1), st.permutations(range(30)), st.integers(0, 2**32))
 def test_any_order(first: int, order: list[int], start_ns: int) -> None:
     """Packets that arrive within one hold leave in the order they were sent, none missing."""
-    buffer = ReorderBuffer(HOLD_NS)
+    buffer = JitterBuffer(HOLD_NS)
     ordered = [
         one for at, number in enumerate(order) for one in buffer.push(packet(first + number), start_ns + at * 1000)
     ]
@@ -229,7 +229,7 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 60), st.integers(0, 8 * NS_PER_MS))
 @given(st.integers(0, 2**16 - 1), ARRIVALS)
 def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
     """Whatever arrives when: order is kept, gaps are told, each packet is accounted for and held one hold at most."""
-    buffer = ReorderBuffer(HOLD_NS)
+    buffer = JitterBuffer(HOLD_NS)
     ordered: Ordered = []
     now_ns = 0
     for number, pause_ns in arrivals:
@@ -249,7 +249,7 @@ def test_any_arrivals(first: int, arrivals: list[tuple[int, int]]) -> None:
 @given(st.lists(st.tuples(st.integers(0, 2**16 - 1), st.integers(0, 1), st.integers(0, HOLD_NS)), max_size=60))
 def test_any_numbers(arrivals: list[tuple[int, int, int]]) -> None:
     """No sequence numbers and sources break the buffer, and after them an orderly stream goes through."""
-    buffer = ReorderBuffer(HOLD_NS)
+    buffer = JitterBuffer(HOLD_NS)
     now_ns = 0
     for sequence, ssrc, pause_ns in arrivals:
         now_ns += pause_ns
@@ -284,10 +284,10 @@ def test_recovered_that_nobody_waits_for() -> None:
     counts = buffer.recovered, buffer.lost, buffer.late, buffer.duplicate, buffer.stray
     assert counts == (0, 1, 0, 0, 0)
     assert numbers(buffer.push(packet(3), STARTED_NS + HOLD_NS)) == [3]
-    assert ReorderBuffer(HOLD_NS).push_recovered(packet(0), 0) == []
+    assert JitterBuffer(HOLD_NS).push_recovered(packet(0), 0) == []
 
 
-def hold_of(buffer: ReorderBuffer, number: int, now_ns: int) -> int:
+def hold_of(buffer: JitterBuffer, number: int, now_ns: int) -> int:
     """Let packet `number` be lost for good at `now_ns`; give how long it was waited for."""
     assert buffer.push(packet(number + 1), now_ns) == []
     wake_ns = buffer.next_wake_ns()
@@ -377,7 +377,7 @@ def test_the_hold_stays_what_repairs_need() -> None:
 @given(ARRIVALS)
 def test_any_arrivals_with_a_hold_that_follows(arrivals: list[tuple[int, int]]) -> None:
     """Whatever arrives when, no packet is held longer than the longest hold, and each is accounted for."""
-    buffer = ReorderBuffer()
+    buffer = JitterBuffer()
     left, now_ns = 0, 0
     for number, pause_ns in arrivals:
         now_ns += pause_ns

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, Picture
 from lavt.streams import stream
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
-from lavt.transport.rtp.jitter_buffer import Ordered, ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer, parse_packet
 from lavt.transport.video.h264 import Decoder, Encoder
 from lavt.transport.video.stamp import read_stamp, rtp_timestamp, stamp_agrees, write_stamp
@@ -59,7 +59,7 @@ def test_reordered(sent: Sent) -> None:
     for number, datagrams in enumerate(sent.datagrams):
         delays_ns = random.integers(0, LEAST_HOLD_NS - NS_PER_MS, len(datagrams))
         arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
-    buffer, depacketizer, decoder = ReorderBuffer(), Depacketizer(), Decoder()
+    buffer, depacketizer, decoder = JitterBuffer(), Depacketizer(), Decoder()
     ordered: Ordered = []
     for now_ns, datagram in sorted(arrivals):
         ordered += buffer.push(parse_packet(datagram), now_ns)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.ntp_time import ntp_of_elapsed, short_time
 from lavt.transport.rtp.reception_stats import Reception, ReceptionSample
 from lavt.transport.rtp.rtcp import Announcement, SenderReport
@@ -21,7 +21,7 @@ class Stream:
     """A reception with its reorder buffer, fed as the receiver node does."""
 
     def __init__(self) -> None:
-        self.reorder = ReorderBuffer()
+        self.reorder = JitterBuffer()
         self.reception = Reception(self.reorder)
 
     def arrive(self, sequence: int, at_ns: int, timestamp: int = 0, ssrc: int = SSRC) -> None:
@@ -238,7 +238,7 @@ def test_sender_report_comes_back() -> None:
 
 def test_a_round_trip_of_less_than_a_step_is_known() -> None:
     """It is 0 then, and not unknown."""
-    reception = Reception(ReorderBuffer())
+    reception = Reception(JitterBuffer())
     sent_ns = 5 * NS_PER_S
     answer = ReferenceAnswer(1, short_time(ntp_of_elapsed(sent_ns)), 0)
     reception.note_announcement(Announcement((), (answer,)), 1, sent_ns + 1000)

@@ -17,7 +17,14 @@ pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from lavt.transport.security.envelope import TRAILER_BYTES, NoSeal, OpenedState, OperatorSeal, Reply, VehicleSeal
+from lavt.transport.security.envelope import (
+    TRAILER_BYTES,
+    NoVehicleAuthenticator,
+    OperatorAuthenticator,
+    VehicleAuthenticator,
+    VerifiedReply,
+    VerifiedState,
+)
 from lavt.transport.security.keys import PrivateKey
 
 KEPT, LONGEST_BYTES = 8, 1280
@@ -38,10 +45,12 @@ OPERATORS = {"alice": ALICE.public, "bob": BOB.public}
 class Pair:
     """A vehicle and an operator, and nothing between them but bytes."""
 
-    def __init__(self, who: str = "alice", key: PrivateKey = ALICE, vehicle: VehicleSeal | None = None) -> None:
+    def __init__(
+        self, who: str = "alice", key: PrivateKey = ALICE, vehicle: VehicleAuthenticator | None = None
+    ) -> None:
         self.who = who
-        self.vehicle = vehicle or VehicleSeal("car", VEHICLE, OPERATORS)
-        self.operator = OperatorSeal("car", who, key, VEHICLE.public)
+        self.vehicle = vehicle or VehicleAuthenticator("car", VEHICLE, OPERATORS)
+        self.operator = OperatorAuthenticator("car", who, key, VEHICLE.public)
 
     def request(self, operation: str = "hold", number: int = 0) -> bytes:
         request = SessionRequest(operation, self.who, 5, number)  # type: ignore[arg-type]
@@ -149,7 +158,7 @@ def test_the_code_of_one_kind_serves_for_no_other(pair: Pair) -> None:
 def test_a_command_for_another_vehicle_is_refused(pair: Pair) -> None:
     """A signature serves for one vehicle only."""
     pair.hold()
-    elsewhere = OperatorSeal("truck", "alice", ALICE, VEHICLE.public)
+    elsewhere = OperatorAuthenticator("truck", "alice", ALICE, VEHICLE.public)
     assert pair.vehicle.open_command(elsewhere.seal_command(encode(COMMAND))) is None
 
 
@@ -168,7 +177,7 @@ def test_a_request_to_another_process_of_the_server_is_not_looked_at(pair: Pair)
     """What was asked of a server before it was started anew is stale after it."""
     pair.hold()
     data = pair.request("hold")
-    anew = VehicleSeal("car", VEHICLE, OPERATORS).open_request("session", data)
+    anew = VehicleAuthenticator("car", VEHICLE, OPERATORS).open_request("session", data)
     assert anew is not None
     assert anew.is_stale
 
@@ -245,7 +254,7 @@ def test_a_reply_counts_once(pair: Pair) -> None:
         assert (
             pair.operator.open_reply("session", sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :]).body is None
         )
-    other = VehicleSeal("car", MALLORY, OPERATORS)
+    other = VehicleAuthenticator("car", MALLORY, OPERATORS)
     asked = other.open_request("session", data)
     assert asked is not None
     assert pair.operator.open_reply("session", other.seal_reply(asked, b"")).again is None
@@ -260,7 +269,7 @@ def test_a_reply_that_cannot_be_decrypted_is_a_forgery(pair: Pair, changes: dict
     request = pair.vehicle.open_request("session", pair.request())
     assert request is not None
     unreadable = pair.vehicle.seal_reply(replace(request, **changes), encode(GRANTED))
-    assert pair.operator.open_reply("session", unreadable) == Reply(None, None)
+    assert pair.operator.open_reply("session", unreadable) == VerifiedReply(None, None)
     assert pair.operator.counts["session_replies_forged"] == 1
     assert pair.operator.open_reply("session", pair.vehicle.seal_reply(request, encode(GRANTED))).body is not None
 
@@ -274,8 +283,8 @@ def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
         assert request is not None
         replies.append(pair.vehicle.seal_reply(request, b"" if request.is_stale else encode(GRANTED)))
     assert pair.operator.open_reply("session", replies[1]).again is not None
-    assert pair.operator.open_reply("session", replies[0]) == Reply(None, None)
-    assert pair.operator.open_reply("session", replies[1]) == Reply(None, None)
+    assert pair.operator.open_reply("session", replies[0]) == VerifiedReply(None, None)
+    assert pair.operator.open_reply("session", replies[1]) == VerifiedReply(None, None)
 
 
 def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
@@ -284,12 +293,12 @@ def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
     first, second = pair.vehicle.seal_state(b"first"), pair.vehicle.seal_state(b"second")
     assert pair.operator.open_state(second).body == b"second"
     for old in (second, first):
-        assert pair.operator.open_state(old) == OpenedState(None, ask=False)
+        assert pair.operator.open_state(old) == VerifiedState(None, ask=False)
     assert pair.operator.counts["states_replayed"] == 2
-    forged = VehicleSeal("car", MALLORY, OPERATORS)
+    forged = VehicleAuthenticator("car", MALLORY, OPERATORS)
     forged._instance = pair.vehicle._instance
     forged._states = 100
-    assert pair.operator.open_state(forged.seal_state(b"forged")) == OpenedState(None, ask=False)
+    assert pair.operator.open_state(forged.seal_state(b"forged")) == VerifiedState(None, ask=False)
     assert pair.operator.counts["states_forged"] == 1
 
 
@@ -300,14 +309,14 @@ def test_a_reply_makes_no_old_state_new(pair: Pair) -> None:
     assert pair.operator.open_state(state).body == b"state"
     pair.ask(pair.request())
     assert not pair.operator.is_next_state(state)
-    assert pair.operator.open_state(state) == OpenedState(None, ask=False)
+    assert pair.operator.open_state(state) == VerifiedState(None, ask=False)
     assert pair.operator.counts["states_replayed"] == 1
 
 
 def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pair) -> None:
     """A state of a server's process that has not answered a request may be a recorded one: it is asked first."""
     pair.hold()
-    anew = VehicleSeal("car", VEHICLE, OPERATORS)
+    anew = VehicleAuthenticator("car", VEHICLE, OPERATORS)
     opened = pair.operator.open_state(anew.seal_state(b"new"))
     assert opened.body is None
     assert opened.ask
@@ -342,10 +351,10 @@ def test_requests_without_replies_are_bounded(pair: Pair) -> None:
     requests += [pair.vehicle.open_request("session", pair.request("hold", number)) for number in range(3 * KEPT)]
     assert len(pair.operator._asked) == KEPT
     replies = [pair.vehicle.seal_reply(request, encode(GRANTED)) for request in requests if request is not None]
-    assert pair.operator.open_reply("netem", replies[0]) == Reply(None, None)
-    assert pair.operator.open_reply("session", replies[-KEPT - 1]) == Reply(None, None)
+    assert pair.operator.open_reply("netem", replies[0]) == VerifiedReply(None, None)
+    assert pair.operator.open_reply("session", replies[-KEPT - 1]) == VerifiedReply(None, None)
     assert len(pair.operator._asked) == KEPT
-    assert pair.operator.open_reply("session", replies[-KEPT]) != Reply(None, None)
+    assert pair.operator.open_reply("session", replies[-KEPT]) != VerifiedReply(None, None)
 
 
 def test_agreements_with_clients_are_bounded(pair: Pair) -> None:
@@ -397,12 +406,12 @@ def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
     assert pair.vehicle.open_request("session", data) is None
     assert pair.vehicle.open_request("netem", data) is None
     assert pair.operator.open_reply("session", data).body is None
-    assert pair.operator.open_state(data) == OpenedState(None, ask=False)
+    assert pair.operator.open_state(data) == VerifiedState(None, ask=False)
 
 
 def test_without_keys_everything_is_as_it_is() -> None:
     """Where nothing is signed, bytes go in and out unchanged."""
-    seal = NoSeal()
+    seal = NoVehicleAuthenticator()
     request = seal.open_request("session", b"request")
     assert request is not None
     assert {seal.body(b"x"), seal.open_command(b"x"), seal.seal_state(b"x"), seal.seal_reply(request, b"x")} == {b"x"}

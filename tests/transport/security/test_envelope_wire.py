@@ -10,13 +10,13 @@ import pytest
 
 from lavt.domain import SessionReply, SessionRequest
 from lavt.transport.messages import MAX_MESSAGE_BYTES, encode
-from lavt.transport.security.envelope import LONGEST_BYTES, OperatorSeal, VehicleSeal
+from lavt.transport.security.envelope import LONGEST_BYTES, OperatorAuthenticator, VehicleAuthenticator
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from lavt.transport.security.keys import Agreement, PrivateKey, decrypt
+from lavt.transport.security.keys import KeyAgreement, PrivateKey, decrypt
 
 TOKEN = bytes(range(16))
 HOLD = encode(SessionRequest("hold", "alice", 5, 0))
@@ -28,8 +28,8 @@ class Session:
     """A vehicle, and an operator who has control of it."""
 
     def __init__(self) -> None:
-        self.vehicle = VehicleSeal("car", VEHICLE, {"alice": ALICE.public})
-        self.operator = OperatorSeal("car", "alice", ALICE, VEHICLE.public)
+        self.vehicle = VehicleAuthenticator("car", VEHICLE, {"alice": ALICE.public})
+        self.operator = OperatorAuthenticator("car", "alice", ALICE, VEHICLE.public)
         data = self.operator.seal_request("session", HOLD)
         for body in (b"", GRANTED):
             request = self.vehicle.open_request("session", data)
@@ -75,7 +75,7 @@ def test_bytes_of_what_is_signed_and_carries_a_code(session: Session) -> None:
 @pytest.mark.parametrize("stale", [False, True])
 def test_bytes_of_a_reply(session: Session, *, stale: bool) -> None:
     """A reply has the bytes that `docs/wire.md` describes, and a client of another make reads it."""
-    client = session.operator._agreement = Agreement()
+    client = session.operator._agreement = KeyAgreement()
     query = session.operator.seal_request("session", HOLD)
     request = session.vehicle.open_request("session", query)
     assert request is not None

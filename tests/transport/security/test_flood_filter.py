@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_S, PATH_POINTS, Command
 from lavt.streams import stream
 from lavt.transport.messages import VERSION, encode
-from lavt.transport.security.flood_filter import Budget, CommandScreen, may_be_obeyed
+from lavt.transport.security.flood_filter import FloodFilter, RateLimiter, may_be_obeyed
 
 OTHERS_PER_S = 200
 """The limit that docs/wire.md states."""
@@ -19,12 +19,12 @@ COMMAND = Command(EPOCH, SEQUENCE + 1, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POI
 FLOOD_PER_S = 10_000
 
 
-def new_screen() -> CommandScreen:
+def new_screen() -> FloodFilter:
     """Make a screen to which everything that ends with a zero byte is the holder's."""
-    return CommandScreen(lambda: (EPOCH, SEQUENCE), lambda data: data.endswith(b"\0"))
+    return FloodFilter(lambda: (EPOCH, SEQUENCE), lambda data: data.endswith(b"\0"))
 
 
-def passed(screen: CommandScreen, bodies: list[bytes], *, from_holder: bool = True) -> int:
+def passed(screen: FloodFilter, bodies: list[bytes], *, from_holder: bool = True) -> int:
     """Tell how many of `bodies`, which come within one second, go on."""
     end = b"\0" if from_holder else b"\1"
     return sum(screen.passes(body + end, body, number * NS_PER_S // len(bodies)) for number, body in enumerate(bodies))
@@ -54,7 +54,7 @@ def test_of_a_flood_little_goes_on() -> None:
         assert screen.counts["commands_screened_out"] == FLOOD_PER_S - OTHERS_PER_S
 
 
-def goes_on_always(screen: CommandScreen, command: Command) -> bool:
+def goes_on_always(screen: FloodFilter, command: Command) -> bool:
     """Tell whether a command goes on however often it comes, and not within what old commands may take."""
     body = encode(command)
     return passed(screen, [body] * (OTHERS_PER_S + 1)) == OTHERS_PER_S + 1
@@ -74,7 +74,7 @@ def test_commands_up_to_the_newest_one_noted_are_old(noted: list[int]) -> None:
 def test_a_new_epoch_begins_with_its_own_sequence(next_epoch: int) -> None:
     """The newest command of the epoch before makes none of the next epoch old; the newest of the next one does."""
     in_force = [(EPOCH, SEQUENCE)]
-    screen = CommandScreen(lambda: in_force[0], lambda _data: True)
+    screen = FloodFilter(lambda: in_force[0], lambda _data: True)
     screen.note(encode(replace(COMMAND, sequence=SEQUENCE + 5)))
     in_force[0] = next_epoch, 0
     first = replace(COMMAND, epoch=next_epoch, sequence=1)
@@ -96,7 +96,7 @@ def test_what_is_not_the_holders_cannot_hide_what_is() -> None:
 
 def test_the_budget_is_for_each_second() -> None:
     """So many are taken in a second, none more, and as many again in the next."""
-    budget = Budget(3)
+    budget = RateLimiter(3)
     assert [budget.take(at) for at in (5, 6, 7, 8, 9)] == [True, True, True, False, False]
     assert [budget.take(at) for at in (NS_PER_S - 1, NS_PER_S, NS_PER_S + 1)] == [False, True, True]
     assert [budget.take(2 * NS_PER_S - 1) for _ in range(2)] == [True, False]

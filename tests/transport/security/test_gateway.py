@@ -10,8 +10,8 @@ from lavt.domain import NS_PER_S, PATH_POINTS, Command, Now, SessionReply, Sessi
 from lavt.node import Send
 from lavt.transport import zenoh_link
 from lavt.transport.messages import encode
-from lavt.transport.security.envelope import NoSeal, OperatorSeal, VehicleSeal
-from lavt.transport.security.gateway import ClientDoor, OpenDoor, ServerDoor
+from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
@@ -35,16 +35,16 @@ class Both:
         self.outside: list[Send] = []
         self.in_the_car: list[tuple[str, bytes, Any]] = []
         self.at_the_desk: list[tuple[str, bytes]] = []
-        self.car = ServerDoor(
+        self.car = ServerGateway(
             lambda channel, payload, _arrived, peer: self.in_the_car.append((channel, payload, peer)),
             lambda *sends: self.outside.extend(sends),
             lambda: (7, 2),
-            VehicleSeal("car", vehicle, {"alice": alice.public}),
+            VehicleAuthenticator("car", vehicle, {"alice": alice.public}),
         )
-        self.desk = ClientDoor(
+        self.desk = ClientGateway(
             lambda channel, payload, _arrived, _peer: self.at_the_desk.append((channel, payload)),
             lambda *sends: self.outside.extend(sends),
-            OperatorSeal("car", "alice", alice, vehicle.public),
+            OperatorAuthenticator("car", "alice", alice, vehicle.public),
         )
         self.desk._send_soon = lambda send: self.outside.append(send)  # type: ignore[method-assign]  # no thread
 
@@ -164,9 +164,16 @@ def test_states_of_a_known_server_cause_no_query(both: Both) -> None:
 def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
     """Of ten thousand queries in a second as many are looked at as one client could ever ask."""
     heard: list[bytes] = []
-    door = both.car if signed else ServerDoor(
-        lambda _channel, payload, _arrived, _peer: heard.append(payload), lambda *_: None, lambda: (7, 2), NoSeal()
-    )  # fmt: skip
+    door = (
+        both.car
+        if signed
+        else ServerGateway(
+            lambda _channel, payload, _arrived, _peer: heard.append(payload),
+            lambda *_: None,
+            lambda: (7, 2),
+            NoVehicleAuthenticator(),
+        )
+    )
     for number in range(10_000):
         door.let_in("session", b"garbage", Now(2 * NS_PER_S, 0), number)
     assert door.counts["session_requests_screened_out"] == 10_000 - QUERIES_PER_S
@@ -241,7 +248,9 @@ def test_a_flood_does_not_hide_what_is_the_holders(both: Both) -> None:
 def test_requests_that_are_never_answered_are_forgotten() -> None:
     """The door remembers the newest requests, as many as a link keeps queries, and answers each of them once."""
     carried: list[Send] = []
-    door = ServerDoor(lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NoSeal())
+    door = ServerGateway(
+        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NoVehicleAuthenticator()
+    )
     for number in range(1000):
         door.let_in("session", b"request", Now(number * NS_PER_S, 0), number)
     for _ in range(2):
@@ -254,7 +263,7 @@ def test_an_open_door_changes_nothing() -> None:
     """Where nothing is signed the operator's door is none."""
     delivered: list[Any] = []
     sent: list[Send] = []
-    door = OpenDoor(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))
+    door = OpenClientGateway(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))
     door.let_in("state", b"state", Now(1, 2), None)
     door.send(Send("control", b"command"))
     assert delivered == [("state", b"state", Now(1, 2), None)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lavt.errors import UserError
-from lavt.transport.security.keys import Agreement, decrypt, encrypt, load_private, load_public
+from lavt.transport.security.keys import KeyAgreement, decrypt, encrypt, load_private, load_public
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
 
@@ -72,7 +72,7 @@ def test_a_file_that_is_not_there_or_no_key_is_refused(tmp_path: Path, load: Cal
 
 def test_two_ends_agree_on_a_secret() -> None:
     """Both ends get the same 32 bytes; another context or another end gives others, and what is no key gives none."""
-    one, other, third = Agreement(), Agreement(), Agreement()
+    one, other, third = KeyAgreement(), KeyAgreement(), KeyAgreement()
     secret = one.secret(other.public, b"context")
     assert secret == other.secret(one.public, b"context")
     assert secret is not None

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import Lane, Picture, SeenLane
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, Packetizer, parse_packet
-from lavt.transport.video.frame_codec import KEPT_PICTURES, HandedOver, LaneReceiver, LaneSender
+from lavt.transport.video.frame_codec import KEPT_PICTURES, InMemoryFrameCodec, LaneReceiver, LaneSender
 
 numbers = st.floats(allow_nan=False)
 STAMP_NS = 1_790_000_000_123_456_789
@@ -16,7 +16,7 @@ STAMP_NS = 1_790_000_000_123_456_789
 
 def through_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
     """Send access units as packets, one of which may be lost, and give what arrives."""
-    packetizer, reorder, depacketizer = Packetizer(7, 65_530), ReorderBuffer(), Depacketizer()
+    packetizer, reorder, depacketizer = Packetizer(7, 65_530), JitterBuffer(), Depacketizer()
     packets = [each for number, unit in enumerate(access_units) for each in packetizer.packetize(unit, number)]
     assert len(packets) == len(access_units), "one packet each"
     ordered = [
@@ -58,12 +58,12 @@ def test_two_lanes_of_a_standing_car_differ() -> None:
 def test_what_is_no_picture_gives_none(data: bytes) -> None:
     """Access units of something else give no picture, and raise nothing."""
     assert LaneReceiver().decode(data) is None
-    assert HandedOver().decode(data) is None
+    assert InMemoryFrameCodec().decode(data) is None
 
 
 def test_pixels_arrive_as_they_were_rendered() -> None:
     """A picture handed over has every pixel that it had when it was encoded, its stamp can be read, once."""
-    between = HandedOver()
+    between = InMemoryFrameCodec()
     shown = between.write_stamp(picture(1), STAMP_NS)
     (unit,) = through_rtp([between.encode(shown, keyframe=False)])
     expected = shown.copy()
@@ -77,7 +77,7 @@ def test_pixels_arrive_as_they_were_rendered() -> None:
 
 def test_a_lost_picture_spoils_no_other() -> None:
     """Each access unit stands alone: after a loss the next one is complete, and the lost picture is let go."""
-    between = HandedOver()
+    between = InMemoryFrameCodec()
     units = through_rtp([between.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
     assert [unit.complete for unit in units] == [True, True, True]
     received = [between.decode(unit.data) for unit in units]
@@ -89,7 +89,7 @@ def test_a_lost_picture_spoils_no_other() -> None:
 
 def test_pictures_that_never_arrive_fill_no_memory() -> None:
     """When nothing arrives, only so many pictures are kept, the newest."""
-    between = HandedOver()
+    between = InMemoryFrameCodec()
     units = [between.encode(picture(0)[:1], keyframe=False) for _ in range(KEPT_PICTURES + 5)]
     assert between.decode(units[4]) is None
     assert between.decode(units[5]) is not None

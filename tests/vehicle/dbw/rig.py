@@ -12,8 +12,8 @@ import pytest
 
 from lavt.assembly.dbw import load_profile
 from lavt.domain import NS_PER_MS, Actuation, VehicleEvent
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
@@ -58,16 +58,16 @@ class Rig:
         self.profile: Profile = name if isinstance(name, Profile) else profile(name)
         self.generation, self.tick_ns = generation, 20 * NS_PER_MS
         adapter_keys = {key: keys.pop(key) for key in ("hindrance",) if key in keys}
-        self.adapter = Adapter(self.profile, start_ns=START_NS, **adapter_keys)
+        self.adapter = ByWireAdapter(self.profile, start_ns=START_NS, **adapter_keys)
         self.simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
         self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **keys)
         self.car = SoftwareCar(self.kit, self.simulator)
         self.now_ns = START_NS
         self.actuation = Actuation(0.0, 0.0, 1.0)
         self.is_ticking, self.is_cut = True, False
-        self.spoil: Callable[[Frame], Frame | None] = lambda frame: frame
-        self.lose_report: Callable[[Frame], bool] = lambda _: False
-        self.sent: list[tuple[int, Frame]] = []
+        self.spoil: Callable[[CanFrame], CanFrame | None] = lambda frame: frame
+        self.lose_report: Callable[[CanFrame], bool] = lambda _: False
+        self.sent: list[tuple[int, CanFrame]] = []
         self.moments: list[Moment] = []
         self.events: list[VehicleEvent] = []
         self._next_tick_ns = START_NS

@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 from tests.vehicle.dbw.rig import Rig, driving, started
 
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.vehicle import Reached
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.vehicle import ReachedCommand
 
 COMMAND, REPORT = 0x064, 0x065
 FIRST_RAD, SECOND_RAD = 0.012, 0.014
@@ -30,7 +30,7 @@ class ChosenReports:
         self.before = self._command = self._data[2:4]
         rig.adapter.take_reached()
 
-    def _replace(self, frame: Frame) -> bool:
+    def _replace(self, frame: CanFrame) -> bool:
         if frame.identifier != REPORT:
             return False
         self._data = frame.data
@@ -43,8 +43,8 @@ class ChosenReports:
         """Where the wheel was reported to be."""
         return self._data[:2]
 
-    def _report(self) -> Frame:
-        return Frame(REPORT, self._data[:2] + self._command + self._data[4:])
+    def _report(self) -> CanFrame:
+        return CanFrame(REPORT, self._data[:2] + self._command + self._data[4:])
 
     def steer(self, steering_rad: float) -> tuple[int, bytes]:
         """Let a tick ask for an angle; gives when that was, and the angle on the bus."""
@@ -54,7 +54,7 @@ class ChosenReports:
             frame.data[:2] for _, frame in reversed(self.rig.sent) if frame.identifier == COMMAND
         )
 
-    def choose(self, command: bytes) -> list[Reached]:
+    def choose(self, command: bytes) -> list[ReachedCommand]:
         """Report a command now; gives what has reached the kit by that. The same report again is no news."""
         self._command = command
         self.rig.adapter.receive(self._report(), self.rig.now_ns)
@@ -70,7 +70,7 @@ def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool
     car = ChosenReports(driving(1))
     asked_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
-    assert car.choose(command) == [Reached(asked_ns, car.rig.now_ns)] * is_known
+    assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)] * is_known
 
 
 def test_only_old_commands_are_forgotten() -> None:
@@ -81,7 +81,7 @@ def test_only_old_commands_are_forgotten() -> None:
     asked_ns, second = car.steer(SECOND_RAD)
     car.rig.run_ms(120)
     assert car.choose(first) == []
-    assert car.choose(second) == [Reached(asked_ns, car.rig.now_ns)]
+    assert car.choose(second) == [ReachedCommand(asked_ns, car.rig.now_ns)]
 
 
 def test_all_old_commands_are_forgotten() -> None:
@@ -104,15 +104,15 @@ def test_a_command_that_is_given_again_reaches_the_kit_again() -> None:
     asked = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     for asked_ns, command in asked:
         car.rig.run_ms(5)
-        assert car.choose(command) == [Reached(asked_ns, car.rig.now_ns)]
+        assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)]
 
 
 def test_overtaken_commands_reach_nothing() -> None:
     """Where the kit reports a command those before it were overtaken; those after it are still expected."""
     car = ChosenReports(driving(1))
     (_, first), (second_ns, second), (third_ns, _) = [car.steer(each) for each in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
-    assert car.choose(second) == [Reached(second_ns, car.rig.now_ns)]
-    assert car.choose(first) == [Reached(third_ns, car.rig.now_ns)]
+    assert car.choose(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
+    assert car.choose(first) == [ReachedCommand(third_ns, car.rig.now_ns)]
     assert car.choose(second) == []
 
 
@@ -121,7 +121,7 @@ def test_a_command_that_was_not_sent_changes_nothing() -> None:
     car = ChosenReports(driving(1))
     asked_ns, command = car.steer(FIRST_RAD)
     assert car.choose(OTHER) == []
-    assert car.choose(command) == [Reached(asked_ns, car.rig.now_ns)]
+    assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)]
 
 
 def test_a_repeated_command_is_expected_once() -> None:

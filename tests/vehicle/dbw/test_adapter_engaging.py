@@ -12,8 +12,8 @@ import pytest
 from tests.vehicle.dbw.rig import COARSE_MS, START_NS, Rig, both, driving, profile, road, started
 
 from lavt.domain import NS_PER_MS, Actuation
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS
 from lavt.vehicle.dbw.states import TABLE
@@ -85,10 +85,10 @@ def test_clearing_frames_of_generation_1() -> None:
     rig.run_until(lambda rig: rig.state == "enabling")
     frames = [frame for _, frame in rig.sent]
     a_set = [
-        Frame(0x064, bytes([0, 0, 2, 0])),
-        Frame(0x060, bytes([0, 0, 0, 2])),
-        Frame(0x062, bytes([0, 0, 0, 2])),
-        Frame(0x066, bytes([0x80])),
+        CanFrame(0x064, bytes([0, 0, 2, 0])),
+        CanFrame(0x060, bytes([0, 0, 0, 2])),
+        CanFrame(0x062, bytes([0, 0, 0, 2])),
+        CanFrame(0x066, bytes([0x80])),
     ]
     assert frames[:12] == a_set * 3
     times = sorted({at_ns for at_ns, _ in rig.sent})[:3]
@@ -182,9 +182,9 @@ def test_no_park_by_one_report(generation: int) -> None:
     """PARK is asked for after 300 ms of standing: not because a report or two of a rolling car say that it stands."""
     rig = driving(generation)
     speed = {1: 0x065, 2: 0x107}[generation]
-    lost: list[Frame] = []
+    lost: list[CanFrame] = []
 
-    def lose(frame: Frame) -> bool:
+    def lose(frame: CanFrame) -> bool:
         lost.extend([frame] * (frame.identifier == speed))
         return frame.identifier == speed
 
@@ -196,7 +196,7 @@ def test_no_park_by_one_report(generation: int) -> None:
         standing = standing[:-1] + bytes([frame_crc8(speed, standing[:-1])])
     rig.adapter.engage(False, rig.now_ns)
     for _ in range(10):
-        rig.adapter.receive(Frame(speed, standing), rig.now_ns)
+        rig.adapter.receive(CanFrame(speed, standing), rig.now_ns)
         rig.run_ms(20)
     assert rig.adapter.state().speed_mps == 0.0
     assert rig.speed_mps > 3.0
@@ -235,7 +235,7 @@ def test_not_wanted_while_enabling(generation: int) -> None:
 def test_not_engaged_while_rolling(generation: int) -> None:
     """A car that moves is not engaged."""
     rig = driving(generation)
-    rig.adapter = Adapter(rig.profile, start_ns=rig.now_ns)
+    rig.adapter = ByWireAdapter(rig.profile, start_ns=rig.now_ns)
     rig.is_ticking = False
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
@@ -334,7 +334,7 @@ def test_drives_as_the_simulator(generation: int) -> None:
 
 def test_wake() -> None:
     """The adapter is never asleep longer than 100 ms, nor over what it has to do."""
-    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     assert adapter.next_wake_ns() == START_NS + 100 * NS_PER_MS
     rig = driving(1)
     for _ in range(50):

@@ -14,7 +14,7 @@ import pytest
 from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.adapter import SEPARATOR
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 from lavt.vehicle.software_car.state import AXES, Gear
@@ -68,13 +68,13 @@ def test_counter_stuck(generation: int) -> None:
     rig = driving(generation)
     stuck: list[int] = []
 
-    def spoil(frame: Frame) -> Frame:
+    def spoil(frame: CanFrame) -> CanFrame:
         if frame.identifier != STEERING[generation]:
             return frame
         place = 7 if generation == 1 else 6
         stuck.append(frame.data[place])
         data = frame.data[:place] + bytes([stuck[0]]) + frame.data[place + 1 :]
-        return sealed(frame.identifier, data) if generation == 2 else Frame(frame.identifier, data)
+        return sealed(frame.identifier, data) if generation == 2 else CanFrame(frame.identifier, data)
 
     rig.spoil = spoil
     rig.run_until(lambda _: len(stuck) == 2)
@@ -84,7 +84,7 @@ def test_counter_stuck(generation: int) -> None:
     assert not rig.adapter.state().is_engaged
 
 
-def sealed(identifier: int, data: bytes) -> Frame:
+def sealed(identifier: int, data: bytes) -> CanFrame:
     """Give a frame its CRC by division, bit by bit."""
     number = int.from_bytes(identifier.to_bytes(2, "big") + data[:-1], "big") << 8
     bits = 8 * (2 + len(data) - 1)
@@ -92,7 +92,7 @@ def sealed(identifier: int, data: bytes) -> Frame:
     for bit in range(bits + 7, 7, -1):
         if number >> bit & 1:
             number ^= 0x11D << bit - 8
-    return Frame(identifier, data[:-1] + bytes([number ^ 0xFF]))
+    return CanFrame(identifier, data[:-1] + bytes([number ^ 0xFF]))
 
 
 @pytest.mark.parametrize("part", [0, 1, 2])
@@ -101,11 +101,11 @@ def test_checksum_wrong(part: int) -> None:
     rig = driving(2)
     spoiled: list[int] = []
 
-    def spoil(frame: Frame) -> Frame:
+    def spoil(frame: CanFrame) -> CanFrame:
         if frame.identifier != 0x200 + part or spoiled:
             return frame
         spoiled.append(rig.now_ns)
-        return Frame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 0x40]))
+        return CanFrame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 0x40]))
 
     rig.spoil = spoil
     rig.run_until(lambda _: bool(spoiled))
@@ -157,7 +157,7 @@ def test_frozen(generation: int) -> None:
     assert {is_enabling(rig.generation, frame) for _, frame in rig.sent} == {False}
 
 
-def is_enabling(generation: int, frame: Frame) -> bool:
+def is_enabling(generation: int, frame: CanFrame) -> bool:
     """Whether a frame has its EN, or asks the system to enable."""
     if generation == 1:
         return bool(frame.data[2 if frame.identifier == 0x064 else 3] & 1)
@@ -165,8 +165,8 @@ def is_enabling(generation: int, frame: Frame) -> bool:
 
 
 SOMEBODY_ELSES = {
-    1: [Frame(0x064, bytes(8)), Frame(0x060, bytes(4)), Frame(0x066, bytes(1))],
-    2: [Frame(0x201, bytes(8)), Frame(0x203, bytes(4)), Frame(0x216, bytes(2))],
+    1: [CanFrame(0x064, bytes(8)), CanFrame(0x060, bytes(4)), CanFrame(0x066, bytes(1))],
+    2: [CanFrame(0x201, bytes(8)), CanFrame(0x203, bytes(4)), CanFrame(0x216, bytes(2))],
 }
 """Of an axis, of another length or a gear, and of the system or a gear: which bytes does not matter."""
 
@@ -493,7 +493,7 @@ def test_wrong_checksum_of_a_report() -> None:
     rig = driving(2)
     before = rig.adapter.state()
     frame = sealed(0x107, bytes(8))
-    rig.adapter.receive(Frame(0x107, frame.data[:-1] + bytes([frame.data[-1] ^ 1])), rig.now_ns)
+    rig.adapter.receive(CanFrame(0x107, frame.data[:-1] + bytes([frame.data[-1] ^ 1])), rig.now_ns)
     assert rig.adapter.state() == before
     assert rig.adapter.counts["wrong_checksum"] == 1
     rig.adapter.receive(frame, rig.now_ns)
@@ -617,9 +617,9 @@ def test_park_is_not_missed_while_the_car_moves() -> None:
     """A car that still moves 3 s after driving ended is no hindrance, and is not put into PARK."""
     rig = without_park()
 
-    def move(frame: Frame) -> bool:
+    def move(frame: CanFrame) -> bool:
         if frame.identifier == 0x065:
-            rig.adapter.receive(Frame(0x065, frame.data[:4] + b"\0\4" + frame.data[6:]), rig.now_ns)
+            rig.adapter.receive(CanFrame(0x065, frame.data[:4] + b"\0\4" + frame.data[6:]), rig.now_ns)
         return frame.identifier == 0x065
 
     rig.lose_report = move

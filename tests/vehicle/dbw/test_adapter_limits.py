@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started, with_limits
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
-from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, Limits
-from lavt.vehicle.dbw.sending import Asked, limited
+from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
+from lavt.vehicle.dbw.sending import DriveCommand, limited
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 
-LIMITS = Limits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
+LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
 STEERING = {1: 0x064, 2: 0x200}
 
 
@@ -139,12 +139,12 @@ def test_begins_where_the_wheel_is(generation: int) -> None:
 
 
 any_number = st.floats(allow_nan=False, allow_infinity=False)
-asked = st.builds(Asked, any_number, any_number, any_number)
-allowed = st.builds(Asked, st.floats(-400, 400), st.floats(0, 0.6), st.floats(0, 0.8))
+asked = st.builds(DriveCommand, any_number, any_number, any_number)
+allowed = st.builds(DriveCommand, st.floats(-400, 400), st.floats(0, 0.6), st.floats(0, 0.8))
 
 
 @given(asked, allowed, st.integers(0, 10 * NS_PER_S))
-def test_never_more(wanted: Asked, before: Asked, passed_ns: int) -> None:
+def test_never_more(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
     """Whatever is asked, what is allowed is in range and no faster than the rates over at most 60 ms."""
     found = limited(LIMITS, wanted, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
@@ -155,7 +155,7 @@ def test_never_more(wanted: Asked, before: Asked, passed_ns: int) -> None:
 
 
 @given(allowed)
-def test_as_asked(wanted: Asked) -> None:
+def test_as_asked(wanted: DriveCommand) -> None:
     """What is within the limits is not changed, but that there is no throttle while the brake is asked for."""
     found = limited(LIMITS, wanted, wanted, 0)
     assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from tests.vehicle.dbw.rig import START_NS, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.profile import AXES
-from lavt.vehicle.dbw.sending import Sender
+from lavt.vehicle.dbw.sending import FrameSender
 from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
 from lavt.vehicle.software_car.state import Order
@@ -21,7 +21,7 @@ from lavt.vehicle.software_car.state import Order
 names = pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user"])
 
 
-def heard(name: str, frame: Frame) -> Order:
+def heard(name: str, frame: CanFrame) -> Order:
     """What the software car, which shares no code with the adapter, takes a frame for."""
     read = generation_1.read if name == "dataspeed_gen1" else generation_2.read
     order = read(frame, Mechanics(), not name.endswith(":user"))
@@ -33,7 +33,7 @@ def heard(name: str, frame: Frame) -> Order:
 @given(data=st.data())
 def test_all_that_can_be_sent(name: str, data: st.DataObject) -> None:
     """Whatever the limits allow is heard by the kit as it was meant, to half a step, valid and enabling."""
-    known, sender = profile(name), Sender(profile(name), START_NS)
+    known, sender = profile(name), FrameSender(profile(name), START_NS)
     axis = data.draw(st.sampled_from(AXES))
     sender._numbers[known.axes[axis].message] = data.draw(st.integers(0, 1000))
     if axis == "steering":
@@ -60,25 +60,25 @@ def test_all_that_can_be_sent(name: str, data: st.DataObject) -> None:
 def test_reports_come_back(name: str, data: st.DataObject) -> None:
     """Any angle and speed that a report can hold is read as it was written, to half a step."""
     known = profile(name)
-    adapter = Adapter(known, start_ns=START_NS)
+    adapter = ByWireAdapter(known, start_ns=START_NS)
     angle = data.draw(st.integers(-5500, 5500))
     raw = angle.to_bytes(2, "little", signed=True)
     if name == "dataspeed_gen1":
-        adapter.receive(Frame(0x065, raw + bytes(6)), START_NS)
+        adapter.receive(CanFrame(0x065, raw + bytes(6)), START_NS)
     else:
         fourteen = (angle & 0x3FFF).to_bytes(2, "little")
         adapter.receive(generation_2_sealed(0x100, fourteen + bytes(6)), START_NS)
     assert adapter.state().steering_rad == pytest.approx(known.road_rad(angle / 10), abs=1e-12)
 
 
-def generation_2_sealed(identifier: int, data: bytes) -> Frame:
+def generation_2_sealed(identifier: int, data: bytes) -> CanFrame:
     from lavt.vehicle.software_car.frames import sealed
 
-    return Frame(identifier, sealed(identifier, data))
+    return CanFrame(identifier, sealed(identifier, data))
 
 
 any_frame = st.builds(
-    Frame,
+    CanFrame,
     st.one_of(
         st.integers(0, 0x7FF),
         st.sampled_from([0x061, 0x063, 0x065, 0x067, 0x100, 0x101, 0x102, 0x103, 0x106, 0x107, 0x2D8]),
@@ -92,9 +92,9 @@ steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.intege
 @names
 @given(steps)
 @settings(max_examples=150)
-def test_random_bus(name: str, happening: list[tuple[Frame, int, int]]) -> None:
+def test_random_bus(name: str, happening: list[tuple[CanFrame, int, int]]) -> None:
     """Whatever comes from the bus nothing is raised, and without all the reports the car is never engaged."""
-    adapter = Adapter(profile(name), start_ns=START_NS)
+    adapter = ByWireAdapter(profile(name), start_ns=START_NS)
     now_ns = START_NS
     for frame, passed_ns, kind in happening:
         now_ns += passed_ns
@@ -111,12 +111,12 @@ def test_random_bus(name: str, happening: list[tuple[Frame, int, int]]) -> None:
 
 
 @cache
-def reports_of(generation: int) -> tuple[Frame, ...]:
+def reports_of(generation: int) -> tuple[CanFrame, ...]:
     """A driving kit's reports of 100 ms."""
     rig, found = driving(generation), []
     receive = rig.adapter.receive
 
-    def keep(frame: Frame, now_ns: int) -> None:
+    def keep(frame: CanFrame, now_ns: int) -> None:
         found.append(frame)
         receive(frame, now_ns)
 
@@ -128,7 +128,7 @@ def reports_of(generation: int) -> tuple[Frame, ...]:
 @pytest.mark.parametrize("generation", [1, 2])
 @given(st.lists(st.tuples(any_frame, st.integers(0, 30)), min_size=1, max_size=20))
 @settings(max_examples=25)
-def test_garbage_beside_reports(generation: int, garbage: list[tuple[Frame, int]]) -> None:
+def test_garbage_beside_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
     """Garbage between the reports of a car that only stands there never makes it engaged while nobody wants it."""
     rig = started(generation)
     for frame, wait_ms in garbage:
@@ -146,8 +146,8 @@ def test_one_bit(generation: int, data: st.DataObject) -> None:
     frame = data.draw(st.sampled_from(reports_of(generation)))
     bit = data.draw(st.integers(0, 8 * len(frame.data) - 1))
     flipped = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(len(frame.data), "little")
-    adapter = Adapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
-    adapter.receive(Frame(frame.identifier, flipped), START_NS)
+    adapter = ByWireAdapter(profile(f"dataspeed_gen{generation}"), start_ns=START_NS)
+    adapter.receive(CanFrame(frame.identifier, flipped), START_NS)
     known = {known.identifier: name for name, known in profile(f"dataspeed_gen{generation}").codec.messages.items()}
     report = profile(f"dataspeed_gen{generation}").reports.get(known[frame.identifier])
     if generation == 2 and report is not None:

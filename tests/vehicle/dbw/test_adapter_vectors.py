@@ -10,9 +10,9 @@ import pytest
 import yaml
 from tests.vehicle.dbw.rig import START_NS, profile
 
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import AXES, Axis, Profile
-from lavt.vehicle.dbw.sending import Asked, Plan, Sender
+from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
 
 NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user")
 NONE: frozenset[Axis] = frozenset()
@@ -24,10 +24,10 @@ def vectors(name: str) -> list[dict[str, Any]]:
     return found
 
 
-def sent(name: str, vector: dict[str, Any]) -> Frame | None:
+def sent(name: str, vector: dict[str, Any]) -> CanFrame | None:
     """The frame of the adapter that asks for what the vector says; None where the adapter never says it."""
     known, signals, message = profile(name), dict(vector["signals"]), vector["message"]
-    sender = Sender(known, START_NS)
+    sender = FrameSender(known, START_NS)
     if signals.pop("CLEAR", 0):
         return cleared(known, message, signals)
     for axis in AXES:
@@ -43,7 +43,7 @@ def sent(name: str, vector: dict[str, Any]) -> Frame | None:
     return None
 
 
-def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> Frame | None:
+def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
     """An axis's command of the type that the profile has; what the adapter never changes is a constant of a profile."""
     command = known.axes[axis]
     kind, number = next(iter(command.constants.items()))
@@ -51,19 +51,19 @@ def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> Frame | None
         return None
     varied = {command.value, command.enable, command.count}
     constants = {kind: number} | {name: each for name, each in signals.items() if name not in varied}
-    sender = Sender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
+    sender = FrameSender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
     sender._numbers[command.message] = signals.get(command.count, 0) + command.modulus - 1
     is_enabled = bool(signals.get(command.enable, 0))
     return sender.axis_frame(axis, signals[command.value] / command.per_unit, is_enabled=is_enabled)
 
 
-def cleared(known: Profile, message: str, signals: dict[str, Any]) -> Frame | None:
+def cleared(known: Profile, message: str, signals: dict[str, Any]) -> CanFrame | None:
     """A frame of what takes back overrides."""
     if message not in {command.message for command in known.axes.values()} | {known.gear.message}:
         return None
-    sender = Sender(known, START_NS)
+    sender = FrameSender(known, START_NS)
     sender._numbers[message] = signals.get("RC", 0) - 1
-    frames = sender.frames(Plan(NONE, is_clearing=True), Asked(0.0, 0.0, 0.0), 0.0, START_NS)
+    frames = sender.frames(KitCommands(NONE, is_clearing=True), DriveCommand(0.0, 0.0, 0.0), 0.0, START_NS)
     identifier = known.codec.messages[message].identifier
     return next(frame for frame in frames if frame.identifier == identifier)
 
@@ -77,9 +77,9 @@ CASES = [
 
 
 @pytest.mark.parametrize(("frame", "vector"), CASES)
-def test_sent(frame: Frame, vector: dict[str, Any]) -> None:
+def test_sent(frame: CanFrame, vector: dict[str, Any]) -> None:
     """A command that the adapter makes has the bytes worked by hand, counter and checksum included."""
-    assert frame == Frame(vector["id"], bytes.fromhex(vector["data"]))
+    assert frame == CanFrame(vector["id"], bytes.fromhex(vector["data"]))
 
 
 def test_enough() -> None:

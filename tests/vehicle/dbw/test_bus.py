@@ -21,15 +21,15 @@ from tests.support.ports import free_port
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw import bus as bus_module
 from lavt.vehicle.dbw.bus import CanPort, is_virtual, log_line, read_log
 
 GROUP = "239.74.163.2"
 DEADLINE_S = 20
-STEERING = Frame(0x064, bytes(8))
-BRAKE = Frame(0x060, bytes(range(8)))
-FAR = Frame(0x2F01, b"\x01", is_extended=True)
+STEERING = CanFrame(0x064, bytes(8))
+BRAKE = CanFrame(0x060, bytes(range(8)))
+FAR = CanFrame(0x2F01, b"\x01", is_extended=True)
 
 
 def until(done: Callable[[], bool]) -> None:
@@ -40,9 +40,9 @@ def until(done: Callable[[], bool]) -> None:
     raise AssertionError("it did not happen")
 
 
-def hear(port: CanPort, count: int) -> list[Frame]:
+def hear(port: CanPort, count: int) -> list[CanFrame]:
     """The next frames that a port hears."""
-    heard: list[HeardFrame] = []
+    heard: list[ReceivedCanFrame] = []
 
     def enough() -> bool:
         heard.extend(port.take(0))
@@ -141,7 +141,7 @@ def test_arrival(opened: Callable[..., CanPort]) -> None:
     port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
     before_ns = now_ns()
     other.send([STEERING], before_ns)
-    taken: list[HeardFrame] = []
+    taken: list[ReceivedCanFrame] = []
 
     def is_there() -> bool:
         taken.extend(port.take(0))
@@ -204,7 +204,7 @@ def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
     raw.send(can.Message(is_remote_frame=True, arbitration_id=0x60))
     raw.send(can.Message(is_fd=True, arbitration_id=0x60, data=bytes(12), is_extended_id=False))
     raw.send(can.Message(arbitration_id=0x60, data=b"\x07", is_extended_id=False))
-    assert hear(port, 1) == [Frame(0x60, b"\x07")]
+    assert hear(port, 1) == [CanFrame(0x60, b"\x07")]
     assert {name: count for name, count in port.counts.items() if count} == {
         "error_frames": 1,
         "remote_frames": 1,
@@ -293,7 +293,7 @@ def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> No
         port.take(2 * NS_PER_S - 1)
     assert port.take(2 * NS_PER_S) == []
     device.heard.append(can.Message(arbitration_id=7, is_extended_id=False))
-    assert hear(port, 1) == [Frame(7, b"")]
+    assert hear(port, 1) == [CanFrame(7, b"")]
     port.send([STEERING], 0)
     assert device.opened == 2
 
@@ -433,7 +433,7 @@ def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 def test_log(tmp_path: Path) -> None:
     """A log that was written is read as it was, to the microsecond."""
-    written = [HeardFrame(STEERING, 1_700_000_000_000_001_000), HeardFrame(FAR, 1_700_000_000_500_000_000)]
+    written = [ReceivedCanFrame(STEERING, 1_700_000_000_000_001_000), ReceivedCanFrame(FAR, 1_700_000_000_500_000_000)]
     log = tmp_path / "drive.log"
     log.write_text("".join(log_line(each.arrived_ns, "vcan0", each.frame) for each in written))
     read = list(read_log(log))
@@ -456,4 +456,4 @@ def test_counts_of_a_log(tmp_path: Path) -> None:
     """A log's error and remote frames are left out."""
     log = tmp_path / "drive.log"
     log.write_text("(1.0) can0 20000080#0000000000000000\n(2.0) can0 060#R\n(3.0) can0 060#01\n")
-    assert [each.frame for each in read_log(log)] == [Frame(0x60, b"\x01")]
+    assert [each.frame for each in read_log(log)] == [CanFrame(0x60, b"\x01")]

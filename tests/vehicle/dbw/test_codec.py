@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw import codec as codec_module
 from lavt.vehicle.dbw.codec import Codec
 
@@ -65,7 +65,7 @@ def test_vectors(codec: Codec, vector: dict[str, Any]) -> None:
     made = codec.encode(vector["message"], vector["signals"], length=len(data))
     has_crc = "CRC" in codec.messages[vector["message"]].signals
     assert made[: len(data) - has_crc] == data[: len(data) - has_crc]
-    decoded = codec.decode(Frame(vector["id"], data), short=True)
+    decoded = codec.decode(CanFrame(vector["id"], data), short=True)
     assert decoded is not None
     assert decoded[0] == vector["message"]
     for name, signal in codec.messages[decoded[0]].signals.items():
@@ -82,7 +82,7 @@ def test_vectors(codec: Codec, vector: dict[str, Any]) -> None:
 def test_random_bus(codec: Codec, data: bytes, identifier: int, short: bool) -> None:
     """Whatever a frame is, it is read or counted, once, and nothing raises."""
     before = sum(codec.counts.values())
-    decoded = codec.decode(Frame(identifier, data, identifier > 0x7FF), short=short)
+    decoded = codec.decode(CanFrame(identifier, data, identifier > 0x7FF), short=short)
     assert (decoded is None) == (sum(codec.counts.values()) == before + 1)
     assert all(value is None or math.isfinite(value) for value in (decoded or ("", {}))[1].values())
 
@@ -90,17 +90,17 @@ def test_random_bus(codec: Codec, data: bytes, identifier: int, short: bool) -> 
 def test_counts() -> None:
     """What cannot be read is counted by why: identifier, length, multiplexer."""
     codec = shipped("dataspeed_gen1")
-    assert codec.decode(Frame(0x555, bytes(8))) is None
-    assert codec.decode(Frame(0x065, bytes(8), is_extended=True)) is None
-    assert codec.decode(Frame(0x065, bytes(7))) is None
-    assert codec.decode(Frame(0x067, bytes(3)), short=True) is None
-    assert codec.decode(Frame(0x060, bytes([0, 0, 0x50, 0, 0, 0, 0, 0]))) is None  # type 5
+    assert codec.decode(CanFrame(0x555, bytes(8))) is None
+    assert codec.decode(CanFrame(0x065, bytes(8), is_extended=True)) is None
+    assert codec.decode(CanFrame(0x065, bytes(7))) is None
+    assert codec.decode(CanFrame(0x067, bytes(3)), short=True) is None
+    assert codec.decode(CanFrame(0x060, bytes([0, 0, 0x50, 0, 0, 0, 0, 0]))) is None  # type 5
     assert codec.counts == {"unknown_identifier": 2, "wrong_length": 2, "unknown_multiplexer": 1}
 
 
 def test_short_frame() -> None:
     """A frame of four bytes tells the signals that are whole in it, to whoever asks for short ones."""
-    clear = Frame(0x064, bytes([0, 0, 2, 0]))
+    clear = CanFrame(0x064, bytes([0, 0, 2, 0]))
     assert GENERATION_1.decode(clear) is None
     assert GENERATION_1.decode(clear, short=True) == (
         "SteeringCmd",
@@ -114,10 +114,10 @@ def test_short_frame() -> None:
 
 def test_named_values() -> None:
     """A value that has a name is decoded as a number, and one whose name says that there is none as None."""
-    report = GENERATION_1.decode(Frame(0x065, bytes.fromhex("00 80 00 00 00 80 80 00")))
+    report = GENERATION_1.decode(CanFrame(0x065, bytes.fromhex("00 80 00 00 00 80 80 00")))
     assert report is not None
     assert [report[1][name] for name in ("ANGLE", "VEH_VEL", "TORQUE", "CMD")] == [None, None, None, 0]
-    gear = GENERATION_1.decode(Frame(0x067, bytes([4, 0])))
+    gear = GENERATION_1.decode(CanFrame(0x067, bytes([4, 0])))
     assert gear is not None
     assert gear[1]["STATE"] == 4
     assert GENERATION_1.messages["GearReport"].signals["STATE"].names[4] == "DRIVE"
@@ -185,7 +185,7 @@ def test_offsets_nesting_and_reals(tmp_path: Path) -> None:
     assert codec.encode("Far", {"TEMPERATURE": 0})[0] == 80
     far = codec.messages["Far"]
     assert far.is_extended
-    decoded = codec.decode(Frame(far.identifier, bytes([80, 0, 0, 0xC0, 0x7F, 0, 0, 0]), is_extended=True))
+    decoded = codec.decode(CanFrame(far.identifier, bytes([80, 0, 0, 0xC0, 0x7F, 0, 0, 0]), is_extended=True))
     assert decoded == ("Far", {"TEMPERATURE": 0, "REAL": None})
     assert codec.encode("Nested", {"OUTER": 1, "INNER": 2, "DEEP": 7})[:2] == bytes([0x21, 7])
     with pytest.raises(ValueError, match="DEEP of Nested is not in a frame"):

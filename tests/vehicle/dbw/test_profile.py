@@ -12,9 +12,9 @@ from lavt.assembly.dbw import load_profile, shipped_profiles
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import parse_config
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.dbw.reports import Reports
-from lavt.vehicle.dbw.sending import Sender
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.reports import NewestReports
+from lavt.vehicle.dbw.sending import FrameSender
 
 NAMES = ("dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user", "dataspeed_gen2:remote")
 
@@ -60,10 +60,10 @@ def test_angles_in_radians(tmp_path: Path) -> None:
         text = text.replace(before, '(0.001,0) [-10|10] "rad"')
     (tmp_path / "radians.dbc").write_text(text)
     profile = load_profile(str(changed(tmp_path, "dataspeed_gen1", dbc=str(tmp_path / "radians.dbc"))))
-    command = Sender(profile, 0).axis_frame("steering", 90.0, is_enabled=True)
+    command = FrameSender(profile, 0).axis_frame("steering", 90.0, is_enabled=True)
     assert int.from_bytes(command.data[:2], "little", signed=True) == 1571
-    reports = Reports(profile, 0)
-    reports.receive(Frame(0x065, command.data[:2] + bytes(6)), 0)
+    reports = NewestReports(profile, 0)
+    reports.receive(CanFrame(0x065, command.data[:2] + bytes(6)), 0)
     assert reports.wheel_deg == pytest.approx(90.0, abs=0.06)
 
 

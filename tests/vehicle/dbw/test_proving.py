@@ -9,9 +9,9 @@ import pytest
 from tests.vehicle.dbw.rig import START_NS, both, profile, road
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import OwnBrake
-from lavt.vehicle.dbw.proving import Proving
+from lavt.vehicle.dbw.proving import WatchdogTest
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit
@@ -27,16 +27,16 @@ class Attempt:
     def __init__(self, generation: int, *, has_watchdog: bool = True) -> None:
         self.profile, self.generation = profile(f"dataspeed_gen{generation}"), generation
         assert self.profile.watchdog is not None
-        self.proving = Proving(self.profile, self.profile.watchdog, start_ns=START_NS)
+        self.proving = WatchdogTest(self.profile, self.profile.watchdog, start_ns=START_NS)
         self.simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
         self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, has_watchdog=has_watchdog)
         self.car = SoftwareCar(self.kit, self.simulator)
-        self.sent: list[tuple[int, Frame]] = []
+        self.sent: list[tuple[int, CanFrame]] = []
         self.now_ns = START_NS
         self.meddle: Callable[[int], None] = lambda _: None
-        self.spoil: Callable[[Frame], Frame | None] = lambda frame: frame
+        self.spoil: Callable[[CanFrame], CanFrame | None] = lambda frame: frame
 
-    def run(self) -> Proving:
+    def run(self) -> WatchdogTest:
         """Let it go on until it is done."""
         for _ in range(20_000):
             if self.proving.is_done:
@@ -117,11 +117,11 @@ def test_without_watchdog(generation: int) -> None:
     assert proving.failure.startswith("the kit did not brake within 500 ms")
 
 
-def delayed(attempt: Attempt, by_ms: int) -> Callable[[Frame], Frame | None]:
+def delayed(attempt: Attempt, by_ms: int) -> Callable[[CanFrame], CanFrame | None]:
     """The watchdog's brake comes later than it does."""
     gone: list[int] = []
 
-    def spoil(frame: Frame) -> Frame | None:
+    def spoil(frame: CanFrame) -> CanFrame | None:
         if frame.identifier != BRAKE_REPORTS[attempt.generation] or not attempt.kit.state.watchdog_brakes:
             return frame
         gone.append(attempt.now_ns)
@@ -129,7 +129,7 @@ def delayed(attempt: Attempt, by_ms: int) -> Callable[[Frame], Frame | None]:
             return frame
         data = bytearray(frame.data)
         data[6] &= 0xF7
-        return Frame(frame.identifier, bytes(data))
+        return CanFrame(frame.identifier, bytes(data))
 
     return spoil
 
@@ -187,8 +187,8 @@ def test_brakes_already() -> None:
     assert attempt.sent == []
 
 
-def unsealed(frame: Frame) -> Frame:
-    return Frame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
+def unsealed(frame: CanFrame) -> CanFrame:
+    return CanFrame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
 
 
 HINDERED: list[tuple[Callable[[Attempt], object], str]] = [
@@ -198,7 +198,7 @@ HINDERED: list[tuple[Callable[[Attempt], object], str]] = [
     (lambda it: it.kit.set_fault("steering.fault", START_NS), "the kit cannot be enabled: the steering has a fault"),
     (lambda it: it.kit.hinder("door", START_NS), "the kit cannot be enabled: a door is open"),
     (lambda it: it.kit.switch_remote(1, START_NS), "the kit cannot be enabled: RemoteReport has STATE pause"),
-    (lambda it: it.proving.receive(Frame(0x201, bytes(8)), START_NS), "somebody else commands the kit (0x201)"),
+    (lambda it: it.proving.receive(CanFrame(0x201, bytes(8)), START_NS), "somebody else commands the kit (0x201)"),
     (lambda it: it.proving.bus_gone("pulled out"), "the bus is gone: pulled out"),
 ]
 
@@ -238,10 +238,10 @@ def test_still_enabled() -> None:
     """A kit that goes on without commands is the worst, and said."""
     attempt = Attempt(1)
 
-    def spoil(frame: Frame) -> Frame:
+    def spoil(frame: CanFrame) -> CanFrame:
         if frame.identifier != 0x061 or not attempt.sent:
             return frame
-        return Frame(0x061, frame.data[:7] + bytes([frame.data[7] | 1]))
+        return CanFrame(0x061, frame.data[:7] + bytes([frame.data[7] | 1]))
 
     attempt.spoil = spoil
     assert attempt.run().failure.startswith("the kit did not let go")
@@ -250,6 +250,6 @@ def test_still_enabled() -> None:
 def test_other_signal() -> None:
     """What counts is the signal that the profile names: one that is never set proves nothing."""
     attempt = Attempt(1)
-    attempt.proving = Proving(attempt.profile, OwnBrake("BrakeReport", "BC", 0.0), start_ns=START_NS)
+    attempt.proving = WatchdogTest(attempt.profile, OwnBrake("BrakeReport", "BC", 0.0), start_ns=START_NS)
     assert attempt.run().failure.startswith("the kit did not brake")
     assert attempt.profile.watchdog == OwnBrake("BrakeReport", "WDCBRK", 0.0)

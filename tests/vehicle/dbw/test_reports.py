@@ -9,12 +9,12 @@ import pytest
 from tests.vehicle.dbw.rig import START_NS, profile
 
 from lavt.domain import NS_PER_MS
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import IN_DEGREES, IN_METRES_PER_SECOND
-from lavt.vehicle.dbw.reports import Reports
+from lavt.vehicle.dbw.reports import NewestReports
 
 STEERING, BRAKE = 0x065, 0x061
-ANGLE_AND_SPEED = Frame(STEERING, bytes.fromhex("64 00 00 00 E8 03 00 00"))
+ANGLE_AND_SPEED = CanFrame(STEERING, bytes.fromhex("64 00 00 00 E8 03 00 00"))
 """A SteeringReport of generation 1: 100 steps of 0.1 deg, and 1000 of 0.01 km/h."""
 
 
@@ -24,7 +24,7 @@ def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: fl
     """The wheel's angle in degrees or radians and the speed in m/s or km/h are read as degrees and m/s."""
     angle_per_deg, speed_per_mps = IN_DEGREES[angle_unit], IN_METRES_PER_SECOND[speed_unit]
     in_units = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speed_per_mps=speed_per_mps)
-    reports = Reports(in_units, START_NS)
+    reports = NewestReports(in_units, START_NS)
     reports.receive(ANGLE_AND_SPEED, START_NS + 1)
     assert reports.wheel_deg == pytest.approx(wheel_deg)
     assert reports.speed_mps == pytest.approx(speed_mps)
@@ -33,11 +33,11 @@ def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: fl
 
 def test_deadline() -> None:
     """The next deadline is that of the report that is the first to be 200 ms old, of those that are not yet."""
-    reports = Reports(profile("dataspeed_gen1"), START_NS)
+    reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.deadline_ns(START_NS) is None
     reports.receive(ANGLE_AND_SPEED, START_NS)
     later_ns = START_NS + 30 * NS_PER_MS
-    reports.receive(Frame(BRAKE, bytes(8)), later_ns)
+    reports.receive(CanFrame(BRAKE, bytes(8)), later_ns)
     first_ns, second_ns = START_NS + 200 * NS_PER_MS, later_ns + 200 * NS_PER_MS
     assert reports.deadline_ns(later_ns) == reports.deadline_ns(first_ns - 1) == first_ns
     assert reports.deadline_ns(first_ns) == second_ns
@@ -46,7 +46,7 @@ def test_deadline() -> None:
 
 def test_missing() -> None:
     """A report is missing until it has come with all its values, and again from the moment it is 200 ms old."""
-    reports = Reports(profile("dataspeed_gen1"), START_NS)
+    reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     missing = len(reports.missing(START_NS))
     assert missing == len(profile("dataspeed_gen1").reports)
     reports.receive(ANGLE_AND_SPEED, START_NS)
@@ -56,8 +56,8 @@ def test_missing() -> None:
 
 def test_foreign_commands() -> None:
     """Somebody else who commanded the kit is taken to do so for one second."""
-    reports = Reports(profile("dataspeed_gen1"), START_NS)
+    reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.foreign(START_NS) == ""
-    reports.receive(Frame(0x064, b""), START_NS)
+    reports.receive(CanFrame(0x064, b""), START_NS)
     assert reports.foreign(START_NS + 1000 * NS_PER_MS - 1) != ""
     assert reports.foreign(START_NS + 1000 * NS_PER_MS) == ""

@@ -9,13 +9,13 @@ import pytest
 from tests.vehicle.dbw.rig import START_NS, profile
 
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.vehicle import DbwVehicle, Truth
-from lavt.vehicle.vehicle import Capabilities, Reached
+from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
-SPEED = Frame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
+SPEED = CanFrame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
 """A SteeringReport of generation 1 with a speed above zero."""
 
 
@@ -24,18 +24,18 @@ class StandInPort:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter(overflowed=3)
-        self.waiting: list[HeardFrame] = []
-        self.sent: list[tuple[Frame, int]] = []
+        self.waiting: list[ReceivedCanFrame] = []
+        self.sent: list[tuple[CanFrame, int]] = []
         self.wake_ns: int | None = None
         self.taken_ns = 0
         self.is_gone = self.is_closed = False
 
-    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Keep frames with the time at which they were made."""
         self._check()
         self.sent += [(frame, made_ns) for frame in frames]
 
-    def take(self, now_ns: int) -> list[HeardFrame]:
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return what is waiting, once, and keep when it was taken."""
         self._check()
         self.taken_ns = now_ns
@@ -61,7 +61,7 @@ def port() -> StandInPort:
 
 
 def made(port: StandInPort, truth: Truth | None = None) -> DbwVehicle:
-    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     return DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS, truth=truth)
 
 
@@ -72,7 +72,7 @@ def truth_at(mono_ns: int) -> GroundTruth:
 def test_without_truth(port: StandInPort) -> None:
     """A vehicle without a software car tells no ground truth, and what its kit says goes on."""
     vehicle = made(port)
-    port.waiting = [HeardFrame(SPEED, START_NS + 1)]
+    port.waiting = [ReceivedCanFrame(SPEED, START_NS + 1)]
     assert vehicle.advance(START_NS + NS_PER_MS) == []
     assert vehicle.ground_truth() is None
     assert vehicle.state().speed_mps > 0
@@ -88,8 +88,8 @@ def test_truth_and_events(port: StandInPort) -> None:
     ]
     vehicle = made(port, lambda _: told.pop(0))
     assert vehicle.ground_truth() == truth_at(START_NS)
-    override = Frame(0x061, bytes([0, 0, 0, 0, 0, 0, 0, 0x10]))  # a foot on the brake
-    port.waiting = [HeardFrame(override, START_NS + 3)]
+    override = CanFrame(0x061, bytes([0, 0, 0, 0, 0, 0, 0, 0x10]))  # a foot on the brake
+    port.waiting = [ReceivedCanFrame(override, START_NS + 3)]
     events = vehicle.advance(START_NS + 9)
     assert [(event.mono_ns - START_NS, event.kind) for event in events] == [
         (0, "off_road"), (3, "fault"), (5, "collision"),
@@ -104,7 +104,7 @@ def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
     """A frame counts from its arrival, but never from later than now."""
     vehicle = made(port)
     now_ns = START_NS + NS_PER_MS
-    port.waiting = [HeardFrame(SPEED, now_ns + arrived_ns)]
+    port.waiting = [ReceivedCanFrame(SPEED, now_ns + arrived_ns)]
     vehicle.apply(Actuation(0.0, 0.0, 0.0), now_ns)
     assert vehicle.state().mono_ns == now_ns + counted_ns
 
@@ -128,14 +128,14 @@ def test_bus_gone(port: StandInPort) -> None:
     vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
     assert "pulled out" in vehicle.state().hindrance
     port.is_gone = False
-    port.waiting = [HeardFrame(SPEED, START_NS + 3)]
+    port.waiting = [ReceivedCanFrame(SPEED, START_NS + 3)]
     vehicle.advance(START_NS + 3)
     assert "pulled out" not in vehicle.state().hindrance
 
 
 def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the adapter has due leaves with the time of the tick, after the bus was heard."""
-    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.taken_ns == now_ns else [])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
@@ -145,15 +145,15 @@ def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_wishes_and_echoes(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """The adapter hears whether driving is wanted, and what it saw reach the wheels is told."""
-    adapter = Adapter(profile("dataspeed_gen1"), start_ns=START_NS)
+    adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     wishes: list[tuple[bool, int]] = []
     monkeypatch.setattr(adapter, "engage", lambda *wish: wishes.append(wish))
-    monkeypatch.setattr(adapter, "take_reached", lambda: [Reached(1, 2)])
+    monkeypatch.setattr(adapter, "take_reached", lambda: [ReachedCommand(1, 2)])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.engage(True, 3)
     vehicle.engage(False, 4)
     assert wishes == [(True, 3), (False, 4)]
-    assert vehicle.take_reached() == [Reached(1, 2)]
+    assert vehicle.take_reached() == [ReachedCommand(1, 2)]
 
 
 def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,7 +171,7 @@ def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None
 def test_what_it_passes_on(port: StandInPort) -> None:
     """Capabilities, counts of adapter and port, silence and closing are those of its parts."""
     vehicle = made(port)
-    port.waiting = [HeardFrame(Frame(0x555, bytes(8)), START_NS)]
+    port.waiting = [ReceivedCanFrame(CanFrame(0x555, bytes(8)), START_NS)]
     before = vehicle.counts.get("unknown_identifier", 0)
     vehicle.advance(START_NS + 1)
     assert vehicle.capabilities == CAPABILITIES

@@ -6,23 +6,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lavt.domain import Actuation
-from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, RAIL_FRICTION, Car, CarMotion, CarParameters, Contact
+from lavt.vehicle.sim.dynamics import GRAVITY_MPS2, RAIL_FRICTION, CarDynamics, CarMotion, CarParameters, Contact
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 
 STEP_S = 1 / 240
 CAR = LINCOLN_MKZ
 
 
-def car_at(speed_mps: float = 0.0, parameters: CarParameters = CAR) -> Car:
-    return Car(parameters, CarMotion(0.0, 0.0, 0.0, speed_mps=speed_mps), STEP_S)
+def car_at(speed_mps: float = 0.0, parameters: CarParameters = CAR) -> CarDynamics:
+    return CarDynamics(parameters, CarMotion(0.0, 0.0, 0.0, speed_mps=speed_mps), STEP_S)
 
 
-def drive(car: Car, actuation: Actuation, duration_s: float) -> None:
+def drive(car: CarDynamics, actuation: Actuation, duration_s: float) -> None:
     for _ in range(round(duration_s / STEP_S)):
         car.step(actuation)
 
 
-def cruise(car: Car, speed_mps: float, steering_rad: float, duration_s: float) -> None:
+def cruise(car: CarDynamics, speed_mps: float, steering_rad: float, duration_s: float) -> None:
     for _ in range(round(duration_s / STEP_S)):
         car.step(Actuation(steering_rad, 0.0, 0.0))
         car.motion.speed_mps = speed_mps
@@ -159,7 +159,7 @@ def test_throttle_and_brake_have_lags_of_their_own() -> None:
     assert car.motion.brake == pytest.approx(1 - math.exp(-2), rel=0.01)
 
 
-def energy_j(car: Car) -> float:
+def energy_j(car: CarDynamics) -> float:
     motion = car.motion
     return (
         CAR.mass_kg * (motion.speed_mps**2 + motion.side_speed_mps**2) + CAR.yaw_inertia_kgm2 * motion.yaw_rate_radps**2
@@ -187,7 +187,7 @@ def test_a_rail_takes_the_motion_into_it_and_gives_none(
     speed_mps: float, side_mps: float, yaw_radps: float, out_rad: float, front: bool
 ) -> None:
     """After a contact its point is out and moves in no more, and the car has no more energy, wherever it is."""
-    car = Car(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
+    car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
     ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)
     before_j = energy_j(car)
     car.slide(Contact(ahead_m, left_m, 0.02, out_rad))
@@ -204,7 +204,7 @@ def test_a_rail_takes_the_motion_into_it_and_gives_none(
 
 def test_a_car_along_a_rail_is_slowed_by_friction() -> None:
     """Pressed sideways into a rail at its centre of gravity it loses friction times the speed that was stopped."""
-    car = Car(CAR, CarMotion(0.0, 0.0, 0.0, 8.0, 0.5, 0.0), STEP_S)
+    car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.0, 8.0, 0.5, 0.0), STEP_S)
     at_gravity_m = CAR.wheelbase_m - CAR.front_axle_to_gravity_m
     car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
     assert (car.motion.speed_mps, car.motion.side_speed_mps) == pytest.approx((8.0 - RAIL_FRICTION * 0.5, 0.0))

@@ -9,7 +9,7 @@ from lavt.domain import NS_PER_S, EventKind, VehicleEvent
 from lavt.vehicle.sim.dynamics import CarMotion
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import Road, load_road, parse_road
-from lavt.vehicle.sim.route_monitor import Judge
+from lavt.vehicle.sim.route_monitor import RouteMonitor
 
 CAR = LINCOLN_MKZ
 SECOND_WITHOUT_RAIL_M = 40.0
@@ -30,7 +30,7 @@ def motion_at(
 
 def judged(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
     """Judge a car that is moved from place to place (station, lateral offset)."""
-    judge = Judge(road, CAR, near_s_m=places[0][0])
+    judge = RouteMonitor(road, CAR, near_s_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
         events += judge.judge(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
@@ -52,7 +52,7 @@ def test_a_drive_along_the_lane_is_only_completed(road: Road) -> None:
 def test_the_track_is_measured_at_the_rear_axle(road: Road, lateral_m: float, turned_rad: float) -> None:
     """Cross-track, heading error and progress are the rear axle's, left positive, in the curve as on the straight."""
     for s_m in (5.0, 50.0, 110.0):
-        track = Judge(road, CAR, near_s_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
+        track = RouteMonitor(road, CAR, near_s_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
         assert (track.cross_track_m, track.heading_error_rad, track.progress_m) == pytest.approx(
             (lateral_m, turned_rad, s_m), abs=1e-6
         )
@@ -60,7 +60,7 @@ def test_the_track_is_measured_at_the_rear_axle(road: Road, lateral_m: float, tu
 
 def test_heading_error_is_the_short_way_round(road: Road) -> None:
     """A heading that went on past a full turn gives the same small error."""
-    track = Judge(road, CAR, near_s_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
+    track = RouteMonitor(road, CAR, near_s_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
     assert track.heading_error_rad == pytest.approx(0.1)
 
 
@@ -113,7 +113,7 @@ def test_leaving_the_asphalt_where_no_rail_stands_is_off_road(road: Road) -> Non
 
 def test_the_time_of_a_drive_counts_from_its_first_movement(road: Road) -> None:
     """The limit is the route at 10 km/h plus 30 s, 74.3 s here, once the car exceeds 0.1 m/s; waiting is free."""
-    judge = Judge(road, CAR, near_s_m=0.0)
+    judge = RouteMonitor(road, CAR, near_s_m=0.0)
     standing, moving = motion_at(road, 1.0), motion_at(road, 1.0, speed_mps=0.2)
     began_ns = 500 * NS_PER_S
     assert judge.judge(standing, 0) == []
@@ -127,7 +127,7 @@ def test_the_time_of_a_drive_counts_from_its_first_movement(road: Road) -> None:
 
 def test_the_time_limit_can_be_set(road: Road) -> None:
     """A drive may be given a time of its own."""
-    judge = Judge(road, CAR, near_s_m=0.0, limit_s=2.0)
+    judge = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
     moving = motion_at(road, 1.0, speed_mps=0.2)
     assert [kinds(judge.judge(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
 
@@ -137,7 +137,7 @@ def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
     straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
     wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
     for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
-        judge = Judge(straight, wide, near_s_m=5.0)
+        judge = RouteMonitor(straight, wide, near_s_m=5.0)
         judge.judge(motion_at(straight, 5.0), 0)
         assert kinds(judge.judge(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
 
@@ -146,7 +146,7 @@ def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
     """A car across its lane invades to both sides in the same step, left edge first."""
     events = judged(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
-    judge = Judge(road, CAR, near_s_m=5.0)
+    judge = RouteMonitor(road, CAR, near_s_m=5.0)
     judge.judge(motion_at(road, 5.0), 0)
     events = judge.judge(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
     assert [event.detail for event in events] == [
@@ -156,7 +156,7 @@ def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
 
 def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
     """A car that has turned round in its lane has invaded on the way, and at the end is where it was."""
-    judge = Judge(road, CAR, near_s_m=5.0)
+    judge = RouteMonitor(road, CAR, near_s_m=5.0)
     events = []
     for index in range(181):
         events += judge.judge(motion_at(road, 5.0, 0.0, math.radians(index)), index)
@@ -168,7 +168,7 @@ def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
 def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
     """A car that goes back from the start is measured there, and only its time runs out."""
     places = [(1.0 - index / 4, 0.0) for index in range(100)]
-    judge = Judge(road, CAR, near_s_m=1.0, limit_s=1e-6)
+    judge = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
         events += judge.judge(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
@@ -218,7 +218,7 @@ def test_a_car_behind_a_rail_does_not_touch_it() -> None:
 
 def test_one_contact_is_one_collision(road: Road) -> None:
     """Touching and leaving a rail within half a second is one collision, after more than that it is another."""
-    judge = Judge(road, CAR, near_s_m=5.0)
+    judge = RouteMonitor(road, CAR, near_s_m=5.0)
     at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
     collisions = []
     for at_ms in (0, 10, 20, 500, 1021, 1500):
@@ -230,7 +230,7 @@ def test_one_contact_is_one_collision(road: Road) -> None:
 
 def test_a_car_that_stands_in_a_rail_stays_in_one_collision(road: Road) -> None:
     """Pressed against a rail for seconds and moved there again, a car has touched it once."""
-    judge = Judge(road, CAR, near_s_m=5.0)
+    judge = RouteMonitor(road, CAR, near_s_m=5.0)
     events = [event for at_s in range(4) for event in judge.judge(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
     events += judge.judge(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
     assert kinds(events).count("collision") == 1
@@ -238,7 +238,7 @@ def test_a_car_that_stands_in_a_rail_stays_in_one_collision(road: Road) -> None:
 
 def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> None:
     """The front right corner in the right rail: its place on the body, its depth, and that out is to the left."""
-    judge = Judge(road, CAR, near_s_m=5.0)
+    judge = RouteMonitor(road, CAR, near_s_m=5.0)
     judge.judge(motion_at(road, 5.0, -6.5, -0.5), 0)
     (contact,) = judge.contacts
     assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
@@ -268,7 +268,7 @@ def test_looking_only_when_needed_changes_no_verdict(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
     """However a car moves, its judge says the same as one that looks at the whole body in every step."""
-    lazy, eager = Judge(road, CAR, near_s_m=s_m), Judge(road, CAR, near_s_m=s_m)
+    lazy, eager = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad

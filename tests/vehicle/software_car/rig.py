@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lavt.domain import NS_PER_MS, VehicleState
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.kit import Kit
 
 START_NS = 77_000_000_123
@@ -27,8 +27,8 @@ def crc_by_division(identifier: int, data: bytes) -> int:
     return number ^ 0xFF
 
 
-def sealed(identifier: int, data: bytes) -> Frame:
-    return Frame(identifier, data + bytes([crc_by_division(identifier, data)]))
+def sealed(identifier: int, data: bytes) -> CanFrame:
+    return CanFrame(identifier, data + bytes([crc_by_division(identifier, data)]))
 
 
 @dataclass(frozen=True)
@@ -50,23 +50,29 @@ class Hand1:
     def __init__(self) -> None:
         self.count = 0
 
-    def commands(self, asked: Asked) -> list[Frame]:
+    def commands(self, asked: Asked) -> list[CanFrame]:
         """Steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 256
         bits = asked.enable | asked.clear << 1 | asked.ignore << 2
         return [
-            Frame(0x064, struct.pack("<hBBBBBB", round(asked.angle_deg * 10), bits, asked.rate, 0, 0, 0, self.count)),
-            Frame(0x060, struct.pack("<HBBBBBB", round(asked.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-            Frame(0x062, struct.pack("<HBBBBBB", round(asked.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
+            CanFrame(
+                0x064, struct.pack("<hBBBBBB", round(asked.angle_deg * 10), bits, asked.rate, 0, 0, 0, self.count)
+            ),
+            CanFrame(0x060, struct.pack("<HBBBBBB", round(asked.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
+            CanFrame(0x062, struct.pack("<HBBBBBB", round(asked.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
         ]
 
-    def clearing(self) -> list[Frame]:
+    def clearing(self) -> list[CanFrame]:
         """What takes back overrides."""
-        return [Frame(0x064, bytes([0, 0, 2, 0])), Frame(0x060, bytes([0, 0, 0, 2])), Frame(0x062, bytes([0, 0, 0, 2]))]
+        return [
+            CanFrame(0x064, bytes([0, 0, 2, 0])),
+            CanFrame(0x060, bytes([0, 0, 0, 2])),
+            CanFrame(0x062, bytes([0, 0, 0, 2])),
+        ]
 
-    def gear(self, gear: int, clear: bool = False) -> Frame:
+    def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """A gear by its number."""
-        return Frame(0x066, bytes([gear | clear << 7]))
+        return CanFrame(0x066, bytes([gear | clear << 7]))
 
 
 class Hand2:
@@ -75,7 +81,7 @@ class Hand2:
     def __init__(self, first: int = 0x200) -> None:
         self.count, self.first = 0, first
 
-    def commands(self, asked: Asked) -> list[Frame]:
+    def commands(self, asked: Asked) -> list[CanFrame]:
         """Steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 16
         bits = asked.enable << 4 | asked.clear << 5 | asked.ignore << 6
@@ -87,16 +93,16 @@ class Hand2:
             *(sealed(self.first + part, struct.pack("<HBBBBB", raw, 14 | bits, 0, *tail)) for part, raw in pedals),
         ]
 
-    def clearing(self) -> list[Frame]:
+    def clearing(self) -> list[CanFrame]:
         """What takes back overrides."""
         return self.commands(Asked(enable=False, clear=True))
 
-    def gear(self, gear: int, clear: bool = False) -> Frame:
+    def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """A gear by its number."""
         assert not clear
         return sealed(self.first + 3, bytes([gear, 0, 0]))
 
-    def system(self, request: int) -> Frame:
+    def system(self, request: int) -> CanFrame:
         """A request to the system: 0 nothing, 1 enable, 2 disable."""
         self.count = (self.count + 1) % 16
         return sealed(0x216, bytes([request | self.count << 4]))
@@ -117,7 +123,7 @@ class Rig:
         """Let the car have a speed and a road wheel angle."""
         self.kit.sense(VehicleState(self.now_ns, speed_mps, steering_rad, "drive"), self.now_ns)
 
-    def send(self, *frames: Frame) -> None:
+    def send(self, *frames: CanFrame) -> None:
         """Put frames on the bus now."""
         for frame in frames:
             self.kit.receive(frame, self.now_ns)
@@ -166,8 +172,8 @@ class Rig:
         )
 
 
-def with_crc_broken(frame: Frame) -> Frame:
-    return Frame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
+def with_crc_broken(frame: CanFrame) -> CanFrame:
+    return CanFrame(frame.identifier, frame.data[:-1] + bytes([frame.data[-1] ^ 1]))
 
 
 ALL = set(AXES)

@@ -1,8 +1,8 @@
 import pytest
 from tests.vehicle.software_car.rig import ALL, Asked, Hand2, Rig, both, driving, sealed
 
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.software_car.state import Reason, System
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.software_car.state import ReleaseReason, SystemState
 
 
 def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
@@ -18,9 +18,9 @@ def test_generation_2_enables_when_asked_and_all_axes_are_commanded() -> None:
     """In generation 2 nothing obeys until the system is asked to enable and every axis is commanded with EN on."""
     rig = Rig(2)
     rig.command()
-    assert (rig.enabled(), rig.kit.state.system) == (set(), System.READY)
+    assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
     rig.ask()
-    assert (rig.enabled(), rig.kit.state.system) == (ALL, System.ACTIVE)
+    assert (rig.enabled(), rig.kit.state.system) == (ALL, SystemState.ACTIVE)
     other = Rig(2)
     other.ask()
     steering, brake, throttle = other.hand.commands(Asked())
@@ -48,7 +48,7 @@ def test_disabling_in_park_is_quiet(generation: int) -> None:
     rig.ask(2)
     rig.command(enable=False)
     state = rig.kit.state
-    assert (rig.enabled(), state.watchdog, state.watchdog_brakes) == (set(), Reason.NONE, False)
+    assert (rig.enabled(), state.watchdog, state.watchdog_brakes) == (set(), ReleaseReason.NONE, False)
 
 
 def test_generation_2_has_to_be_asked_anew() -> None:
@@ -59,7 +59,7 @@ def test_generation_2_has_to_be_asked_anew() -> None:
     rig.ask()
     rig.command(clear=True)
     rig.ask()
-    assert (rig.enabled(), rig.kit.state.system) == (set(), System.READY)
+    assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
     rig.ask(2)
     rig.ask()
     assert rig.enabled() == ALL
@@ -119,7 +119,7 @@ def test_an_unknown_type_of_command_enables_nothing(generation: int) -> None:
     _, brake, _ = rig.hand.commands(Asked(brake=0.5))
     data = bytearray(brake.data)
     data[2] = 7 << 4 if generation == 1 else 1 << 4 | 7
-    rig.send(Frame(0x060, bytes(data)) if generation == 1 else sealed(0x201, bytes(data[:-1])))
+    rig.send(CanFrame(0x060, bytes(data)) if generation == 1 else sealed(0x201, bytes(data[:-1])))
     assert rig.enabled() == (ALL - {"brake"} if generation == 1 else set())
 
 
@@ -141,7 +141,7 @@ def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: fl
     _, brake, _ = rig.hand.commands(Asked(brake=raw))
     data = bytearray(brake.data)
     data[2] = kind << 4
-    rig.send(Frame(brake.identifier, bytes(data)))
+    rig.send(CanFrame(brake.identifier, bytes(data)))
     assert rig.wheels()[2] == pytest.approx(fraction, abs=2e-4)
 
 

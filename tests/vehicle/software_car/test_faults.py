@@ -3,7 +3,7 @@ from tests.vehicle.software_car.rig import ALL, Rig, both, driving
 
 from lavt.errors import UserError
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
-from lavt.vehicle.software_car.state import Gear, Reason, System
+from lavt.vehicle.software_car.state import Gear, ReleaseReason, SystemState
 
 FAULTS = [
     (1, "steering.FLTPWR"),
@@ -21,7 +21,7 @@ def test_a_fault_lets_go_and_brakes(generation: int, name: str) -> None:
     """A part that breaks while it is driven lets everything go, and the kit brakes."""
     rig = driving(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), Reason.FAULT, WATCHDOG_BRAKE)
+    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), ReleaseReason.FAULT, WATCHDOG_BRAKE)
 
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
@@ -40,20 +40,20 @@ def test_what_is_broken_is_not_enabled(generation: int, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("seat belt", Reason.SEAT_BELT),
-        ("door", Reason.DOOR),
-        ("speed", Reason.LOCKOUT_SPEED),
-        ("acceleration", Reason.LOCKOUT_ACCELERATION),
-        ("reverse", Reason.LOCKOUT_REVERSE),
+        ("seat belt", ReleaseReason.SEAT_BELT),
+        ("door", ReleaseReason.DOOR),
+        ("speed", ReleaseReason.LOCKOUT_SPEED),
+        ("acceleration", ReleaseReason.LOCKOUT_ACCELERATION),
+        ("reverse", ReleaseReason.LOCKOUT_REVERSE),
     ],
 )
-def test_what_hinders_generation_2(name: str, reason: Reason) -> None:
+def test_what_hinders_generation_2(name: str, reason: ReleaseReason) -> None:
     """Belt, door and lockouts keep generation 2 in manual, and it says why; while driving it lets go and brakes."""
     rig = Rig(2)
     rig.kit.hinder(name, rig.now_ns)
     rig.command()
     rig.ask()
-    assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), System.MANUAL, reason)
+    assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), SystemState.MANUAL, reason)
     rig.kit.hinder(None, rig.now_ns)
     assert rig.enabled() == ALL
     rig.kit.hinder(name, rig.now_ns)
@@ -65,7 +65,7 @@ def test_the_remotes_switch(remote_state: int) -> None:
     """At emergency stop or pause generation 2 lets go and brakes, and is not ready."""
     rig = driving(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
-    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, Reason.REMOTE)
+    assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, ReleaseReason.REMOTE)
 
 
 @both
@@ -77,7 +77,7 @@ def test_bus_off_is_silence(generation: int) -> None:
     rig.last.clear()
     rig.drive_ms(80, throttle=0.5)
     assert rig.last == {}
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), Reason.TIMEOUT)
+    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
     rig.kit.bus_off(rig.now_ns, is_off=False)
     rig.wait_ms(100)
     assert len(rig.last) == (5 if generation == 1 else 8)

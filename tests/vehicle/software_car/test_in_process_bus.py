@@ -8,11 +8,11 @@ import pytest
 from tests.vehicle.software_car.rig import START_NS, Asked, Hand1, Hand2, both
 
 from lavt.domain import NS_PER_MS, NS_PER_S, GroundTruth, VehicleEvent
-from lavt.vehicle.can_frame import BusGone, HeardFrame
+from lavt.vehicle.can_frame import BusGone, ReceivedCanFrame
 from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
-from lavt.vehicle.software_car.in_process_bus import FRAME_NS, InsidePort
+from lavt.vehicle.software_car.in_process_bus import FRAME_NS, InProcessPort
 from lavt.vehicle.software_car.kit import Kit
 
 
@@ -21,10 +21,10 @@ def road() -> Road:
     return load_road("a_key")
 
 
-def port_of(generation: int, delay_ns: int = FRAME_NS) -> InsidePort:
+def port_of(generation: int, delay_ns: int = FRAME_NS) -> InProcessPort:
     simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
     car = SoftwareCar(Kit(1 if generation == 1 else 2, start_ns=START_NS), simulator)
-    return InsidePort(car, delay_ns=delay_ns)
+    return InProcessPort(car, delay_ns=delay_ns)
 
 
 def hand_of(generation: int) -> Hand1 | Hand2:
@@ -33,10 +33,10 @@ def hand_of(generation: int) -> Hand1 | Hand2:
 
 def drive(
     generation: int, looks_each_ms: int, *, asked: Asked, duration_ms: int = 3_000
-) -> tuple[list[HeardFrame], GroundTruth, list[VehicleEvent]]:
+) -> tuple[list[ReceivedCanFrame], GroundTruth, list[VehicleEvent]]:
     """Command every 20 ms, look at the port however often, and tell all that came."""
     port, hand = port_of(generation), hand_of(generation)
-    heard: list[HeardFrame] = []
+    heard: list[ReceivedCanFrame] = []
     events: list[VehicleEvent] = []
     truth: GroundTruth | None = None
     for passed_ms in range(0, duration_ms + 1, looks_each_ms):
@@ -128,7 +128,7 @@ def test_a_set_from_the_past_goes_now() -> None:
 def test_waking_as_it_asks_hears_everything() -> None:
     """Who takes at each `next_wake_ns` hears every report of a second, each at most 2 ms after it came."""
     port = port_of(2)
-    heard: list[HeardFrame] = []
+    heard: list[ReceivedCanFrame] = []
     now_ns = START_NS
     while now_ns < START_NS + NS_PER_S + 10 * NS_PER_MS:
         came = port.take(now_ns)

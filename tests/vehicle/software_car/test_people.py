@@ -1,8 +1,8 @@
 import pytest
 from tests.vehicle.software_car.rig import ALL, AXES, Rig, both, driving
 
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.software_car.state import Gear, Reason, Reject
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
 
 
 @both
@@ -20,7 +20,7 @@ def test_the_driver_takes_over(generation: int, axis: str) -> None:
     rig.drive_ms(1000, throttle=0.1)
     rig.ask()
     assert rig.enabled() == ALL - lost
-    assert rig.kit.state.watchdog == Reason.NONE
+    assert rig.kit.state.watchdog == ReleaseReason.NONE
     rig.ask(0)
     rig.send(*rig.hand.clearing())
     rig.command()
@@ -67,9 +67,9 @@ def test_clearing_frames_have_no_counter() -> None:
     for _ in range(4):
         rig.wait_ms(25)
         rig.send(*rig.hand.clearing())
-    assert rig.kit.state.watchdog == Reason.TIMEOUT
+    assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
     other = Rig(1)
-    other.send(*(Frame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.hand.clearing()))
+    other.send(*(CanFrame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.hand.clearing()))
     assert other.enabled() == set()
 
 
@@ -77,8 +77,8 @@ def test_a_full_clearing_frame_without_a_counter_trips() -> None:
     """Generation 1: 8 bytes with CLEAR and no counter trip the watchdog."""
     rig = driving(1)
     rig.command()
-    rig.send(*(Frame(frame.identifier, frame.data + bytes(4)) for frame in rig.hand.clearing()))
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), Reason.COUNTER)
+    rig.send(*(CanFrame(frame.identifier, frame.data + bytes(4)) for frame in rig.hand.clearing()))
+    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.COUNTER)
 
 
 @both
@@ -88,10 +88,10 @@ def test_a_shift_needs_the_brake(generation: int) -> None:
     rig.enable(in_drive=False)
     rig.command(brake=0.0)
     rig.send(rig.hand.gear(4))
-    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.PARK, Reject.VEHICLE)
+    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.PARK, GearRejection.VEHICLE)
     rig.command(brake=0.5)
     rig.send(rig.hand.gear(4))
-    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.DRIVE, Reject.NONE)
+    assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.DRIVE, GearRejection.NONE)
 
 
 @both
@@ -99,21 +99,21 @@ def test_why_gears_are_refused(generation: int) -> None:
     """Park while moving 5, reverse 6, after the driver's shift 2, with a fault 7, and no gear at all is no request."""
     rig = driving(generation)
 
-    def refusal(gear: int) -> Reject:
+    def refusal(gear: int) -> GearRejection:
         rig.command(brake=0.5)
         rig.send(rig.hand.gear(gear))
         return rig.kit.state.gear_reject
 
     assert [refusal(gear) for gear in (1, 2, 5, 0)] == [
-        Reject.VEHICLE,
-        Reject.UNSUPPORTED,
-        Reject.UNSUPPORTED,
-        Reject.NONE,
+        GearRejection.VEHICLE,
+        GearRejection.UNSUPPORTED,
+        GearRejection.UNSUPPORTED,
+        GearRejection.NONE,
     ]
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
-    assert refusal(4) == Reject.OVERRIDE
+    assert refusal(4) == GearRejection.OVERRIDE
     rig.kit.set_fault(f"gear.{'FLTBUS' if generation == 1 else 'fault'}", rig.now_ns)
-    assert refusal(4) == Reject.FAULT
+    assert refusal(4) == GearRejection.FAULT
     assert rig.kit.state.gear == Gear.NEUTRAL
 
 
@@ -135,11 +135,15 @@ def test_the_shifter_takes_over() -> None:
     """Moving the shifter lets generation 2 go as a whole, and is told in generation 1, whose sender has to let go."""
     rig = driving(2)
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
-    assert (rig.enabled(), rig.kit.state.disengaged, rig.kit.state.watchdog) == (set(), Reason.OVERRIDE, Reason.NONE)
+    assert (rig.enabled(), rig.kit.state.disengaged, rig.kit.state.watchdog) == (
+        set(),
+        ReleaseReason.OVERRIDE,
+        ReleaseReason.NONE,
+    )
     first = driving(1)
     first.kit.driver_shifts(Gear.NEUTRAL, first.now_ns)
     first.command(enable=False)
-    assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog) == (True, Reason.NONE)
+    assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog) == (True, ReleaseReason.NONE)
     first.send(first.hand.gear(0, clear=True))
     assert not first.kit.state.is_gear_overridden
 

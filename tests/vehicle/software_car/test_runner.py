@@ -9,7 +9,7 @@ from tests.vehicle.software_car.rig import START_NS, Asked, Hand2, with_crc_brok
 from tests.vehicle.software_car.test_in_process_bus import port_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S, VehicleEvent
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.ground_truth_wire import TruthReceiver
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.runner import Runner
@@ -22,18 +22,18 @@ class Bus:
     """A port of which a test is the other end."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[Frame, int]] = []
-        self.coming: list[HeardFrame] = []
+        self.sent: list[tuple[CanFrame, int]] = []
+        self.coming: list[ReceivedCanFrame] = []
         self.gone = ""
         self.counts: dict[str, int] = {}
 
-    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Keep frames."""
         if self.gone:
             raise BusGone(self.gone)
         self.sent += [(frame, made_ns) for frame in frames]
 
-    def take(self, _now_ns: int) -> list[HeardFrame]:
+    def take(self, _now_ns: int) -> list[ReceivedCanFrame]:
         """Give what a test lets come."""
         if self.gone:
             raise BusGone(self.gone)
@@ -57,9 +57,9 @@ class Life:
         self.now_ns = START_NS
         self.said: list[tuple[str, str]] = []
 
-    def come(self, *frames: Frame, at_ns: int | None = None) -> None:
+    def come(self, *frames: CanFrame, at_ns: int | None = None) -> None:
         """Let frames come from the bus."""
-        self.bus.coming += [HeardFrame(frame, self.now_ns if at_ns is None else at_ns) for frame in frames]
+        self.bus.coming += [ReceivedCanFrame(frame, self.now_ns if at_ns is None else at_ns) for frame in frames]
 
     def step_ms(self, passed_ms: float = 0) -> None:
         """Let time pass, then step once."""

@@ -9,7 +9,7 @@ from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit
-from lavt.vehicle.software_car.state import Reason
+from lavt.vehicle.software_car.state import ReleaseReason
 
 
 @cache
@@ -87,7 +87,7 @@ def test_a_silent_sender_stops_the_car(generation: int) -> None:
     drive = Drive(generation)
     drive.hold_ms(5_000, speed_mps=5.0)
     drive.wait_ms(100)
-    assert drive.car.kit.state.watchdog == Reason.TIMEOUT
+    assert drive.car.kit.state.watchdog == ReleaseReason.TIMEOUT
     drive.wait_ms(2_400)
     assert (drive.simulator.state().speed_mps, drive.speed_mps) == (0.0, 0.0)
 

@@ -15,7 +15,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import UserError
 from lavt.vehicle.software_car.console_commands import WORDS, act, help_lines
 from lavt.vehicle.software_car.kit import Kit
-from lavt.vehicle.software_car.state import Gear, Reason
+from lavt.vehicle.software_car.state import Gear, ReleaseReason
 
 NO_DEEDS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense"}
 """What a kit does by itself."""
@@ -32,7 +32,7 @@ NO_DEEDS = {"receive", "frames_due", "actuation", "next_wake_ns", "sense"}
         ("  fault   steering.fault  ", lambda kit: kit.state.actuators["steering"].faults == {"fault"}),
         ("fault gear.fault", lambda kit: kit.state.gear_faults == {"fault"}),
         ("unknown speed", lambda kit: kit.state.invalid == {"speed"}),
-        ("hinder seat belt", lambda kit: kit.state.not_ready == Reason.SEAT_BELT),
+        ("hinder seat belt", lambda kit: kit.state.not_ready == ReleaseReason.SEAT_BELT),
         ("switch_remote emergency_stop", lambda kit: kit.state.remote_state == 0),
         ("switch_remote pause", lambda kit: kit.state.remote_state == 1),
         ("switch_remote control_allowed", lambda kit: kit.state.remote_state == 3),

@@ -4,7 +4,7 @@ import pytest
 from tests.vehicle.software_car.rig import ALL, AXES, Asked, Hand2, Rig, both, driving, with_crc_broken
 
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
-from lavt.vehicle.software_car.state import Gear, Reason, System
+from lavt.vehicle.software_car.state import Gear, ReleaseReason, SystemState
 
 
 @both
@@ -17,7 +17,7 @@ def test_commands_time_out_after_100_ms(generation: int) -> None:
     rig.wait_ms(0.001)
     assert (rig.enabled(), rig.wheels()[1:]) == (set(), (0.0, WATCHDOG_BRAKE))
     assert all(actuator.has_timed_out for actuator in rig.kit.state.actuators.values())
-    assert rig.kit.state.watchdog == Reason.TIMEOUT
+    assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
 
 
 @both
@@ -43,7 +43,7 @@ def test_one_axis_without_commands_is_enough(generation: int, part: int) -> None
         rig.wait_ms(20)
         frames = rig.hand.commands(Asked(throttle=0.5))
         rig.send(*(frame for index, frame in enumerate(frames) if index != part))
-    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), Reason.TIMEOUT)
+    assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
     assert rig.kit.state.watchdog_axis == AXES[part]
 
 
@@ -67,7 +67,11 @@ def test_a_stuck_counter_trips_the_watchdog(generation: int) -> None:
     assert rig.enabled() == ALL
     rig.wait_ms(20)
     rig.send(frames[2])
-    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[1:]) == (set(), Reason.COUNTER, (0.0, WATCHDOG_BRAKE))
+    assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[1:]) == (
+        set(),
+        ReleaseReason.COUNTER,
+        (0.0, WATCHDOG_BRAKE),
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,7 +99,11 @@ def test_a_wrong_checksum_trips_the_watchdog() -> None:
         rig = driving(2)
         frames = rig.hand.commands(Asked(angle_deg=50.0, throttle=0.5))
         rig.send(with_crc_broken(frames[part]))
-        assert (rig.enabled(), rig.kit.state.watchdog, rig.kit.state.system) == (set(), Reason.CRC, System.FAULT)
+        assert (rig.enabled(), rig.kit.state.watchdog, rig.kit.state.system) == (
+            set(),
+            ReleaseReason.CRC,
+            SystemState.FAULT,
+        )
         assert [rig.kit.state.actuators[axis].is_crc_bad for axis in ("steering", "brake", "throttle")] == [
             index == part for index in range(3)
         ]

@@ -15,7 +15,7 @@ two crystals differ by less. Only chrony may be faster, and says by how much it 
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
+class ClockOffset:
     """Delta at moments of the client's wall clock, in order, and how far from the truth the line between them can be.
 
     `bound_ns` is NaN where nobody knows. Before the first and after the last moment it grows by `outside` nanoseconds
@@ -45,7 +45,7 @@ class Offset:
         return server_ns
 
 
-NO_OFFSET = Offset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1), 0.0)
+NO_OFFSET = ClockOffset(np.zeros(1, np.int64), np.zeros(1), np.zeros(1), 0.0)
 """That of two hosts which share a clock."""
 
 
@@ -78,7 +78,7 @@ class _Correction:
         return _between(reference_ns, self.reference_ns, values)
 
 
-def by_sources(server: Table, client: Table) -> Offset | None:
+def by_sources(server: Table, client: Table) -> ClockOffset | None:
     """Delta by what both hosts' sources of time say, from their channels `clock`; None where one of them cannot tell.
 
     Its moments are those of the samples of both, as long as both know theirs; beyond them it is taken to go on changing
@@ -104,7 +104,7 @@ def by_sources(server: Table, client: Table) -> Offset | None:
     correction_ns = of_client.at(moments, of_client.correction_ns)
     delta_ns = correction_ns - of_server.at(moments, of_server.correction_ns)
     outside = 2 * float(np.max(np.abs(_rates(moments, delta_ns))[[0, -1]])) if len(moments) > 1 else DRIFT_ALLOWANCE
-    return Offset(moments - np.rint(correction_ns).astype(np.int64), delta_ns, bound_ns, outside)
+    return ClockOffset(moments - np.rint(correction_ns).astype(np.int64), delta_ns, bound_ns, outside)
 
 
 def known_samples(samples: Table) -> Table:
@@ -167,7 +167,7 @@ def _missed_ns(moments: IntArray, samples: _Correction) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Exchanges:
+class ProbeExchanges:
     """Exchanges of the probe, in order: when, on both wall clocks, and what each says of Delta, in ns."""
 
     client_wall_ns: IntArray
@@ -178,23 +178,23 @@ class Exchanges:
     def __len__(self) -> int:
         return len(self.client_wall_ns)
 
-    def within(self, began_wall_ns: int, ended_wall_ns: int) -> Exchanges:
+    def within(self, began_wall_ns: int, ended_wall_ns: int) -> ProbeExchanges:
         """Those of an interval of the server's wall clock."""
         chosen = (self.server_wall_ns >= began_wall_ns) & (self.server_wall_ns <= ended_wall_ns)
         return self.where(chosen)
 
-    def where(self, chosen: BoolArray | IntArray) -> Exchanges:
+    def where(self, chosen: BoolArray | IntArray) -> ProbeExchanges:
         """Choose some."""
-        return Exchanges(
+        return ProbeExchanges(
             self.client_wall_ns[chosen], self.server_wall_ns[chosen], self.delta_ns[chosen], self.round_trip_ns[chosen]
         )
 
 
-def exchanges(probes: Table) -> Exchanges:
+def exchanges(probes: Table) -> ProbeExchanges:
     """Read the channel `clock_probe`; a clock that was set in the middle of an exchange spoils it, where that shows."""
     names = ("sent_wall_ns", "received_wall_ns", "answered_wall_ns", "arrived_wall_ns")
     sent, received, answered, arrived = (probes.ints(name) for name in names)
-    found = Exchanges(
+    found = ProbeExchanges(
         sent + (arrived - sent) // 2,
         received + (answered - received) // 2,
         ((received - sent) + (answered - arrived)) / 2,
@@ -206,7 +206,7 @@ def exchanges(probes: Table) -> Exchanges:
     return found.where(np.flatnonzero(good)[order])
 
 
-def by_probe(every: Exchanges) -> Offset | None:
+def by_probe(every: ProbeExchanges) -> ClockOffset | None:
     """Delta by the probe alone: at the time of each exchange by the one, of all, that says most of it.
 
     An exchange says Delta to half its round trip, and later or earlier to as much more as clocks may drift apart.
@@ -221,7 +221,7 @@ def by_probe(every: Exchanges) -> Offset | None:
     delta_ns = every.delta_ns[np.where(bounds_ns[0] <= bounds_ns[1], before, after)]
     gaps_ns = np.diff(when_ns)
     between_ns = DRIFT_ALLOWANCE * np.maximum(np.append(gaps_ns, 0.0), np.append(0.0, gaps_ns)) / 2
-    return Offset(every.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + between_ns, DRIFT_ALLOWANCE)
+    return ClockOffset(every.client_wall_ns, delta_ns, np.minimum(*bounds_ns) + between_ns, DRIFT_ALLOWANCE)
 
 
 def _running_least(values: FloatArray) -> IntArray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clock_offset import follows
-from lavt.experiment.analysis.clocks import MARGIN_NS, PROBE, SAME_KERNEL, Clocks, drive_on_client
+from lavt.experiment.analysis.clocks import MARGIN_NS, PROBE, SAME_KERNEL, RunClocks, drive_on_client
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
@@ -28,7 +28,7 @@ Sides = tuple[tuple[str, Table, Table, IntArray], ...]
 """Name of a side, its samples, the other side's, and beginning and end of the drive on its wall clock."""
 
 
-def step_reasons(server: Record, client: Record, clocks: Clocks, began_ns: int, ended_ns: int) -> list[str]:
+def step_reasons(server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int) -> list[str]:
     """Tell of wall clocks that were set near the drive; two sides on one kernel have one clock."""
     found = {
         "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
@@ -94,7 +94,7 @@ def _sampled_ns(record: Record) -> IntArray:
     return np.sort(mono_ns[mono_ns != MISSING])
 
 
-def offset_reasons(server: Record, client: Record, clocks: Clocks) -> list[str]:
+def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[str]:
     """Tell what is wrong with Delta: an unfit source of time first, and only where there is none what it leads to."""
     if clocks.source == SAME_KERNEL:
         return []
@@ -112,7 +112,7 @@ def _status(samples: Table) -> str:
     return said[-1] if said else "no sample that can be used"
 
 
-def _source_reasons(of_server: Table, of_client: Table, clocks: Clocks) -> list[str]:
+def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> list[str]:
     sides: Sides = (
         ("client", of_client, of_server, clocks.client_wall_ns),
         ("server", of_server, of_client, clocks.server_wall_ns),
@@ -129,7 +129,7 @@ def _grandmasters(samples: Table) -> set[str]:
     return {name for source, name in names if source == "ptp" and name}
 
 
-def _path_reasons(sides: Sides, clocks: Clocks) -> list[str]:
+def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
     """Compare the shortest round trips of NTP and of the probe during the drive, where one host follows the other.
 
     A busy machine makes some of them longer, injected delay all of them.
@@ -150,7 +150,7 @@ def _path_reasons(sides: Sides, clocks: Clocks) -> list[str]:
     return reasons
 
 
-def _still_reasons(sides: Sides, _clocks: Clocks) -> list[str]:
+def _still_reasons(sides: Sides, _clocks: RunClocks) -> list[str]:
     """Look for a time that touches the drive in which NTP's samples came to nothing, or came no more."""
     reasons = []
     for side, samples, _, drive_ns in sides:
@@ -186,7 +186,7 @@ def _during(samples: Table, drive_ns: IntArray) -> Table:
     return samples.where((wall_ns >= drive_ns[0]) & (wall_ns <= drive_ns[1]))
 
 
-def _bound_reasons(clocks: Clocks) -> list[str]:
+def _bound_reasons(clocks: RunClocks) -> list[str]:
     bound_ms = clocks.bound_ms
     if bound_ms is None:
         return ["the offset between the clocks has no bound"]
@@ -198,7 +198,7 @@ def _bound_reasons(clocks: Clocks) -> list[str]:
     return []
 
 
-def _unchecked_reasons(clocks: Clocks) -> list[str]:
+def _unchecked_reasons(clocks: RunClocks) -> list[str]:
     if clocks.probe is not None:
         return []
     return [
@@ -207,7 +207,7 @@ def _unchecked_reasons(clocks: Clocks) -> list[str]:
     ]
 
 
-def _agreement_reasons(clocks: Clocks) -> list[str]:
+def _agreement_reasons(clocks: RunClocks) -> list[str]:
     apart_ms = clocks.disagreement_ms()
     if apart_ms is None:
         return []

@@ -10,8 +10,8 @@ import numpy as np
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.experiment.analysis.clock_offset import (
     NO_OFFSET,
-    Exchanges,
-    Offset,
+    ClockOffset,
+    ProbeExchanges,
     by_probe,
     by_sources,
     exchanges,
@@ -29,16 +29,16 @@ which is more than a run may have."""
 
 
 @dataclass(frozen=True, slots=True)
-class Clocks:
+class RunClocks:
     """Delta of a run by name of its source, the probe's opinion, and over which wall times of client and server.
 
     `offset` is None where nobody knows Delta, `probe` where the probe had no answer during the drive.
     """
 
     source: str | None
-    offset: Offset | None
-    probe: Offset | None
-    probed: Exchanges
+    offset: ClockOffset | None
+    probe: ClockOffset | None
+    probed: ProbeExchanges
     """Exchanges during the drive."""
     client_wall_ns: IntArray
     """Beginning and end of the drive, on each host's wall clock."""
@@ -79,23 +79,23 @@ class Clocks:
         )
         return delta_ms, probe_ms, bound_ms
 
-    def _inner(self, offset: Offset) -> IntArray:
+    def _inner(self, offset: ClockOffset) -> IntArray:
         """Moments of an offset during the drive."""
         moments = offset.client_wall_ns
         return np.asarray(moments[(moments > self.client_wall_ns[0]) & (moments < self.client_wall_ns[1])], np.int64)
 
-    def _bound_ms(self, offset: Offset) -> float | None:
+    def _bound_ms(self, offset: ClockOffset) -> float | None:
         moments = np.union1d(self._inner(offset), self.client_wall_ns)
         largest_ns = float(np.max(offset.bound_at(moments)))
         return largest_ns / NS_PER_MS if np.isfinite(largest_ns) else None
 
-    def _middle_ms(self, offset: Offset | None) -> float | None:
+    def _middle_ms(self, offset: ClockOffset | None) -> float | None:
         if offset is None:
             return None
         began_ns, ended_ns = self.client_wall_ns.tolist()
         return float(offset.at(np.array([(began_ns + ended_ns) // 2]))[0]) / NS_PER_MS
 
-    def _drift_ppm(self, offset: Offset) -> float | None:
+    def _drift_ppm(self, offset: ClockOffset) -> float | None:
         """Slope of the straight line through Delta during the drive."""
         if self.source == SAME_KERNEL:
             return 0.0
@@ -104,7 +104,7 @@ class Clocks:
         return None if len(moments) < 2 else float(np.polyfit(gone_ns, offset.at(moments), 1)[0]) * 1e6
 
 
-def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Clocks:
+def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunClocks:
     """Find Delta of a run that was driven between two times of the server's monotonic clock.
 
     Hosts that report the same name share a kernel, and so a clock: Delta is 0 and so is its bound. Else what the hosts'
@@ -121,7 +121,7 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
     probe = by_probe(every) if len(probed) else None
     sources = None if _left_to_the_probe(of_server, of_client) else by_sources(of_server, of_client)
     source: str | None
-    offset: Offset | None
+    offset: ClockOffset | None
     if _one_host(of_server, of_client):
         source, offset = SAME_KERNEL, NO_OFFSET
     elif sources is not None and (_is_bounded(sources, server_wall_ns) or probe is None):
@@ -130,7 +130,7 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> Cloc
     else:
         source, offset = (None, None) if probe is None else (PROBE, probe)
     client_wall_ns = server_wall_ns if offset is None else _on_client(offset, server_wall_ns)
-    return Clocks(source, offset, probe, probed, client_wall_ns, server_wall_ns)
+    return RunClocks(source, offset, probe, probed, client_wall_ns, server_wall_ns)
 
 
 def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
@@ -176,13 +176,13 @@ def _left_to_the_probe(server: Table, client: Table) -> bool:
     return PROBE in {*server.texts("source"), *client.texts("source")}
 
 
-def _is_bounded(offset: Offset, server_wall_ns: IntArray) -> bool:
+def _is_bounded(offset: ClockOffset, server_wall_ns: IntArray) -> bool:
     """Tell whether the bound is known, and from before the drive's beginning on."""
     known = np.isfinite(offset.bound_ns)
     return bool(known.all()) and bool(offset.client_wall_ns[0] <= _on_client(offset, server_wall_ns)[0])
 
 
-def _on_client(offset: Offset, server_wall_ns: IntArray) -> IntArray:
+def _on_client(offset: ClockOffset, server_wall_ns: IntArray) -> IntArray:
     """Turn wall times of the server into those of the client, where Delta hardly changes within itself."""
     guess_ns = server_wall_ns - offset.at(server_wall_ns)
     return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)

@@ -20,7 +20,7 @@ DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class DriveData:
     """One run: where it is, its `result.json`, the truth of the driving interval, and the route's centre line.
 
     `reference_m` is (points, 2); `truth` has the columns `DRAWN`, and no rows where there was no simulator.
@@ -40,12 +40,12 @@ class Drive:
         return str(self.result["condition"])
 
 
-def read_drive(directory: Path, result: Mapping[str, Any]) -> Drive:
+def read_drive(directory: Path, result: Mapping[str, Any]) -> DriveData:
     """Read what the figures need of the run in `directory`."""
     return drive_of(read_record(directory / "server.mcap", channels=("truth", "event", "route")), directory, result)
 
 
-def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> Drive:
+def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> DriveData:
     """Take what the figures need out of the server's record of a run."""
     began_ns, ended_ns, _ = driving_interval(record)
     truth = record.table("truth")
@@ -55,12 +55,12 @@ def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> Driv
     within = truth.where((truth_ns >= began_ns) & (truth_ns <= ended_ns))
     columns = {name: within.columns[name] for name in DRAWN if name in within.columns}
     driven = Table(within.mono_ns, within.wall_ns, columns)
-    return Drive(directory, result, driven, reference_m, began_ns, record.annotations)
+    return DriveData(directory, result, driven, reference_m, began_ns, record.annotations)
 
 
-def one_of_each_condition(drives: Sequence[Drive]) -> list[Drive]:
+def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
     """Choose a drive of each condition, in their order: a valid one if there is one, the first of those."""
-    chosen: dict[str, Drive] = {}
+    chosen: dict[str, DriveData] = {}
     for drive in sorted(drives, key=lambda drive: not drive.result["valid"]):
         chosen.setdefault(drive.condition, drive)
     return [chosen[name] for name in sorted(chosen)]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS, FloatArray
-from lavt.experiment.analysis.clock_offset import Offset
+from lavt.experiment.analysis.clock_offset import ClockOffset
 from lavt.recording.table import MISSING, IntArray, Table
 
 
@@ -53,13 +53,13 @@ def decoded_pictures(pictures: Table) -> Table:
     return pictures.where(np.array([decoded is not False for decoded in pictures.objects("decoded")], np.bool_))
 
 
-def video_latency_ns(pictures: Table, offset: Offset) -> IntArray:
+def video_latency_ns(pictures: Table, offset: ClockOffset) -> IntArray:
     """tau_v of every readable picture: stamp written to stamp read, both by the server's clock."""
     readable = pictures.where(pictures.flags("readable") & (pictures.ints("read_wall_ns") != MISSING))
     return offset.on_server_ns(readable.ints("read_wall_ns")) - readable.ints("stamp_ns")
 
 
-def control_latency_ns(admissions: Table, offset: Offset, began_ns: int, ended_ns: int) -> IntArray:
+def control_latency_ns(admissions: Table, offset: ClockOffset, began_ns: int, ended_ns: int) -> IntArray:
     """tau_c of every command received, obeyed or refused: sent by the client to received by the server."""
     received_ns = admissions.ints("received_mono_ns")
     known = (admissions.ints("sent_wall_ns") != MISSING) & (admissions.ints("received_wall_ns") != MISSING)
@@ -68,7 +68,7 @@ def control_latency_ns(admissions: Table, offset: Offset, began_ns: int, ended_n
 
 
 @dataclass(frozen=True, slots=True)
-class Loops:
+class AcceptedLoops:
     """For each frame that led to an obeyed command: the frame, and the first such command (rows of `admission`)."""
 
     stamp_ns: IntArray
@@ -100,7 +100,7 @@ def obeyed(admissions: Table) -> Table:
     return Table(commands.mono_ns[order], commands.wall_ns[order], columns)
 
 
-def loops(frames: Table, admissions: Table, ended_ns: int) -> Loops:
+def loops(frames: Table, admissions: Table, ended_ns: int) -> AcceptedLoops:
     """Pair each of `frames` with the first obeyed command that carries its stamp and was applied by `ended_ns`."""
     commands = obeyed(admissions)
     commands = commands.where(commands.ints("applied_mono_ns") <= ended_ns)
@@ -110,10 +110,10 @@ def loops(frames: Table, admissions: Table, ended_ns: int) -> Loops:
     chosen[first] = True
     chosen &= stamped_ns != MISSING
     commands = commands.where(chosen)
-    return Loops(commands.ints("stamp_ns"), stamped_ns[chosen], commands)
+    return AcceptedLoops(commands.ints("stamp_ns"), stamped_ns[chosen], commands)
 
 
-def closure_ns(pictures: Table, paired: Loops, offset: Offset) -> IntArray:
+def closure_ns(pictures: Table, paired: AcceptedLoops, offset: ClockOffset) -> IntArray:
     """How far tau_v + client time + tau_c + actuator time is from the loop latency, for every frame that has them all.
 
     The offset cancels in the sum; a clock that stepped, or a command that names another picture's times, does not.

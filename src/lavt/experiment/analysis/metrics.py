@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.analysis.clocks import Clocks, clocks
+from lavt.experiment.analysis.clocks import RunClocks, clocks
 from lavt.experiment.analysis.latency import (
     ages_at_actuation_ns,
     closure_ns,
@@ -30,7 +30,7 @@ from lavt.recording.table import MISSING, Table
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class RunMeasurement:
     """What was measured in a run.
 
     `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of how far the
@@ -39,7 +39,7 @@ class Measured:
 
     entry: Mapping[str, Any]
     closure_p95_ms: float | None
-    clocks: Clocks
+    clocks: RunClocks
 
 
 def driving_interval(server: Record) -> tuple[int, int, str | None]:
@@ -62,7 +62,7 @@ def _events(events: Table) -> list[tuple[str, int, str]]:
     return list(zip(events.texts("kind"), events.ints("mono_ns").tolist(), events.texts("detail"), strict=True))
 
 
-def measure(server: Record, client: Record) -> Measured:
+def measure(server: Record, client: Record) -> RunMeasurement:
     """Compute every metric of a run. What cannot be known (no truth, no clock samples, no picture) is None."""
     began_ns, ended_ns, ending = driving_interval(server)
     drove = began_ns <= ended_ns
@@ -75,7 +75,7 @@ def measure(server: Record, client: Record) -> Measured:
         **latencies,
         "delta": on_one_scale.entry,
     }
-    return Measured(entry, closure_p95_ms, on_one_scale)
+    return RunMeasurement(entry, closure_p95_ms, on_one_scale)
 
 
 def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
 
 
 def _latencies(
-    server: Record, client: Record, began_ns: int, ended_ns: int, on_one_scale: Clocks
+    server: Record, client: Record, began_ns: int, ended_ns: int, on_one_scale: RunClocks
 ) -> tuple[dict[str, Any], float | None]:
     all_frames, admissions = server.table("frame"), server.table("admission")
     frames = frames_within(all_frames, began_ns, ended_ns)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS
-from lavt.experiment.analysis.clock_offset import Offset
+from lavt.experiment.analysis.clock_offset import ClockOffset
 from lavt.experiment.analysis.latency import look_up, pictures_of, video_latency_ns
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
@@ -25,7 +25,7 @@ Durations = list[tuple[Hop, IntArray]]
 
 
 def hop_percentiles(
-    server: Record, client: Record, frames: Table, tau_c_ns: IntArray, offset: Offset | None
+    server: Record, client: Record, frames: Table, tau_c_ns: IntArray, offset: ClockOffset | None
 ) -> list[dict[str, Any]]:
     """Tell of each hop of the life of `frames`, in order, how long it took: p50 and p95 in ms, and of how many.
 
@@ -73,7 +73,7 @@ def wheel_ns(server: Record, frames: Table) -> IntArray:
     return np.asarray((wheel.ints("wheel_mono_ns") - wheel.ints("applied_mono_ns"))[known], np.int64)
 
 
-def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: Offset) -> IntArray:
+def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: ClockOffset) -> IntArray:
     """Time from a frame's last packet leaving the camera to the arrival of the packet that made it whole.
 
     It is tau_v less what the camera did after the stamp, and less what the client did before the stamp was read.

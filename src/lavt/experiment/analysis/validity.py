@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.clock_validity import offset_reasons, poll_reasons, step_reasons
 from lavt.experiment.analysis.latency import frames_within
-from lavt.experiment.analysis.metrics import Measured, count, driving_interval
+from lavt.experiment.analysis.metrics import RunMeasurement, count, driving_interval
 from lavt.recording.record import Record
 
 CLOSURE_LIMIT_MS = 1.0
@@ -19,7 +19,7 @@ INJECTION_LIMIT_MS = 1.0
 """How far the injected delay may be from what was asked."""
 
 
-def invalid_because(server: Record, client: Record, measured: Measured) -> list[str]:
+def invalid_because(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
     """Say why a run must not count, one sentence a reason; an empty list is a valid run."""
     return [
         *_record_reasons("server", server),
@@ -37,7 +37,7 @@ def _record_reasons(side: str, record: Record) -> list[str]:
     return reasons
 
 
-def _clock_reasons(server: Record, client: Record, measured: Measured) -> list[str]:
+def _clock_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
     """Tell of the clocks; where one was set, everything else about them follows from it."""
     began_ns, ended_ns, _ = driving_interval(server)
     polls = poll_reasons(server, client, began_ns, ended_ns)
@@ -47,7 +47,7 @@ def _clock_reasons(server: Record, client: Record, measured: Measured) -> list[s
     return [*offset_reasons(server, client, measured.clocks), *polls, *_closure_reasons(measured)]
 
 
-def _closure_reasons(measured: Measured) -> list[str]:
+def _closure_reasons(measured: RunMeasurement) -> list[str]:
     closure_ms = measured.closure_p95_ms
     if closure_ms is None or closure_ms <= CLOSURE_LIMIT_MS:
         return []

@@ -25,7 +25,7 @@ from lavt.experiment.boundary.delay_margin import configured_loop, critical_dela
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.boundary_figure import boundary_figure
 from lavt.experiment.report.files import save_figure
-from lavt.experiment.runs.monitored_run import WatchedDrive, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.statistics.boundary_summary import CRITERIA, groups_of
 from lavt.experiment.sweep.workers import Workers, processes
@@ -40,7 +40,7 @@ Totals = Callable[[float], float]
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class BoundarySearch:
     """One seed on one route with one preset: its run without added delay, and where to look."""
 
     planned: PlannedRun
@@ -54,7 +54,7 @@ class Search:
         return self.planned.name
 
 
-def plan_boundary(config: BoundaryConfig) -> list[Search]:
+def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
     """Plan every route with every preset, repeated; a first seed of each comes before any second one.
 
     Raises `UserError` for what `plan_run` refuses, for what has no straight road or no virtual time, for a video delay
@@ -79,7 +79,7 @@ def plan_boundary(config: BoundaryConfig) -> list[Search]:
             "repetition": repetition,
         }
         planned = plan_run(parse_config(RunConfig, asked, "the boundary"), name=f"{route} {preset} {repetition:02d}")
-        searches.append(Search(planned, config.longest_delay_ms, config.grid_ms, config.within_ms))
+        searches.append(BoundarySearch(planned, config.longest_delay_ms, config.grid_ms, config.within_ms))
     return searches
 
 
@@ -90,27 +90,27 @@ def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
     return config.model_copy(update={"network": config.network.model_copy(update={"video": video})})
 
 
-def began(drive: WatchedDrive) -> bool:
+def began(drive: MonitoredRun) -> bool:
     """Whether the vehicle was armed: with pictures that are too old it is not, and nobody drives anywhere."""
     return len(drive.time_s) > 0
 
 
-def departed(drive: WatchedDrive) -> bool:
+def departed(drive: MonitoredRun) -> bool:
     """Whether the car left its lane: at least one event `lane_invasion`."""
     return drive.lane_invasions > 0
 
 
-def not_completed(drive: WatchedDrive) -> bool:
+def not_completed(drive: MonitoredRun) -> bool:
     """Whether the drive ended in any other way than at the route's end."""
     return drive.ending != "completed"
 
 
-def search(asked: Search) -> dict[str, Any]:
+def search(asked: BoundarySearch) -> dict[str, Any]:
     """Find the boundaries of one seed, and give its entry of `boundary.json`."""
     config, identity = asked.planned.config, asked.planned.identity
 
     @functools.cache
-    def drive(delay_ms: float) -> WatchedDrive:
+    def drive(delay_ms: float) -> MonitoredRun:
         return watch_drive(plan_run(with_video_delay(config, delay_ms), name=asked.name))
 
     added_ms: list[float] = []
@@ -174,14 +174,14 @@ def theoretical_ms(config: RunConfig) -> float | None:
 
 
 def search_all(
-    searches: Sequence[Search], *, jobs: int | None, tell: Tell
+    searches: Sequence[BoundarySearch], *, jobs: int | None, tell: Tell
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
     """Search them all, `jobs` at a time (None: one a core).
 
     Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
     Ctrl-C, which lets the searches under way end, and takes what they found.
     """
-    work, done = _Work(tell), True
+    work, done = _SearchProgress(tell), True
     try:
         _search_in_processes(work, searches, jobs or os.cpu_count() or 1)
     except KeyboardInterrupt:
@@ -189,7 +189,7 @@ def search_all(
     return [work.found[each.name] for each in searches if each.name in work.found], work.failed, done
 
 
-class _Work:
+class _SearchProgress:
     """What has become of the searches so far."""
 
     def __init__(self, tell: Tell) -> None:
@@ -197,7 +197,7 @@ class _Work:
         self.failed: list[dict[str, Any]] = []
         self._tell = tell
 
-    def search(self, workers: Workers, todo: Sequence[Search]) -> list[Search]:
+    def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
         """Have searches done; give those that were not, because a worker's process died, in the order of `todo`."""
         futures = {workers.executor.submit(search, each): each for each in todo}
         broken: set[str] = set()
@@ -223,13 +223,13 @@ class _Work:
             raise
         return [each for each in todo if each.name in broken]
 
-    def fail(self, asked: Search, why: str) -> None:
+    def fail(self, asked: BoundarySearch, why: str) -> None:
         """Note that a search failed."""
         self.failed.append({"name": asked.name, "why": why})
         self._tell(f"{asked.name}: failed: {why}")
 
 
-def _search_in_processes(work: _Work, todo: Sequence[Search], jobs: int) -> None:
+def _search_in_processes(work: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
     """Search, also when a process dies, which takes the pool with it: what may have been begun is searched alone."""
     while todo:
         with processes(jobs) as workers:
@@ -247,7 +247,7 @@ def _sentence(run: Mapping[str, Any]) -> str:
 
 
 def boundary(
-    config: BoundaryConfig, searches: Sequence[Search], out: Path, *, jobs: int | None, tell: Tell
+    config: BoundaryConfig, searches: Sequence[BoundarySearch], out: Path, *, jobs: int | None, tell: Tell
 ) -> tuple[dict[str, Any], bool]:
     """Search, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also of what was found before Ctrl-C.
 

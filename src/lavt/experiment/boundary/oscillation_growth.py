@@ -11,7 +11,7 @@ import numpy as np
 from lavt.assembly.entropy import run_seed
 from lavt.config import RunConfig
 from lavt.domain import FloatArray
-from lavt.experiment.runs.monitored_run import WatchedDrive, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.vehicle.sim.simulator import start_of
 
@@ -39,7 +39,7 @@ def half_swings(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArr
     return time_s[largest], size_m[largest]
 
 
-def growth_per_s(drive: WatchedDrive) -> float:
+def growth_per_s(drive: MonitoredRun) -> float:
     """Give the rate in 1/s at which the swing grows, negative where it dies away: d/dt of the logarithm of its size.
 
     It is the slope of the straight line of least squares through the logarithms of the largest distances from the

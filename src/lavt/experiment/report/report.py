@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib as mpl
 
 from lavt.errors import WorkError
-from lavt.experiment.analysis.drive_data import Drive
+from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_section import boundary_parts
@@ -24,7 +24,7 @@ from lavt.experiment.report.run_sections import (
     trajectory_parts,
 )
 from lavt.experiment.report.sections import (
-    Report,
+    ReportContext,
     axis_parts,
     clock_parts,
     conditions_parts,
@@ -50,7 +50,7 @@ def write_report(
     run_dirs: Sequence[Path] | None = None,
     base: Mapping[str, Any] | None = None,
     speed: Mapping[str, Any] | None = None,
-    drives: Mapping[Path, Drive] | None = None,
+    drives: Mapping[Path, DriveData] | None = None,
     sweeps: Mapping[Path, str] | None = None,
     boundaries: Sequence[Mapping[str, Any]] = (),
     failed: Sequence[Mapping[str, str]] = (),
@@ -78,7 +78,7 @@ def write_report(
     write_json(summary_path, summary)
     report_dir = sweep_dir / "report"
     report_dir.mkdir(parents=True, exist_ok=True)
-    report = Report(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
+    report = ReportContext(summary, report_dir, condition_colours(str(run["condition"]) for run in summary["runs"]))
     sets = read_drives(drawn_runs(report, results), drives or {})
     with mpl.rc_context({"text.parse_math": False}):  # a name with a dollar is no formula
         sections = _sections(report, sets, boundaries)
@@ -87,7 +87,9 @@ def write_report(
     return index
 
 
-def _sections(report: Report, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]) -> list[html_page.Section]:
+def _sections(
+    report: ReportContext, sets: DriveSets, boundaries: Sequence[Mapping[str, Any]]
+) -> list[html_page.Section]:
     """Make the page's sections in their order."""
     return [
         ("Summary", head(report)),

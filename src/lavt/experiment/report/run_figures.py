@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lavt.domain import NS_PER_S, FloatArray, Picture
-from lavt.experiment.analysis.drive_data import Drive
+from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.report.figure_style import Colours, condition_handles, legend_below, new_figure, tidy
 
 DRAWN_EVERY_M = 0.5
@@ -35,7 +35,7 @@ def drawn_points(progress_m: FloatArray) -> list[int]:
     return sorted({0, *changed.tolist(), len(progress_m) - 1})
 
 
-def trajectories_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) -> Figure:
+def trajectories_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
     """Draw all drives of each route from above, one panel a route.
 
     The reference is thick and black, each drive a thin line in the colour of its condition, and a red cross is where
@@ -85,7 +85,7 @@ def _extent(points_m: FloatArray) -> tuple[float, float]:
     return float(width_m), float(height_m)
 
 
-def cross_track_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) -> Figure:
+def cross_track_figure(routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> Figure:
     """Draw how far each drive was from the lane's centre over the distance along its route, one panel a route."""
     columns = min(2, len(routes))
     rows = -(-len(routes) // columns)
@@ -112,13 +112,13 @@ def cross_track_figure(routes: Mapping[str, Sequence[Drive]], colours: Colours) 
     return figure
 
 
-def _legend(figure: Figure, routes: Mapping[str, Sequence[Drive]], colours: Colours) -> None:
+def _legend(figure: Figure, routes: Mapping[str, Sequence[DriveData]], colours: Colours) -> None:
     names = sorted({drive.condition for drives in routes.values() for drive in drives})
     reference = Line2D([], [], color="black", linewidth=3.5, label="lane centre")
     legend_below(figure, [*condition_handles(names, colours), reference, Line2D([], [], label="ended early", **CROSS)])
 
 
-def time_figure(drives: Sequence[Drive], colours: Colours) -> Figure:
+def time_figure(drives: Sequence[DriveData], colours: Colours) -> Figure:
     """Steering and cross-track error over time, one row a drive."""
     figure = new_figure(1.35 * len(drives) + 0.6)
     rows = figure.subplots(len(drives), 2, sharex=True, sharey="col", squeeze=False)

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lavt.domain import Picture
-from lavt.experiment.analysis.drive_data import Drive, capture_to_stamp_ms, one_of_each_condition, read_drive
+from lavt.experiment.analysis.drive_data import DriveData, capture_to_stamp_ms, one_of_each_condition, read_drive
 from lavt.experiment.report import html_page
 from lavt.experiment.report.files import save_figure, save_table
 from lavt.experiment.report.groups import differing, is_of, title_of
 from lavt.experiment.report.run_figures import cross_track_figure, frames_figure, time_figure, trajectories_figure
-from lavt.experiment.report.sections import Parts, Report
+from lavt.experiment.report.sections import Parts, ReportContext
 from lavt.experiment.report.table_format import html_of
 from lavt.experiment.report.tables import machine_table
 from lavt.experiment.statistics.conditions import road_of, stem_of
@@ -26,13 +26,13 @@ PANELS = 3
 """Routes in one figure of trajectories: the paper's three key parts, and its three whole routes."""
 
 
-DriveSets = Mapping[tuple[str, str], Sequence[Drive]]
+DriveSets = Mapping[tuple[str, str], Sequence[DriveData]]
 """Drives by kind of time and title of their group: what may be drawn into one figure."""
 
 Runs = Sequence[tuple[Path, Mapping[str, object]]]
 
 
-def drawn_runs(report: Report, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
+def drawn_runs(report: ReportContext, runs: Runs) -> dict[tuple[str, str], list[tuple[Path, Mapping[str, object]]]]:
     """Choose the runs whose drives are drawn, by kind of time and title of their group.
 
     `runs` has directories, and entries of the summary's `runs`.
@@ -49,8 +49,8 @@ def drawn_runs(report: Report, runs: Runs) -> dict[tuple[str, str], list[tuple[P
 
 
 def read_drives(
-    sets: Mapping[tuple[str, str], Runs], known: Mapping[Path, Drive]
-) -> dict[tuple[str, str], list[Drive]]:
+    sets: Mapping[tuple[str, str], Runs], known: Mapping[Path, DriveData]
+) -> dict[tuple[str, str], list[DriveData]]:
     """Read the drives that are not `known` yet."""
     return {
         key: [known.get(directory) or read_drive(directory, run) for directory, run in members]
@@ -58,11 +58,11 @@ def read_drives(
     }
 
 
-def trajectory_parts(report: Report, sets: DriveSets) -> Parts:
+def trajectory_parts(report: ReportContext, sets: DriveSets) -> Parts:
     """Draw all drives: key parts of routes in one figure, whole routes in another, and their error over the way."""
     parts = []
     for (kind, title), drives in sets.items():
-        routes: dict[str, list[Drive]] = {}
+        routes: dict[str, list[DriveData]] = {}
         for drive in sorted(drives, key=lambda drive: str(drive.result["route"])):
             if len(drive.truth):
                 routes.setdefault(str(drive.result["route"]), []).append(drive)
@@ -93,7 +93,7 @@ def _figures_of(routes: Sequence[str]) -> list[tuple[str, Sequence[str]]]:
     ]
 
 
-def single_run_parts(report: Report, sets: DriveSets) -> Parts:
+def single_run_parts(report: ReportContext, sets: DriveSets) -> Parts:
     """Show one run of each condition over time, and the pictures that the client received; a kind of time each."""
     parts = []
     for kind, drives in _first_sets(sets).items():
@@ -117,9 +117,9 @@ def single_run_parts(report: Report, sets: DriveSets) -> Parts:
     return parts
 
 
-def _first_sets(sets: DriveSets) -> dict[str, Sequence[Drive]]:
+def _first_sets(sets: DriveSets) -> dict[str, Sequence[DriveData]]:
     """Give the first set of either kind of time."""
-    first: dict[str, Sequence[Drive]] = {}
+    first: dict[str, Sequence[DriveData]] = {}
     for (kind, _), drives in sets.items():
         first.setdefault(kind, drives)
     return first
@@ -153,10 +153,10 @@ def received_pictures(client_record: Path) -> list[tuple[str, Picture]]:
     return pictures
 
 
-def machine_parts(report: Report, sets: DriveSets) -> Parts:
+def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
     """Show versions and machine as the drawn runs recorded them; runs that agree share a table."""
     drives = [drive for members in sets.values() for drive in members]
-    by_text: dict[str, tuple[Drive, int]] = {}
+    by_text: dict[str, tuple[DriveData, int]] = {}
     for drive in drives:
         html = html_of(machine_table(drive.annotations))
         first, many = by_text.get(html, (drive, 0))

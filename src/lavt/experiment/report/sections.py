@@ -70,7 +70,7 @@ COMPARED_GROUPS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class ReportContext:
     """What all sections are made of: a summary, where files go, and what is the same in all of them."""
 
     summary: Mapping[str, Any]
@@ -108,7 +108,7 @@ class Report:
         return f" ({title_of(self.base[0], names)})" if kind == "virtual" and self.base else ""
 
 
-def head(report: Report) -> Parts:
+def head(report: ReportContext) -> Parts:
     """Say in plain words what was driven and what came out."""
     runs, speed, failed = report.summary["runs"], report.summary["speed"], report.summary.get("failed")
     parts = [html_page.paragraph(what_was_driven(runs))]
@@ -133,7 +133,7 @@ def head(report: Report) -> Parts:
     return parts
 
 
-def conditions_parts(report: Report) -> Parts:
+def conditions_parts(report: ReportContext) -> Parts:
     """Show the paper's table, with the paper's own figures where the conditions are the same; a kind of time each."""
     if not report.kinds:
         return [html_page.paragraph("No run has the values of the sweep's own config: see the groups.", note=True)]
@@ -153,7 +153,7 @@ def conditions_parts(report: Report) -> Parts:
     ]
 
 
-def contrast_parts(report: Report) -> Parts:
+def contrast_parts(report: ReportContext) -> Parts:
     """Show the planned contrasts, and why conditions of equal total delay are not told apart."""
     summary, paper = report.summary, (report.summary.get("paper") or {}).get("contrasts") or []
     contrasts = summary.get("contrasts") or []
@@ -183,7 +183,7 @@ def contrast_parts(report: Report) -> Parts:
     return [*parts, *(html_page.paragraph(f"{base}: {each}" if base else each) for each in said)]
 
 
-def difference_parts(report: Report) -> Parts:
+def difference_parts(report: ReportContext) -> Parts:
     """Say where the results differ from the paper's, where all its conditions were driven."""
     conditions = report.summary["conditions"]
     paper = (report.summary.get("paper") or {}).get("conditions") or {}
@@ -191,12 +191,12 @@ def difference_parts(report: Report) -> Parts:
     return [html_page.bullets(said)] if said else []
 
 
-def of_base(report: Report) -> str:
+def of_base(report: ReportContext) -> str:
     """Say below a figure of both kinds of time which group the virtual runs in it are of, where there are several."""
     return f" Virtual runs are of one group{report.which()}." if len(report.groups) > 1 and report.base else ""
 
 
-def injected_parts(report: Report) -> Parts:
+def injected_parts(report: ReportContext) -> Parts:
     """Show injected against measured latency."""
     if not report.kinds:
         return []
@@ -209,7 +209,7 @@ def injected_parts(report: Report) -> Parts:
     return [save_figure(report.directory, "injected", figure, "injected against measured latency", caption)]
 
 
-def degradation_parts(report: Report) -> Parts:
+def degradation_parts(report: ReportContext) -> Parts:
     """Show what latency does to driving."""
     if not any(entry["loop_ms"]["p50"] is not None for of in report.kinds.values() for entry in of.values()):
         return []
@@ -223,7 +223,7 @@ def degradation_parts(report: Report) -> Parts:
     return [save_figure(report.directory, "degradation", figure, "completion and error over latency", caption)]
 
 
-def survival_parts(report: Report) -> Parts:
+def survival_parts(report: ReportContext) -> Parts:
     """Show how far the runs came and how they ended, a kind of time each."""
     parts = []
     for kind, conditions in report.kinds.items():
@@ -253,7 +253,7 @@ def survival_parts(report: Report) -> Parts:
     return parts
 
 
-def hop_parts(report: Report, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
+def hop_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
     """Show where the loop's time goes; `captured_ms` is by kind of time and condition."""
     parts = []
     for kind, conditions in report.kinds.items():
@@ -285,7 +285,7 @@ def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [*hops, rest] if rest_ms > LEAST_REST_MS else hops
 
 
-def group_parts(report: Report) -> Parts:
+def group_parts(report: ReportContext) -> Parts:
     """Compare the groups: presets, sweeps, fidelities, further axes."""
     groups, names = report.groups, differing(report.groups)
     if len(groups) < 2:
@@ -301,7 +301,7 @@ def group_parts(report: Report) -> Parts:
     return [*parts, save_table(report.directory, "groups", group_table(groups, names))]
 
 
-def axis_parts(report: Report) -> Parts:
+def axis_parts(report: ReportContext) -> Parts:
     """Show what the further axes of a sweep do, one figure for each set of runs that else are alike."""
     axes = axes_of(report.groups)
     if not axes:
@@ -328,7 +328,7 @@ def _numeric_values(groups: Sequence[Group], axis: str) -> int:
     return len(values)
 
 
-def route_parts(report: Report) -> Parts:
+def route_parts(report: ReportContext) -> Parts:
     """Show the headline route by route."""
     parts = []
     for kind, conditions in report.kinds.items():
@@ -339,12 +339,12 @@ def route_parts(report: Report) -> Parts:
     return parts
 
 
-def run_parts(report: Report) -> Parts:
+def run_parts(report: ReportContext) -> Parts:
     """Show every run with its validity."""
     return [save_table(report.directory, "runs", run_table(report.summary["runs"]))]
 
 
-def clock_parts(report: Report) -> Parts:
+def clock_parts(report: ReportContext) -> Parts:
     """Say how far the clocks of two machines were apart; in virtual time they are modelled."""
     runs = report.summary["runs"]
     apart = [run for run in runs if run["time"] == "real" and (run.get("delta") or {}).get("source") not in ONE_CLOCK]

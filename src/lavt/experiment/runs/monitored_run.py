@@ -23,7 +23,7 @@ NEVER_NS = 2**62
 """When a drive began that did not."""
 
 
-class Keeper:
+class InMemoryRecorder:
     """A recorder that keeps the payloads of a few channels in memory."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Keeper:
 
 
 @dataclass(frozen=True, slots=True)
-class WatchedDrive:
+class MonitoredRun:
     """What was seen of one drive, from its beginning to its ending; no rows where the vehicle was never armed."""
 
     ending: str | None
@@ -51,23 +51,23 @@ class WatchedDrive:
     """When commands were changed by a limit of the vehicle's safety."""
 
 
-def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> WatchedDrive:
+def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
     """Drive, keeping in memory what is watched.
 
     It is the drive that `run_once` makes, but for its records: they are begun in a temporary directory that is removed.
     """
     cv2.setNumThreads(1)
-    keeper = Keeper()
+    keeper = InMemoryRecorder()
     with TemporaryDirectory() as directory:
         loop = build_loop(planned, Path(directory) / "run")
         tap = EndingTap(keeper)
         loop.runtime.hosts["server"].recorder = tap
-        loop.runtime.hosts["client"].recorder = Keeper()
+        loop.runtime.hosts["client"].recorder = InMemoryRecorder()
         drive(replace(loop, tap=tap), limit_ns=round(limit_s * NS_PER_S))
     return watched(keeper.payloads)
 
 
-def watched(payloads: dict[str, list[Any]]) -> WatchedDrive:
+def watched(payloads: dict[str, list[Any]]) -> MonitoredRun:
     """Make of the payloads of each channel of the server what is known of the drive."""
     began_ns = next((event.mono_ns for event in payloads["event"] if event.kind == "drive_began"), NEVER_NS)
     ended = next(((each.mono_ns, each.detail) for each in payloads["event"] if each.kind == "ending"), None)
@@ -80,7 +80,7 @@ def watched(payloads: dict[str, list[Any]]) -> WatchedDrive:
         return np.asarray((np.array(times_ns, np.int64) - began_ns) / NS_PER_S, np.float64)
 
     events = [event for event in payloads["event"] if began_ns <= event.mono_ns <= ended_ns]
-    return WatchedDrive(
+    return MonitoredRun(
         ending=ending,
         lane_invasions=sum(event.kind == "lane_invasion" for event in events),
         total_delay_ms=_total_delay_ms(payloads["frame"], obeyed),

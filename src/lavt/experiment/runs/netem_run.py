@@ -10,9 +10,9 @@ from typing import Any
 from lavt.assembly.injection import netem_flows
 from lavt.experiment.analysis.validity import injection_reasons
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.transport.emulation.impairment import Flow, Law
-from lavt.transport.netem.netem import Netem
-from lavt.transport.netem.probe import Measured, judge
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
+from lavt.transport.netem.netem import NetemInterface
+from lavt.transport.netem.probe import ProbeResult, judge
 from lavt.transport.netem.state import flows_from
 
 NETEM = "netem.json"
@@ -29,9 +29,9 @@ def check_netem(planned: PlannedRun) -> list[str]:
     """
     if not by_netem(planned):
         return []
-    with Netem(LOOPBACK) as netem:
+    with NetemInterface(LOOPBACK) as netem:
         restored = netem.check()
-        netem.apply([Flow("video", "udp", DISCARD, "source", Law())])
+        netem.apply([ImpairedFlow("video", "udp", DISCARD, "source", Impairment())])
         return restored
 
 
@@ -46,11 +46,11 @@ class NetemRun:
     Raises `UserError` before anything is changed where netem cannot be had.
     """
 
-    def __init__(self, planned: PlannedRun, netem: Netem | None = None) -> None:
+    def __init__(self, planned: PlannedRun, netem: NetemInterface | None = None) -> None:
         self._network = planned.config.network
         self._asked = planned.asked
-        self._netem = netem or Netem(LOOPBACK, seed=planned.seed)
-        self._flows: list[Flow] = []
+        self._netem = netem or NetemInterface(LOOPBACK, seed=planned.seed)
+        self._flows: list[ImpairedFlow] = []
         self._restored: list[str] = []
         self._report: dict[str, Any] = {}
 
@@ -93,7 +93,7 @@ def netem_reasons(report: Mapping[str, Any]) -> list[str]:
         flows = flows_from(report["flows"])
         reasons = [str(each) for each in report["read_back"]]
         for when in ("before", "after"):
-            measured = {name: Measured(**each) for name, each in report[when].items()}
+            measured = {name: ProbeResult(**each) for name, each in report[when].items()}
             reasons += [f"{when} the drive: {reason}" for reason in judge(flows, (), measured)]
     except (KeyError, TypeError, AttributeError):
         return injection_reasons({"video": 0.0, "control": 0.0}, {})

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from lavt.assembly.links import injected
 from lavt.config import Condition, Costs
 from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
-from lavt.transport.emulation.link import Injected
+from lavt.transport.emulation.link import LinkInjection
 
 US_PER_MS = 1000.0
 
@@ -25,7 +25,7 @@ SENT_TO_RECEIVED = (("driver", "command"),)
 
 
 @dataclass(frozen=True, slots=True)
-class Inherent:
+class BaselineLatency:
     """A named profile of the latency that is there without injection: the whole of tau_v and tau_c."""
 
     video_ms: float
@@ -35,12 +35,12 @@ class Inherent:
 
 INHERENT = {
     # The paper's WiFi 5: tau_v with median 62 and 95th percentile 86 ms, tau_c of 8 to 10 ms.
-    "paper_wifi5": Inherent(50.0, Lognormal(12.0, 0.668), 9.0),
+    "paper_wifi5": BaselineLatency(50.0, Lognormal(12.0, 0.668), 9.0),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Network:
+class NetworkDelays:
     """How long things take: video, state (server to client), control (client to server), and what is never held.
 
     A constant delay that is injected is part of these. Where more is, all that is injected is beside them.
@@ -50,11 +50,11 @@ class Network:
     control: DelayLaw
     state: DelayLaw
     unheld: DelayLaw
-    video_injected: Injected | None = None
-    control_injected: Injected | None = None
+    video_injected: LinkInjection | None = None
+    control_injected: LinkInjection | None = None
 
 
-def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> Network:
+def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> NetworkDelays:
     """Give what must be injected on a loopback to have `condition` on top of the inherent `profile`.
 
     `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition
@@ -69,7 +69,7 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
     video = injected("video", condition.video_ms, condition.video, seed)
     control = injected("control", condition.control_ms, condition.control, seed)
-    return Network(
+    return NetworkDelays(
         DelayLaw(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
         DelayLaw(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
         DelayLaw(max(0.0, control_ms) + state_ms),
@@ -79,7 +79,7 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     )
 
 
-def virtual_network(asked: Network, costs: Costs) -> Network:
+def virtual_network(asked: NetworkDelays, costs: Costs) -> NetworkDelays:
     """Add what a real loopback has by itself, as measured."""
     return replace(
         asked,

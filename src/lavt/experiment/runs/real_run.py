@@ -19,13 +19,13 @@ from pydantic import BaseModel
 
 from lavt.assembly.links import trace_digests, trace_path
 from lavt.clock import Clock, MachineClock, pause
-from lavt.config import DelayConfig, Impairment, LinkConfig, RelayConfig
+from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.analysis.validity import injection_reasons, lateness_reasons
 from lavt.experiment.runs.netem_run import NETEM, NetemRun, by_netem
-from lavt.experiment.runs.network import Network, injected_network
+from lavt.experiment.runs.network import NetworkDelays, injected_network
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import LAVT, Process, Processes
 from lavt.experiment.runs.side_configs import client_config, server_config
@@ -41,7 +41,7 @@ SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
 BEGIN_S = 40
 """The drive has begun by then, or the run has failed."""
 LONGEST_S = 900
-NOTHING = Impairment()
+NOTHING = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
@@ -49,7 +49,7 @@ Progress = Callable[[dict[str, Any], dict[str, Any]], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
+class LoopProcesses:
     """The processes of a run. With the relay, the client's side knows nothing of the server's ports but through it."""
 
     server_router: Process
@@ -75,7 +75,7 @@ def start_loop(
     once: bool = True,
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
-) -> Loop:
+) -> LoopProcesses:
     """Start everything in order, each part told the ports of those before; records go into `out`.
 
     Without `once` the server stays after the first drive's end. `netem` holds the flows from before the client starts.
@@ -104,7 +104,7 @@ def start_loop(
     config = config.model_copy(update={"controller": config.controller.model_copy(update={"rearm": rearm})})
     client = processes.start("client", "client", _write(work, "client", config), "--out", str(out / "client"))
     client.ready()
-    return Loop(server_router, server, relay, client_router, client, local, dialled, ready)
+    return LoopProcesses(server_router, server, relay, client_router, client, local, dialled, ready)
 
 
 def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
@@ -139,7 +139,7 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_the_end(processes: Processes, loop: Loop, clock: Clock, progress: Progress | None) -> None:
+def _wait_for_the_end(processes: Processes, loop: LoopProcesses, clock: Clock, progress: Progress | None) -> None:
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
         gone_s = (clock.now().mono_ns - start_ns) / NS_PER_S
@@ -183,7 +183,7 @@ def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _injected(planned: PlannedRun) -> Network:
+def _injected(planned: PlannedRun) -> NetworkDelays:
     network = planned.config.network
     return injected_network(
         network.inherent, planned.asked, read_costs(), planned.seed, state_delay=network.state_delay
@@ -214,7 +214,7 @@ def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> Re
     )
 
 
-def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: Impairment = NOTHING) -> DelayConfig:
+def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: ImpairmentConfig = NOTHING) -> DelayConfig:
     link = LinkConfig()
     if impairment != NOTHING:
         asked = impairment.model_dump()

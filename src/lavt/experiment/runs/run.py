@@ -10,7 +10,7 @@ import cv2
 import yaml
 
 from lavt.errors import WorkError
-from lavt.experiment.analysis.drive_data import Drive, drive_of
+from lavt.experiment.analysis.drive_data import DriveData, drive_of
 from lavt.experiment.analysis.injection_validity import recorded_reasons
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_reasons
@@ -31,7 +31,7 @@ def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None
     return dict(drive_once(planned, out, progress=progress).result)
 
 
-def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> Drive:
+def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> DriveData:
     """Do what `run_once` does, and give with the result what a report's figures need: the records were read anyway."""
     cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
     check_directory(out)
@@ -64,7 +64,7 @@ def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -
     return dict(_compute(out, identity, digest).result)
 
 
-def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Drive:
+def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> DriveData:
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
     reasons = []
     if identity["injection"] == "relay":

@@ -18,7 +18,7 @@ from lavt.assembly.nodes import ClientNodes, ServerNodes, build_client, build_se
 from lavt.config import Costs, RunConfig
 from lavt.config_file import load_config, shipped
 from lavt.domain import NS_PER_S, NS_PER_US, GroundTruth, Now
-from lavt.experiment.runs.network import Network, injected_network, virtual_network
+from lavt.experiment.runs.network import NetworkDelays, injected_network, virtual_network
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.recording.output_directory import make_directory
@@ -27,7 +27,7 @@ from lavt.recording.record import RecordWriter
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
-from lavt.transport.emulation.link import Injected, Link
+from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.emulation.relay import video_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
@@ -156,7 +156,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     return VirtualLoop(runtime, server, client, tap, writers, digest)
 
 
-def virtual_links(network: Network) -> dict[str, VirtualLink]:
+def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
     """Make the links of all channels that cross the network.
 
     Commands and requests for the session share a path in reality; here each has a line and streams of its own, so that
@@ -167,9 +167,9 @@ def virtual_links(network: Network) -> dict[str, VirtualLink]:
         return count
 
     def link(
-        law: DelayLaw, injected: Injected | None = None, index: Callable[[bytes, int], int] = counted
+        law: DelayLaw, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = counted
     ) -> VirtualLink:
-        return VirtualLink(DelayLine(law, None if injected is None else Link(injected)), index)
+        return VirtualLink(DelayLine(law, None if injected is None else EmulatedLink(injected)), index)
 
     session = None if network.control_injected is None else replace(network.control_injected, name="session")
     return {

@@ -21,7 +21,7 @@ from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError, WorkError, in_words
-from lavt.experiment.analysis.drive_data import Drive, read_drive
+from lavt.experiment.analysis.drive_data import DriveData, read_drive
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.runs.run import CONFIG, RESULT, config_text
@@ -36,17 +36,17 @@ Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Driven:
+class SweepResult:
     """Results of a sweep's runs, the drives that were driven now, and which failed, with the reason."""
 
     results: Sequence[Mapping[str, Any]]
-    drives: Sequence[Drive]
+    drives: Sequence[DriveData]
     failed: Sequence[tuple[str, str]]
 
 
 def run_all(
     planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell, cluster_at: str | None = None
-) -> tuple[Driven, dict[str, Any] | None]:
+) -> tuple[SweepResult, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one a core), those in real time one by one.
 
     With `cluster_at` they are driven by Dask's workers there. Returns the results, those of runs that were driven
@@ -57,7 +57,7 @@ def run_all(
     start_ns = clock.now().mono_ns
     before = [read_json(runs_dir / each.name / RESULT) for each in planned if is_finished(runs_dir / each.name)]
     todo = [each for each in planned if not is_finished(runs_dir / each.name)]
-    work = _Work(runs_dir, tell)
+    work = _SweepProgress(runs_dir, tell)
     if cluster_at is None:
         jobs = 1 if any(each.config.time == "real" for each in todo) else jobs or os.cpu_count() or 1
         _drive_in_processes(work, todo, jobs)
@@ -67,7 +67,7 @@ def run_all(
             work.drive(workers, todo)
     results = [drive.result for drive in work.drives]
     simulated = [result for result in results if result["time"] == "virtual"]
-    driven = Driven([*before, *results], work.drives, work.failed)
+    driven = SweepResult([*before, *results], work.drives, work.failed)
     if not simulated:
         return driven, None
     speed = {
@@ -83,11 +83,11 @@ def is_finished(directory: Path) -> bool:
     return (directory / RESULT).is_file()
 
 
-class _Work:
+class _SweepProgress:
     """What has become of the runs so far."""
 
     def __init__(self, runs_dir: Path, tell: Tell) -> None:
-        self.drives: list[Drive] = []
+        self.drives: list[DriveData] = []
         self.failed: list[tuple[str, str]] = []
         self.runs_dir = runs_dir
         self._tell = tell
@@ -116,7 +116,7 @@ class _Work:
             raise
         return broken
 
-    def take(self, planned: PlannedRun, drive: Drive) -> None:
+    def take(self, planned: PlannedRun, drive: DriveData) -> None:
         """Note a drive."""
         self.drives.append(drive)
         self._tell(f"{planned.name}: {drive.result['ending']}")
@@ -127,7 +127,7 @@ class _Work:
         self._tell(f"{planned.name} failed: {why}")
 
 
-def _drive_in_processes(work: _Work, todo: Sequence[PlannedRun], jobs: int) -> None:
+def _drive_in_processes(work: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
     """Drive, also when a process dies, which takes the pool with it: what it was at is driven again, alone."""
     while todo:
         with processes(jobs) as workers:
@@ -165,7 +165,7 @@ def sweep(
     jobs: int | None,
     tell: Tell,
     cluster_at: str | None = None,
-) -> tuple[Path, Driven]:
+) -> tuple[Path, SweepResult]:
     """Drive what is missing of a sweep into `out`, and write its config, summary and report.
 
     `planned` are the runs of `config`; `cluster_at` is that of `run_all`. Returns the report's page, and what was
@@ -184,7 +184,7 @@ def sweep(
     write_json(out / FAILED, failed)
     if not driven.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
-    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: see `_Work.drive`)
+    from lavt.experiment.report.report import write_report  # noqa: PLC0415 (slow: see `_SweepProgress.drive`)
 
     drives = {drive.directory: drive for drive in driven.drives}
     return write_report(out, speed=speed, base=base_of(config, planned), drives=drives, failed=failed), driven

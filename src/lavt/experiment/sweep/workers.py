@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lavt.experiment.analysis.drive_data import Drive
+from lavt.experiment.analysis.drive_data import DriveData
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT, drive_once
 from lavt.recording.output_directory import prepare_directory
@@ -41,9 +41,9 @@ class Workers:
             return self.executor.submit(run_elsewhere, planned)
         return self.executor.submit(drive_once, planned, directory)
 
-    def collect(self, done: Any, directory: Path) -> Drive:
+    def collect(self, done: Any, directory: Path) -> DriveData:
         """Give a run whose files are then in `directory`."""
-        drive: Drive = done
+        drive: DriveData = done
         if self.far:
             drive, files = done
             put_files(files, directory)
@@ -100,7 +100,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def run_elsewhere(planned: PlannedRun) -> tuple[Drive, dict[str, bytes]]:
+def run_elsewhere(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
     """Drive a run into a directory that is gone afterwards; give what came of it, and its files by name."""
     with TemporaryDirectory(prefix="lavt-") as scratch:
         directory = Path(scratch) / "run"

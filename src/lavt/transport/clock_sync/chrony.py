@@ -12,7 +12,7 @@ from typing import Final
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync.clock_report import ClockReport, ask, host_addresses, plain_address, unknown_clock
-from lavt.transport.clock_sync.persistent_process import Ended, Interpreter, Run
+from lavt.transport.clock_sync.persistent_process import Completed, PersistentProcess, Run
 
 SOURCE = "chrony"
 REPORTS = ("tracking", "ntpdata")
@@ -28,7 +28,7 @@ NOT_RUNNING = "chrony is not running"
 NOT_SYNCHRONISED = "chrony is not synchronised"
 
 
-class Chronyc(Interpreter):
+class Chronyc(PersistentProcess):
     """chrony's own client, obeying one command a line."""
 
     program = ("chronyc", "-n", "-c")
@@ -40,10 +40,10 @@ class Chronyc(Interpreter):
         """Write each word as a command of its own, and behind them one that chronyc does not know."""
         return "".join(f"{each}\n" for each in (*command, self.NO_COMMAND))
 
-    def ended(self, answer: bytes) -> Ended | None:
+    def ended(self, answer: bytes) -> Completed | None:
         """Read what it said until then."""
         said = answer.decode(errors="replace")
-        return Ended(0, said.removesuffix(self.END)) if said.endswith(self.END) else None
+        return Completed(0, said.removesuffix(self.END)) if said.endswith(self.END) else None
 
 
 def read_chrony(clock: Clock, run: Run) -> ClockReport | None:

@@ -24,18 +24,18 @@ NOT_FOUND: Final = 127
 """Exit code where there is no such program (POSIX, shell command language, 2.8.2)."""
 
 
-class Ended(NamedTuple):
+class Completed(NamedTuple):
     """A program's exit code and standard output."""
 
     code: int
     output: str
 
 
-Run = Callable[[Sequence[str], float], Ended | None]
+Run = Callable[[Sequence[str], float], Completed | None]
 """Runs a program for so many seconds at most; None where it has not ended by then."""
 
 
-class Interpreter(ABC):
+class PersistentProcess(ABC):
     """A program that stays and obeys one command after the other, started with the first one; to be closed."""
 
     program: tuple[str, ...]
@@ -51,16 +51,16 @@ class Interpreter(ABC):
         """Write a command as the program reads it, with one behind it that marks where its answer ends."""
 
     @abstractmethod
-    def ended(self, answer: bytes) -> Ended | None:
+    def ended(self, answer: bytes) -> Completed | None:
         """Read an answer; None as long as its end has not come."""
 
-    def run(self, command: Sequence[str], timeout_s: float) -> Ended | None:
+    def run(self, command: Sequence[str], timeout_s: float) -> Completed | None:
         """Run a command to its end; None where that takes too long, or where the program has died."""
         with self._one_at_a_time:
             try:
                 return self._ask(self.lines(command), timeout_s)
             except FileNotFoundError:
-                return Ended(NOT_FOUND, "")
+                return Completed(NOT_FOUND, "")
             except OSError:  # it was killed: the next question starts another
                 self._end()
                 return None
@@ -70,7 +70,7 @@ class Interpreter(ABC):
         with self._one_at_a_time:
             self._end()
 
-    def _ask(self, lines: str, timeout_s: float) -> Ended | None:
+    def _ask(self, lines: str, timeout_s: float) -> Completed | None:
         if self._process is None:
             self._process = subprocess.Popen(  # noqa: S603 (the program is one of the two in the code)
                 self.program,
@@ -107,7 +107,7 @@ class Interpreter(ABC):
             self._process = None
 
 
-class Shell(Interpreter):
+class Shell(PersistentProcess):
     """A shell that starts one program after the other; what they say on standard error is not heard."""
 
     program = ("/bin/sh",)
@@ -120,7 +120,7 @@ class Shell(Interpreter):
         """Write a command line whose words mean only themselves."""
         return f"{shlex.join(command)} 2>/dev/null </dev/null; printf '\\n{self.END} %s\\n' $?\n"
 
-    def ended(self, answer: bytes) -> Ended | None:
+    def ended(self, answer: bytes) -> Completed | None:
         """Read a program's output and its exit code."""
         said, end, code = answer.decode(errors="replace").rpartition(f"\n{self.END} ")
-        return Ended(int(code), said) if end and code.endswith("\n") else None
+        return Completed(int(code), said) if end and code.endswith("\n") else None

@@ -1,8 +1,8 @@
 """Delay as a law and as a queue; the relay and the virtual runtime use the same two.
 
 A law says how long the thing with a given index takes; its randomness is a named stream indexed by that number, so that
-runs with one seed stay paired whatever else is drawn. A line keeps order: nothing overtakes, unless a `Link` does more
-than delay.
+runs with one seed stay paired whatever else is drawn. A line keeps order: no packet overtakes another
+unless an `EmulatedLink` does more than delay.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from lavt.domain import NS_PER_MS
 from lavt.streams import IndexedStream
-from lavt.transport.emulation.link import Link
+from lavt.transport.emulation.link import EmulatedLink
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +56,9 @@ def _jitter(seed: int, name: str) -> IndexedStream:
 
 
 class DelayLine:
-    """A queue in which everything waits for its delay and nothing overtakes; with a `Link`, what that says happens."""
+    """A queue that delays each item and keeps order; an `EmulatedLink` may also drop, spread or reorder items."""
 
-    def __init__(self, law: DelayLaw, link: Link | None = None) -> None:
+    def __init__(self, law: DelayLaw, link: EmulatedLink | None = None) -> None:
         self.law = law
         self.link = link
         self._waiting: list[tuple[int, int, Any]] = []

@@ -18,7 +18,7 @@ DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto",
 
 
 @value
-class Law:
+class Impairment:
     """What happens to the packets of a flow; all zero is nothing."""
 
     delay_ms: float = 0.0
@@ -47,14 +47,14 @@ class Law:
 
 
 @value
-class Flow:
+class ImpairedFlow:
     """Packets of one protocol from (`source`) or to (`destination`) a port, as one machine sends them."""
 
     name: Literal["video", "control", "state"]
     protocol: Literal["udp", "tcp"]
     port: int
     end: Literal["source", "destination"]
-    law: Law
+    law: Impairment
 
     @property
     def words(self) -> str:
@@ -63,7 +63,7 @@ class Flow:
 
 
 @value
-class Port:
+class ExemptPort:
     """A port that must never be held, and whose it is."""
 
     protocol: Literal["udp", "tcp"]
@@ -71,11 +71,11 @@ class Port:
     whose: str
 
 
-NEVER: Final = (Port("udp", 123, "NTP"), Port("tcp", 22, "ssh"))
+NEVER: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
 """Never held on any machine; the clock probe's port is added by whoever knows it."""
 
 
-def check_sense(name: str, law: Law) -> None:
+def check_sense(name: str, law: Impairment) -> None:
     """Raise `UserError` for what contradicts itself, whoever is to do it."""
     numbers = [getattr(law, each.name) for each in fields(law) if each.name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
@@ -95,7 +95,7 @@ def check_sense(name: str, law: Law) -> None:
         raise UserError(f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {law.rate_bps}")
 
 
-def check_law(name: str, law: Law) -> None:
+def check_law(name: str, law: Impairment) -> None:
     """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
     check_sense(name, law)
     if law.jitter_ms > law.delay_ms:
@@ -109,11 +109,11 @@ def check_law(name: str, law: Law) -> None:
         raise UserError(f"{name}: correlated jitter needs jitter_ms: give it, or no correlation")
 
 
-def check_flows(flows: Sequence[Flow], never: Sequence[Port] = ()) -> None:
+def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> None:
     """Raise `UserError` for a law that netem cannot do, and for a flow that covers what must never be held."""
     if not flows:
         raise UserError("there is no flow to hold: name at least one")
-    taken: dict[tuple[str, int, str], Flow] = {}
+    taken: dict[tuple[str, int, str], ImpairedFlow] = {}
     for flow in flows:
         check_law(flow.name, flow.law)
         if not 1 <= flow.port <= 65_535:
@@ -131,12 +131,12 @@ def check_flows(flows: Sequence[Flow], never: Sequence[Port] = ()) -> None:
         raise UserError("two flows have one name: name each once")
 
 
-def bursts(law: Law) -> bool:
+def bursts(law: Impairment) -> bool:
     """Whether packets are lost in bursts."""
     return law.loss > 0 and law.loss_burst_packets > 1
 
 
-def gilbert(law: Law) -> tuple[float, float]:
+def gilbert(law: Impairment) -> tuple[float, float]:
     """Give the chances of a burst's begin and end at a packet that lead to a law's loss and mean burst."""
     ends = 1 / law.loss_burst_packets
     return law.loss * ends / (1 - law.loss), ends

@@ -14,8 +14,8 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import Law, bursts, check_sense, gilbert
-from lavt.transport.emulation.random_process import QUANTILES, Draws, Losses, Wander, quantiles
+from lavt.transport.emulation.impairment import Impairment, bursts, check_sense, gilbert
+from lavt.transport.emulation.random_process import QUANTILES, CorrelatedProcess, Draws, LossProcess, quantiles
 from lavt.transport.emulation.trace import OPPORTUNITY_BYTES, CapacityTrace, DelayTrace, Trace
 
 HEADER_BYTES: Final = 42
@@ -27,10 +27,10 @@ SLOT_NS: Final = 20 * NS_PER_MS
 
 
 @dataclass(frozen=True, slots=True)
-class Injected:
+class LinkInjection:
     """What is injected into one direction of a flow; `name` begins the names of its streams of `seed`."""
 
-    law: Law
+    law: Impairment
     seed: int
     name: str
     trace: Trace | None = None
@@ -38,7 +38,7 @@ class Injected:
     """So many wait for rate or capacity; what comes then is dropped."""
 
 
-def check_injected(injected: Injected) -> None:
+def check_injected(injected: LinkInjection) -> None:
     """Raise `UserError` for what contradicts itself. Jitter beyond the delay does not: no delay is below zero."""
     law, name = injected.law, injected.name
     check_sense(name, law)
@@ -48,20 +48,20 @@ def check_injected(injected: Injected) -> None:
         raise UserError(f"{name}: rate_bps and a trace of capacity both say how much passes: give one of the two")
 
 
-class Link:
+class EmulatedLink:
     """One direction of a link; times are those of whoever uses it, and a trace begins at `start_ns`.
 
     Public counters, in packets: `lost` by chance, `dropped` because the queue was full, `overtook` others.
     """
 
-    def __init__(self, injected: Injected, start_ns: int = 0) -> None:
+    def __init__(self, injected: LinkInjection, start_ns: int = 0) -> None:
         law, seed, name = injected.law, injected.seed, injected.name
         self.lost = self.dropped = self.overtook = self.packets = 0
         self._law, self._start_ns = law, start_ns
-        self._losses = Losses(seed, f"{name} loss", law.loss, gilbert(law) if bursts(law) else None)
+        self._losses = LossProcess(seed, f"{name} loss", law.loss, gilbert(law) if bursts(law) else None)
         self._early = Draws(seed, f"{name} reorder")
         self._jitter = Draws(seed, f"{name} jitter")
-        self._wander = Wander(seed, f"{name} wander", law.jitter_correlation)
+        self._wander = CorrelatedProcess(seed, f"{name} wander", law.jitter_correlation)
         self._deviations = quantiles(law.jitter_distribution)
         self._delays = injected.trace if isinstance(injected.trace, DelayTrace) else None
         capacity = injected.trace if isinstance(injected.trace, CapacityTrace) else None

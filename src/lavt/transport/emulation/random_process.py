@@ -79,7 +79,7 @@ def _normal() -> tuple[float, ...]:
     return tuple(standard.inv_cdf((part + 0.5) / QUANTILES) for part in range(QUANTILES))
 
 
-class Wander:
+class CorrelatedProcess:
     """A deviation that is correlated with itself one step before, by step: Gauss and Markov's process, first order."""
 
     def __init__(self, seed: int, name: str, correlation: float) -> None:
@@ -97,7 +97,7 @@ class Wander:
         return self._value
 
 
-class Losses:
+class LossProcess:
     """Which packets are lost, asked for in order: each by itself, or in bursts (Gilbert and Elliott's model)."""
 
     def __init__(self, seed: int, name: str, loss: float, bursts: tuple[float, float] | None) -> None:

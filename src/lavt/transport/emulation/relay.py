@@ -21,7 +21,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
-from lavt.transport.emulation.link import Injected, Link
+from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
 
 LONGEST_DATAGRAM = 65_535
@@ -54,7 +54,7 @@ def video_index(datagram: bytes) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Flow:
+class RelayedFlow:
     """One UDP flow through the relay: where clients reach it, where the server is, and what waits in each direction."""
 
     name: str
@@ -65,8 +65,8 @@ class Flow:
     held_downstream: Callable[[bytes], bool] = lambda _datagram: True
     index_downstream: Callable[[bytes], int] | None = None
     """From a datagram to the index of its delay; None: datagrams are counted."""
-    upstream_injected: Injected | None = None
-    downstream_injected: Injected | None = None
+    upstream_injected: LinkInjection | None = None
+    downstream_injected: LinkInjection | None = None
     """More than a delay; each client has a link of its own."""
 
 
@@ -99,7 +99,7 @@ class _Client:
 class Relay:
     """Carries flows, one upstream socket for each client, in one thread."""
 
-    def __init__(self, clock: Clock, flows: list[Flow]) -> None:
+    def __init__(self, clock: Clock, flows: list[RelayedFlow]) -> None:
         self._clock = clock
         self._selector = selectors.SelectSelector()  # epoll's timeouts are whole milliseconds, rounded up
         self._heap: list[tuple[int, int, _Way]] = []
@@ -219,7 +219,7 @@ class Relay:
 class _OpenFlow:
     """A flow at work: the socket that clients reach, and what is known of each of them."""
 
-    def __init__(self, relay: Relay, flow: Flow) -> None:
+    def __init__(self, relay: Relay, flow: RelayedFlow) -> None:
         self.flow = flow
         self._relay = relay
         self._clients: dict[Address, _Client] = {}
@@ -263,8 +263,8 @@ class _OpenFlow:
         self._relay.watch(towards_server, lambda: self._from_server(client))
         return client
 
-    def _line(self, law: DelayLaw, injected: Injected | None) -> DelayLine:
-        return DelayLine(law, None if injected is None else Link(injected, self._relay.start_ns))
+    def _line(self, law: DelayLaw, injected: LinkInjection | None) -> DelayLine:
+        return DelayLine(law, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
 
     def _from_server(self, client: _Client) -> None:
         for datagram, ancillary, address in _drain(client.upstream_socket):

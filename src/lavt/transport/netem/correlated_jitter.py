@@ -17,7 +17,7 @@ from typing import Final
 from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.streams import stream
-from lavt.transport.emulation.impairment import Flow, Law
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.transport.netem.tc import set_law
 
 STEP_NS: Final = 20 * NS_PER_MS
@@ -26,7 +26,7 @@ LATE_NS: Final = NS_PER_S
 END_S: Final = 5.0
 
 
-def wandering(law: Law, seed: int, name: str, index: int, before: tuple[int, float] | None) -> float:
+def wandering(law: Impairment, seed: int, name: str, index: int, before: tuple[int, float] | None) -> float:
     """Give a delay's deviation at step `index`, in standard deviations; `before` is an earlier (index, deviation)."""
     drawn = float(stream(seed, f"{name} wander", index).standard_normal())
     if before is None:
@@ -35,7 +35,7 @@ def wandering(law: Law, seed: int, name: str, index: int, before: tuple[int, flo
     return correlation * before[1] + float((1 - correlation**2) ** 0.5) * drawn
 
 
-class Wander:
+class CorrelatedJitter:
     """A thread that steps the delays of the flows whose jitter is correlated, from now until it is told to end.
 
     `environment` is that of tc.
@@ -44,7 +44,7 @@ class Wander:
     def __init__(
         self,
         interface: str,
-        flows: Sequence[Flow],
+        flows: Sequence[ImpairedFlow],
         environment: dict[str, str],
         *,
         seed: int,
@@ -97,7 +97,7 @@ class Wander:
             next_ns = begin_ns + (index + 1) * STEP_NS
             self._told.wait(max(0, next_ns - self._clock.now().mono_ns) / NS_PER_S)
 
-    def _say(self, flow: Flow, deviations: float) -> None:
+    def _say(self, flow: ImpairedFlow, deviations: float) -> None:
         delay_ms = max(0.0, flow.law.delay_ms + deviations * flow.law.jitter_ms)
         law = replace(flow.law, delay_ms=delay_ms, jitter_ms=0.0, jitter_correlation=0.0)
         words = set_law(self._interface, flow.name, law, verb="change")[1:]

@@ -12,9 +12,9 @@ from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import LavtError
 from lavt.node import Send
-from lavt.transport.emulation.impairment import Flow, Port
-from lavt.transport.netem.netem import Verified
-from lavt.transport.netem.probe import Measured, judge
+from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow
+from lavt.transport.netem.netem import Verification
+from lavt.transport.netem.probe import ProbeResult, judge
 from lavt.value import value
 
 Deliver = Callable[[str, Any, Now, Any], None]
@@ -27,16 +27,16 @@ log = logging.getLogger(__name__)
 
 
 @value
-class Inject:
+class InjectionOrder:
     """What shall be in force from now on; no flows: nothing."""
 
     number: int
     condition: str
-    flows: tuple[Flow, ...]
+    flows: tuple[ImpairedFlow, ...]
 
 
 @value
-class Injected:
+class InjectionResult:
     """What became of an order."""
 
     number: int
@@ -48,18 +48,20 @@ class Injected:
     """The median of each flow."""
 
 
-class Queues(Protocol):
+class NetemQueues(Protocol):
     """What can delay what this machine sends."""
 
-    def apply(self, flows: Sequence[Flow], *, never: Sequence[Port], condition: str) -> object:
+    def apply(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], condition: str) -> object:
         """Put flows in force, or change them; raises `LavtError`."""
         ...
 
-    def verify(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> Verified:
+    def verify(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int) -> Verification:
         """Read back what is in force, and measure what happens to packets of flows, and of what must not be held."""
         ...
 
-    def measure(self, flows: Sequence[Flow], *, never: Sequence[Port], count: int) -> dict[str, Measured]:
+    def measure(
+        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int
+    ) -> dict[str, ProbeResult]:
         """Measure the same, and read nothing back."""
         ...
 
@@ -78,14 +80,16 @@ class Injector:
     `never` are ports that no order may cover.
     """
 
-    def __init__(self, clock: Clock, deliver: Deliver, queues: Queues | None, never: Sequence[Port] = ()) -> None:
+    def __init__(
+        self, clock: Clock, deliver: Deliver, queues: NetemQueues | None, never: Sequence[ExemptPort] = ()
+    ) -> None:
         self._clock = clock
         self._deliver = deliver
         self._queues = queues
         self._never = tuple(never)
         self._applied = 0
         """Number of the order in force: one that comes again is only measured."""
-        self._orders: queue.Queue[Inject | None] = queue.Queue()
+        self._orders: queue.Queue[InjectionOrder | None] = queue.Queue()
         self._thread = threading.Thread(target=self._work, name="injector", daemon=True)
         self._thread.start()
 
@@ -110,34 +114,36 @@ class Injector:
                 done = self._do(order)
             except Exception as error:  # whatever it was, the next order, which may be to put all back, must be done
                 log.exception("netem failed")
-                done = Injected(order.number, f"{type(error).__name__}: {error}", "", ())
+                done = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
             self._deliver("injected", done, self._clock.now(), None)
 
-    def _newest(self) -> Inject | None:
+    def _newest(self) -> InjectionOrder | None:
         """Wait for an order; of several that wait only the last counts, and after None nothing does."""
         order = self._orders.get()
         while order is not None and not self._orders.empty():
             order = self._orders.get()
         return order
 
-    def _do(self, order: Inject) -> Injected:
+    def _do(self, order: InjectionOrder) -> InjectionResult:
         flows = order.flows
         if self._queues is None:
-            return Injected(order.number, "" if all(flow.law.is_nothing for flow in flows) else NO_INTERFACE, "", ())
+            return InjectionResult(
+                order.number, "" if all(flow.law.is_nothing for flow in flows) else NO_INTERFACE, "", ()
+            )
         try:
             if not flows:
                 self._queues.clear()
-                return Injected(order.number, "", "", ())
+                return InjectionResult(order.number, "", "", ())
             if order.number != self._applied:
                 self._queues.apply(flows, never=self._never, condition=order.condition)
                 found = self._queues.verify(flows, never=self._never, count=FRAMES)
                 if found.reasons:
-                    return Injected(order.number, "; ".join(found.reasons), "", ())
+                    return InjectionResult(order.number, "; ".join(found.reasons), "", ())
             else:  # while it is driven: without starting programs, which would hold it up
                 measured = self._queues.measure(flows, never=self._never, count=FRAMES)
-                found = Verified(self._queues.doubts() + judge(flows, self._never, measured), measured)
+                found = Verification(self._queues.doubts() + judge(flows, self._never, measured), measured)
             self._applied = order.number
         except LavtError as error:
-            return Injected(order.number, str(error), "", ())
+            return InjectionResult(order.number, str(error), "", ())
         measured_ms = tuple((flow.name, found.measured[flow.name].median_ms) for flow in flows)
-        return Injected(order.number, "", "; ".join(found.reasons), measured_ms)
+        return InjectionResult(order.number, "", "; ".join(found.reasons), measured_ms)

@@ -20,10 +20,10 @@ from typing import Any, Final
 from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import LavtError, UserError, WorkError
-from lavt.transport.emulation.impairment import Flow, Law, Port, check_flows
-from lavt.transport.netem.correlated_jitter import Wander
-from lavt.transport.netem.probe import Measured, judge, measure, probes
-from lavt.transport.netem.state import DIRECTORY, NOBODY, Applied, Owner, StateFiles, boot, namespace, this_process
+from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment, check_flows
+from lavt.transport.netem.correlated_jitter import CorrelatedJitter
+from lavt.transport.netem.probe import ProbeResult, judge, measure, probes
+from lavt.transport.netem.state import DIRECTORY, NOBODY, AppliedState, Owner, StateFiles, boot, namespace, this_process
 from lavt.transport.netem.tc import (
     PLACES,
     ROOT,
@@ -107,14 +107,14 @@ def run_tc(command: Command) -> str:
 
 
 @value
-class Verified:
+class Verification:
     """What a verification found: `reasons` says in sentences what is not as asked, and is empty where all is."""
 
     reasons: list[str]
-    measured: dict[str, Measured]
+    measured: dict[str, ProbeResult]
 
 
-class Netem:
+class NetemInterface:
     """The delay of one interface. As a context it puts the interface back at its end, however it ends.
 
     `stays`: what is applied outlives this process, as no program owns it. `directory` holds what is written down for a
@@ -140,9 +140,9 @@ class Netem:
         self._run = run
         self._clock = clock or MachineClock()
         self._seed = seed
-        self._wander: Wander | None = None
+        self._wander: CorrelatedJitter | None = None
 
-    def __enter__(self) -> Netem:
+    def __enter__(self) -> NetemInterface:
         return self
 
     def __exit__(
@@ -169,7 +169,9 @@ class Netem:
                 if each.is_abandoned
             ]
 
-    def apply(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), condition: str = "") -> list[Command]:
+    def apply(
+        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), condition: str = ""
+    ) -> list[Command]:
         """Hold `flows` as their laws say, from now on; give the commands that did it.
 
         What is there already is changed without losing a packet, and what is no longer asked for is held no more.
@@ -188,11 +190,13 @@ class Netem:
             qdiscs = self._ours_or_free(self.interface)
             if any(flow.law.jitter_distribution == "uniform" for flow in flows):
                 self._files.write_text("uniform.dist", uniform_table())
-            self._files.write(Applied(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
+            self._files.write(AppliedState(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
             self._stand_still()
             ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
             if wanders:
-                self._wander = Wander(self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock)
+                self._wander = CorrelatedJitter(
+                    self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock
+                )
             return ran
 
     def clear(self, *, at_once: bool = False, of_anybody: bool = False) -> list[Command]:
@@ -210,7 +214,7 @@ class Netem:
             self._files.forget(self.interface)
             return ran
 
-    def applied(self) -> Applied | None:
+    def applied(self) -> AppliedState | None:
         """Tell what was applied, by whom; None where nothing was written down."""
         return self._files.read(self.interface)
 
@@ -226,7 +230,7 @@ class Netem:
             "applied": self.applied(),
         }
 
-    def read_back(self, flows: Sequence[Flow]) -> list[str]:
+    def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
         """Compare what tc tells with what was asked, in sentences; an empty list is as asked."""
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
         if not _is_ours(qdiscs):
@@ -238,15 +242,19 @@ class Netem:
             f"there is a filter that nobody asked for: {each[:3]}" for each in found if each not in wanted
         ]
 
-    def measure(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), count: int = 50) -> dict[str, Measured]:
+    def measure(
+        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+    ) -> dict[str, ProbeResult]:
         """Measure what happens to packets of each flow, and of what must not be held, on their way out."""
         return measure(self.interface, probes(flows, never), count=count, clock=self._clock)
 
-    def verify(self, flows: Sequence[Flow], *, never: Sequence[Port] = (), count: int = 50) -> Verified:
+    def verify(
+        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+    ) -> Verification:
         """Verify by reading back and by measuring, and tell what has stopped."""
         reasons = self.read_back(flows)
         measured = self.measure(flows, never=never, count=count)
-        return Verified(reasons + self.doubts() + judge(flows, never, measured), measured)
+        return Verification(reasons + self.doubts() + judge(flows, never, measured), measured)
 
     def doubts(self) -> list[str]:
         """Say in sentences what of ours has stopped by itself since it was applied; no program is started for it."""
@@ -295,7 +303,7 @@ class Netem:
                 )
         return []
 
-    def _begin(self, flows: Sequence[Flow]) -> list[Command]:
+    def _begin(self, flows: Sequence[ImpairedFlow]) -> list[Command]:
         """Hold flows on an interface that is free; where that fails it is left as it was."""
         try:
             return self._do([add_root(self.interface)]) + self._change(flows, [])
@@ -311,7 +319,7 @@ class Netem:
             self._wander.end()
             self._wander = None
 
-    def _change(self, flows: Sequence[Flow], qdiscs: Sequence[Qdisc]) -> list[Command]:
+    def _change(self, flows: Sequence[ImpairedFlow], qdiscs: Sequence[Qdisc]) -> list[Command]:
         """Bring our queues from what they are to what is asked."""
         asked = {flow.name: flow for flow in flows}
         found = set(self._filters()) if qdiscs else set()
@@ -320,7 +328,7 @@ class Netem:
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
             if exists or name in asked:
-                law = asked[name].law if name in asked else Law()
+                law = asked[name].law if name in asked else Impairment()
                 verb = "change" if exists else "add"
                 commands.append(set_law(self.interface, name, law, verb=verb, tables=self._tables))  # type: ignore[arg-type]
         commands += [delete_filter(self.interface, *each[:2]) for each in sorted(found - set(wanted), key=str)]
@@ -335,7 +343,7 @@ class Netem:
         if at_once or not held:
             return self._do([delete_root(interface)])
         longest_ms = max(read_law(found.options).longest_ms for found in held.values())
-        ran = self._do([set_law(interface, name, Law(), verb="change") for name in held])
+        ran = self._do([set_law(interface, name, Impairment(), verb="change") for name in held])
         self._wait_until_empty(interface, round(longest_ms * NS_PER_MS))
         ran += self._do([delete_filters(interface)])
         self._wait_until_empty(interface, 0)

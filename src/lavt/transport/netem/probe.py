@@ -22,7 +22,7 @@ from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS
-from lavt.transport.emulation.impairment import NEVER, Flow, Law, Port, bursts, gilbert
+from lavt.transport.emulation.impairment import NEVER, ExemptPort, ImpairedFlow, Impairment, bursts, gilbert
 from lavt.value import value
 
 PERIOD_NS: Final = 20 * NS_PER_MS
@@ -54,19 +54,19 @@ _RECEIVE_BUFFER_BYTES: Final = 1 << 20
 
 
 @value
-class Probe:
+class ProbeSpec:
     """Frames of one kind, and what is expected to happen to them."""
 
     name: str
     protocol: Literal["udp", "tcp"]
     source: int
     destination: int
-    law: Law
+    law: Impairment
     first_byte: int = RTP
 
 
 @value
-class Measured:
+class ProbeResult:
     """What happened to the frames of a probe: how many were sent, lost, passed by later ones; delays in milliseconds.
 
     Where packets overtake by not being delayed, those are counted in `early` and are not among the delays. None: no
@@ -82,7 +82,7 @@ class Measured:
     p95_ms: float | None
 
 
-def probes(flows: Sequence[Flow], never: Sequence[Port] = ()) -> list[Probe]:
+def probes(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> list[ProbeSpec]:
     """Give the probes for flows, and for what must not be held beside them."""
     held, beside = [], []
     taken = {(flow.protocol, flow.port, flow.end) for flow in flows}
@@ -90,19 +90,24 @@ def probes(flows: Sequence[Flow], never: Sequence[Port] = ()) -> list[Probe]:
         there, back = (flow.port, OTHER_PORT), (OTHER_PORT, flow.port)
         if flow.end == "destination":
             there, back = back, there
-        held.append(Probe(flow.name, flow.protocol, *there, flow.law))
+        held.append(ProbeSpec(flow.name, flow.protocol, *there, flow.law))
         other_end: Literal["source", "destination"] = "source" if flow.end == "destination" else "destination"
         if (flow.protocol, flow.port, other_end) not in taken:
-            beside.append(Probe(f"{flow.name}, other direction", flow.protocol, *back, Law()))
+            beside.append(ProbeSpec(f"{flow.name}, other direction", flow.protocol, *back, Impairment()))
         if flow.name == "video":
-            beside.append(Probe("challenges of the video's path", flow.protocol, *there, Law(), PATH))
-    beside += [Probe(port.whose, port.protocol, port.port, port.port, Law()) for port in (*NEVER, *never)]
+            beside.append(ProbeSpec("challenges of the video's path", flow.protocol, *there, Impairment(), PATH))
+    beside += [ProbeSpec(port.whose, port.protocol, port.port, port.port, Impairment()) for port in (*NEVER, *never)]
     return held + beside
 
 
 def measure(
-    interface: str, asked: Sequence[Probe], *, count: int = 50, period_ns: int = PERIOD_NS, clock: Clock | None = None
-) -> dict[str, Measured]:
+    interface: str,
+    asked: Sequence[ProbeSpec],
+    *,
+    count: int = 50,
+    period_ns: int = PERIOD_NS,
+    clock: Clock | None = None,
+) -> dict[str, ProbeResult]:
     """Send `count` frames for each probe, `period_ns` apart, and tell for each by name what happened to them.
 
     Raises `UserError` without root, and for an interface that is not there or not up.
@@ -115,7 +120,9 @@ def measure(
         ) from error
 
 
-def _measure(interface: str, asked: Sequence[Probe], count: int, period_ns: int, clock: Clock) -> dict[str, Measured]:
+def _measure(
+    interface: str, asked: Sequence[ProbeSpec], count: int, period_ns: int, clock: Clock
+) -> dict[str, ProbeResult]:
     with _open(interface) as receiver, _open_sender() as sender:
         seen = _Seen(receiver, asked, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
@@ -133,7 +140,7 @@ def _measure(interface: str, asked: Sequence[Probe], count: int, period_ns: int,
     return {probe.name: summary(probe.law, count, seen.delays[index]) for index, probe in enumerate(asked)}
 
 
-def summary(law: Law, sent: int, delays: Sequence[tuple[int, float]]) -> Measured:
+def summary(law: Impairment, sent: int, delays: Sequence[tuple[int, float]]) -> ProbeResult:
     """Sum up (number, delay in milliseconds) of the frames of a probe, in the order in which they left."""
     newest, reordered = -1, 0
     for number, _ in delays:
@@ -143,17 +150,17 @@ def summary(law: Law, sent: int, delays: Sequence[tuple[int, float]]) -> Measure
     held_ms = [delay_ms for delay_ms in all_ms if not law.reorder or delay_ms > law.delay_ms / 2]
     early = len(all_ms) - len(held_ms)
     if len(held_ms) < 2:
-        return Measured(sent, sent - len(delays), reordered, early, None, None, None)
+        return ProbeResult(sent, sent - len(delays), reordered, early, None, None, None)
     twentieths = quantiles(held_ms, n=20, method="inclusive")
-    return Measured(sent, sent - len(delays), reordered, early, twentieths[0], median(held_ms), twentieths[-1])
+    return ProbeResult(sent, sent - len(delays), reordered, early, twentieths[0], median(held_ms), twentieths[-1])
 
 
-def judge(flows: Sequence[Flow], never: Sequence[Port], measured: Mapping[str, Measured]) -> list[str]:
+def judge(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort], measured: Mapping[str, ProbeResult]) -> list[str]:
     """Say in sentences what was measured to be otherwise than asked; an empty list is as asked."""
     return [reason for probe in probes(flows, never) for reason in _judge(probe, measured.get(probe.name))]
 
 
-def _judge(probe: Probe, found: Measured | None) -> list[str]:
+def _judge(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:
     name, law = probe.name, probe.law
     if found is None:
         return [f"{name}: no packet came through"]
@@ -174,7 +181,7 @@ def _judge(probe: Probe, found: Measured | None) -> list[str]:
     return reasons + _judge_counts(probe, found)
 
 
-def _judge_counts(probe: Probe, found: Measured) -> list[str]:
+def _judge_counts(probe: ProbeSpec, found: ProbeResult) -> list[str]:
     name, law = probe.name, probe.law
     reasons = []
     if not _is_share(found.lost, found.sent, law.loss, _clumping(law)):
@@ -194,7 +201,7 @@ def _is_share(count: int, of: int, share: float, clumping: float) -> bool:
     return abs(count - of * share) <= SIGMAS * math.sqrt(of * share * (1 - share) * clumping) + 1
 
 
-def _clumping(law: Law) -> float:
+def _clumping(law: Impairment) -> float:
     """Tell how much more variable a count of losses is in bursts: (1 + r) / (1 - r), r from one packet to the next."""
     if not bursts(law):
         return 1.0
@@ -205,7 +212,7 @@ def _clumping(law: Law) -> float:
 class _Seen:
     """Frames of ours that have left, by probe: (number, delay in milliseconds) in order."""
 
-    def __init__(self, receiver: socket.socket, asked: Sequence[Probe], who: int) -> None:
+    def __init__(self, receiver: socket.socket, asked: Sequence[ProbeSpec], who: int) -> None:
         self._receiver = receiver
         self._asked = asked
         self._who = who
@@ -287,7 +294,7 @@ def _hardware_address(interface: str) -> bytes:
     return address if any(address) else _NOBODY
 
 
-def _frame(probe: Probe, mark: bytes) -> bytes:
+def _frame(probe: ProbeSpec, mark: bytes) -> bytes:
     """Make an IPv4 packet of a probe's kind; checksums of UDP and TCP are left out, as nobody receives it."""
     payload = bytes([probe.first_byte]) + mark
     if probe.protocol == "udp":

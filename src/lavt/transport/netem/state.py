@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import Flow, Law
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.value import value
 
 DIRECTORY: Final = Path("/run/lavt")
@@ -30,7 +30,7 @@ Owner = tuple[int, int]
 
 
 @value
-class Applied:
+class AppliedState:
     """What was applied to an interface, and by whom."""
 
     interface: str
@@ -38,7 +38,7 @@ class Applied:
     boot: str
     owner: Owner
     condition: str
-    flows: tuple[Flow, ...]
+    flows: tuple[ImpairedFlow, ...]
 
     @property
     def is_abandoned(self) -> bool:
@@ -101,7 +101,7 @@ class StateFiles:
         finally:
             os.close(lock)
 
-    def write(self, applied: Applied) -> None:
+    def write(self, applied: AppliedState) -> None:
         """Write down what is going to be applied."""
         self.write_text(self._path(applied.interface).name, json.dumps(asdict(applied)))
 
@@ -112,11 +112,11 @@ class StateFiles:
             part.write_text(text)
             part.replace(self.directory / name)
 
-    def read(self, interface: str) -> Applied | None:
+    def read(self, interface: str) -> AppliedState | None:
         """Give what was applied to an interface of this namespace; None for nothing, or what cannot be read."""
         return self._read(self._path(interface))
 
-    def all(self) -> list[Applied]:
+    def all(self) -> list[AppliedState]:
         """Give everything that was applied in this namespace."""
         found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{namespace()}-*.json"))]
         return [each for each in found if each is not None]
@@ -139,11 +139,11 @@ class StateFiles:
         return self.directory / f"netem-{namespace()}-{interface}.json"
 
     @staticmethod
-    def _read(path: Path) -> Applied | None:
+    def _read(path: Path) -> AppliedState | None:
         try:
             data = json.loads(path.read_text())
             pid, start = data["owner"]
-            return Applied(
+            return AppliedState(
                 str(data["interface"]), int(data["namespace"]), str(data["boot"]), (int(pid), int(start)),
                 str(data["condition"]), flows_from(data["flows"]),
             )  # fmt: skip
@@ -151,6 +151,6 @@ class StateFiles:
             return None
 
 
-def flows_from(data: Sequence[Any]) -> tuple[Flow, ...]:
+def flows_from(data: Sequence[Any]) -> tuple[ImpairedFlow, ...]:
     """Make flows of what `dataclasses.asdict` made of them; raises `TypeError` or `KeyError` for anything else."""
-    return tuple(Flow(**{**each, "law": Law(**each["law"])}) for each in data)
+    return tuple(ImpairedFlow(**{**each, "law": Impairment(**each["law"])}) for each in data)

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal
 
 from lavt.errors import WorkError
-from lavt.transport.emulation.impairment import ORDER_RATE_BPS, Flow, Law, bursts, gilbert
+from lavt.transport.emulation.impairment import ORDER_RATE_BPS, ImpairedFlow, Impairment, bursts, gilbert
 from lavt.value import value
 
 Command = list[str]
@@ -41,7 +41,7 @@ TC_STEP_MS: Final = 0.002
 
 
 @value
-class Place:
+class FlowPlacement:
     """Where a flow's packets are held: the band, the handle of its netem, and the first of its filters' numbers."""
 
     band: int
@@ -54,15 +54,15 @@ class Place:
         return f"{ROOT}{self.band}"
 
 
-PLACES: Final[Mapping[str, Place]] = {
-    "video": Place(4, "4c01:", 1),
-    "control": Place(5, "4c02:", 3),
-    "state": Place(6, "4c03:", 5),
+PLACES: Final[Mapping[str, FlowPlacement]] = {
+    "video": FlowPlacement(4, "4c01:", 1),
+    "control": FlowPlacement(5, "4c02:", 3),
+    "state": FlowPlacement(6, "4c03:", 5),
 }
 
 
 @value
-class Match:
+class U32Match:
     """One condition of a u32 filter: as tc is told it, and as it is read back, 32 bits at an offset."""
 
     words: str
@@ -77,16 +77,16 @@ class Match:
 
 
 @value
-class Filter:
+class TcFilter:
     """Sends the packets of one IP version that match to a flow's band."""
 
     number: int
     version: Literal["ip", "ipv6"]
-    matches: tuple[Match, ...]
+    matches: tuple[U32Match, ...]
     parent: str
 
 
-def filters(flow: Flow) -> list[Filter]:
+def filters(flow: ImpairedFlow) -> list[TcFilter]:
     """Give the filters of a flow, for IPv4 and for IPv6.
 
     Whole packets only (no fragments but the first, no IPv4 options, no IPv6 extension headers): the bytes looked at are
@@ -96,22 +96,22 @@ def filters(flow: Flow) -> list[Filter]:
     number = {"udp": 17, "tcp": 6}[flow.protocol]
     direction, shift = {"source": ("sport", 16), "destination": ("dport", 0)}[flow.end]
     port_bits, port_mask = flow.port << shift, 0xFFFF << shift
-    matches4: tuple[Match, ...] = (
-        Match("u8 0x45 0xff at 0", 0, 0x45000000, 0xFF000000),
-        Match("u16 0x0000 0x1fff at 6", 4, 0, 0x1FFF),
-        Match(f"ip protocol {number} 0xff", 8, number << 16, 0xFF0000),
-        Match(f"ip {direction} {flow.port} 0xffff", 20, port_bits, port_mask),
+    matches4: tuple[U32Match, ...] = (
+        U32Match("u8 0x45 0xff at 0", 0, 0x45000000, 0xFF000000),
+        U32Match("u16 0x0000 0x1fff at 6", 4, 0, 0x1FFF),
+        U32Match(f"ip protocol {number} 0xff", 8, number << 16, 0xFF0000),
+        U32Match(f"ip {direction} {flow.port} 0xffff", 20, port_bits, port_mask),
     )
-    matches6: tuple[Match, ...] = (
-        Match(f"ip6 protocol {number} 0xff", 4, number << 8, 0xFF00),
-        Match(f"ip6 {direction} {flow.port} 0xffff", 40, port_bits, port_mask),
+    matches6: tuple[U32Match, ...] = (
+        U32Match(f"ip6 protocol {number} 0xff", 4, number << 8, 0xFF00),
+        U32Match(f"ip6 {direction} {flow.port} 0xffff", 40, port_bits, port_mask),
     )
     if flow.name == "video":
-        matches4 += (Match("u8 0x80 0xc0 at 28", 28, 0x80000000, 0xC0000000),)
-        matches6 += (Match("u8 0x80 0xc0 at 48", 48, 0x80000000, 0xC0000000),)
+        matches4 += (U32Match("u8 0x80 0xc0 at 28", 28, 0x80000000, 0xC0000000),)
+        matches6 += (U32Match("u8 0x80 0xc0 at 48", 48, 0x80000000, 0xC0000000),)
     return [
-        Filter(place.number, "ip", matches4, place.parent),
-        Filter(place.number + 1, "ipv6", matches6, place.parent),
+        TcFilter(place.number, "ip", matches4, place.parent),
+        TcFilter(place.number + 1, "ipv6", matches6, place.parent),
     ]
 
 
@@ -120,7 +120,7 @@ def add_root(interface: str) -> Command:
     return ["tc", "qdisc", "add", "dev", interface, "root", "handle", ROOT, "prio", "bands", str(BANDS)]
 
 
-def set_law(interface: str, name: str, law: Law, *, verb: Literal["add", "change"], tables: str = "") -> Command:
+def set_law(interface: str, name: str, law: Impairment, *, verb: Literal["add", "change"], tables: str = "") -> Command:
     """Give the command that gives a flow its law, with all arguments: `change` keeps some that are not named.
 
     `tables` is the directory of our own table of the uniform distribution, which tc has not: without any table a
@@ -134,7 +134,7 @@ def set_law(interface: str, name: str, law: Law, *, verb: Literal["add", "change
     ]  # fmt: skip
 
 
-def netem_arguments(law: Law) -> list[str]:
+def netem_arguments(law: Impairment) -> list[str]:
     """Give netem's own arguments for a law; what wanders (correlated jitter) is not netem's."""
     limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * law.longest_ms / 1000))
     words = ["netem", "limit", str(limit), "delay", f"{_plain(law.delay_ms)}ms"]
@@ -149,7 +149,7 @@ def netem_arguments(law: Law) -> list[str]:
     return [*words, "rate", f"{law.rate_bps}bit" if law.rate_bps else "10gbit"]
 
 
-def add_filter(interface: str, each: Filter) -> Command:
+def add_filter(interface: str, each: TcFilter) -> Command:
     """Give the command that sends what matches to its band."""
     words = " ".join(f"match {match.words}" for match in each.matches)
     return [
@@ -185,7 +185,7 @@ def show_filters(interface: str) -> Command:
     return ["tc", "filter", "show", "dev", interface, "parent", ROOT]
 
 
-def first_commands(interface: str, flows: Sequence[Flow], *, tables: str = "") -> list[Command]:
+def first_commands(interface: str, flows: Sequence[ImpairedFlow], *, tables: str = "") -> list[Command]:
     """Give all commands for an interface that has nothing of ours."""
     commands = [add_root(interface)]
     for flow in flows:
@@ -245,12 +245,12 @@ def parse_filters(text: str) -> list[FoundFilter]:
     return [(number, version, band, frozenset(matches)) for number, version, band, matches in found]
 
 
-def expected_filter(each: Filter) -> FoundFilter:
+def expected_filter(each: TcFilter) -> FoundFilter:
     """Give a filter as it is read back."""
     return each.number, each.version, each.parent, frozenset(match.read_back for match in each.matches)
 
 
-def read_law(options: Mapping[str, Any]) -> Law:
+def read_law(options: Mapping[str, Any]) -> Impairment:
     """Give the law that a netem's options tell; the distribution is not told, and counts as normal.
 
     Raises `WorkError` for options that are not netem's.
@@ -262,7 +262,7 @@ def read_law(options: Mapping[str, Any]) -> Law:
             into, out_of = float(model["p"]), float(model["r"])
             loss, burst = into / (into + out_of), 1 / out_of
         rate_bps = 8 * int(options.get("rate", {}).get("rate", 0))
-        return Law(
+        return Impairment(
             delay_ms=1000 * float(delay.get("delay", 0.0)),
             jitter_ms=1000 * float(delay.get("jitter", 0.0)),
             loss=loss,
@@ -274,7 +274,7 @@ def read_law(options: Mapping[str, Any]) -> Law:
         raise WorkError(f"tc told a netem in words that are not understood: {str(options)[:200]!r}") from error
 
 
-def difference(flow: Flow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
+def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
     """Compare a flow with what was read back, in sentences; an empty list is as asked."""
     place, asked = PLACES[flow.name], flow.law
     netem = next((each for each in qdiscs if each.handle == place.handle), None)

@@ -34,7 +34,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import BadMessage
 from lavt.transport.clock_sync.probe import decode_request
 from lavt.transport.rtp.rtcp import is_rtcp
-from lavt.transport.security.flood_filter import Budget
+from lavt.transport.security.flood_filter import RateLimiter
 from lavt.transport.security.keys import SIGNATURE_BYTES, PrivateKey, PublicKey
 from lavt.transport.video.path_validation import is_path_datagram
 
@@ -120,9 +120,9 @@ class Forwarder:
         self._registered_ns = 0
         self._told_ns = 0
         self._clients = _Clients()
-        self._signatures = {True: Budget(REGISTRATIONS_PER_S), False: Budget(REGISTRATIONS_PER_S)}
+        self._signatures = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
         """Apart, by whether they come from where the vehicle is."""
-        self._upstream = {True: Budget(UPSTREAM_PER_S), False: Budget(UPSTREAM_PER_S)}
+        self._upstream = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
         """Apart, by whether the vehicle has answered the client."""
 
     def vehicle_at(self, now_ns: int) -> Address | None:

@@ -22,7 +22,7 @@ Ordered = list[tuple[RtpPacket, bool]]
 """Packets in order, each with whether any between it and the one before it is missing."""
 
 
-class ReorderBuffer:
+class JitterBuffer:
     """Puts the packets of one RTP stream in order; a new SSRC begins a new stream.
 
     `hold_ns` is how long a gap is waited for; None: as long as the network's packets have lately been overtaken by.

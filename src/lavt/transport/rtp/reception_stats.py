@@ -6,7 +6,7 @@ section 3); after repair one that the decoder had to do without.
 
 from __future__ import annotations
 
-from lavt.transport.rtp.jitter_buffer import ReorderBuffer
+from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.ntp_time import short_time
 from lavt.transport.rtp.rtcp import Announcement, ReceptionReport, SenderReport
 from lavt.transport.rtp.rtcp_xr import answered_round_trip_ns
@@ -46,7 +46,7 @@ class Reception:
     Public: `round_trip_ns`, None before the sender has answered a report.
     """
 
-    def __init__(self, reorder: ReorderBuffer) -> None:
+    def __init__(self, reorder: JitterBuffer) -> None:
         self.round_trip_ns: int | None = None
         self._reorder = reorder
         self._packets = 0

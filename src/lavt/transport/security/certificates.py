@@ -35,7 +35,7 @@ Kind = TypeVar("Kind", bound=x509.ExtensionType)
 
 
 @value
-class Pair:
+class KeyPair:
     """A private key, and what may be shown of it: a certificate, or a public key. Both PEM."""
 
     private: bytes
@@ -43,7 +43,7 @@ class Pair:
 
 
 @value
-class Described:
+class CertificateSummary:
     """What a certificate says."""
 
     name: str
@@ -54,7 +54,7 @@ class Described:
     """Day, as 2027-01-31 (UTC)."""
 
 
-def new_authority(now_wall_ns: int, days: int) -> Pair:
+def new_authority(now_wall_ns: int, days: int) -> KeyPair:
     """Make an authority that signs itself and holds for `days`; it can sign certificates, but no other authority."""
     key = generate_private_key(SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, AUTHORITY)])
@@ -64,12 +64,12 @@ def new_authority(now_wall_ns: int, days: int) -> Pair:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_key_usage(authority=True), critical=True)
     )
-    return Pair(_private(key), _certificate(builder.sign(key, hashes.SHA256())))
+    return KeyPair(_private(key), _certificate(builder.sign(key, hashes.SHA256())))
 
 
 def new_certificate(
-    authority: Pair, name: str, role: str, *, dialled_at: Iterable[str] | None, now_wall_ns: int, days: int
-) -> Pair:
+    authority: KeyPair, name: str, role: str, *, dialled_at: Iterable[str] | None, now_wall_ns: int, days: int
+) -> KeyPair:
     """Make a key and its certificate for `name`, which is the CN; the role is its organizational unit (OU).
 
     `dialled_at` are the addresses and host names beside the loopback's; None: it is never dialled. It holds for
@@ -96,23 +96,23 @@ def new_certificate(
         )
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()), critical=False)
     )
-    return Pair(_private(key), _certificate(builder.sign(issuer_key, hashes.SHA256())))
+    return KeyPair(_private(key), _certificate(builder.sign(issuer_key, hashes.SHA256())))
 
 
-def new_signing_pair() -> Pair:
+def new_signing_pair() -> KeyPair:
     """Make a key to sign with and the public key that others check it by (Ed25519)."""
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-    return Pair(_private(key), public)
+    return KeyPair(_private(key), public)
 
 
-def described(certificate: bytes, where: str) -> Described:
+def described(certificate: bytes, where: str) -> CertificateSummary:
     """Read what a certificate says; raises `UserError`, which says `where` it is, for bytes that are none."""
     read = _read(certificate, where)
     server = _extension(read, x509.ExtendedKeyUsage)
     dialled = server is not None and ExtendedKeyUsageOID.SERVER_AUTH in server
     names = _extension(read, x509.SubjectAlternativeName) if dialled else None
-    return Described(
+    return CertificateSummary(
         name=_subject(read, NameOID.COMMON_NAME),
         role=_subject(read, NameOID.ORGANIZATIONAL_UNIT_NAME),
         hosts=tuple(str(each.value) for each in names or ()),
@@ -187,7 +187,7 @@ def _read(certificate: bytes, where: str) -> x509.Certificate:
         raise UserError(f"{where} is no certificate in PEM: copy it back, or move it away") from error
 
 
-def _authority(authority: Pair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
+def _authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
     certificate = _read(authority.shown, "that of the authority")
     try:
         key = serialization.load_pem_private_key(authority.private, password=None)

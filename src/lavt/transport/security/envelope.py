@@ -20,7 +20,7 @@ from lavt.transport.messages import MAX_MESSAGE_BYTES, decode
 from lavt.transport.security.keys import (
     PUBLIC_KEY_BYTES,
     SIGNATURE_BYTES,
-    Agreement,
+    KeyAgreement,
     PrivateKey,
     PublicKey,
     decrypt,
@@ -53,7 +53,7 @@ def _context(what: str, vehicle: str) -> bytes:
     return f"LAVT 1 {what} {vehicle}\0".encode()
 
 
-class _Codes:
+class _SessionMacs:
     """The codes of one session, which its two ends can make and nobody else; before there is one, of nobody."""
 
     def __init__(self, token: bytes = b"") -> None:
@@ -77,7 +77,7 @@ def _signed(data: bytes) -> bytes:
 
 
 @value
-class Request:
+class VerifiedRequest:
     """A query that is authentic and new: from whom, and what its reply needs to know of it."""
 
     channel: str
@@ -92,7 +92,7 @@ class Request:
     """It has not the place that is next, so it may be a replay: nobody looks at it, and who sent it may ask again."""
 
 
-class NoSeal:
+class NoVehicleAuthenticator:
     """The vehicle's end where nothing is signed: everything is taken to be authentic."""
 
     counts: Mapping[str, int] = {}
@@ -113,20 +113,20 @@ class NoSeal:
         """Give the command in an envelope."""
         return data
 
-    def open_request(self, channel: str, data: bytes) -> Request | None:
+    def open_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
         """Give the query in an envelope."""
-        return Request(channel, "", data, b"", b"", b"", is_stale=False)
+        return VerifiedRequest(channel, "", data, b"", b"", b"", is_stale=False)
 
     def seal_state(self, body: bytes) -> bytes:
         """Give the state as it is."""
         return body
 
-    def seal_reply(self, _request: Request, body: bytes) -> bytes:
+    def seal_reply(self, _request: VerifiedRequest, body: bytes) -> bytes:
         """Give the reply as it is."""
         return body
 
 
-class VehicleSeal(NoSeal):
+class VehicleAuthenticator(NoVehicleAuthenticator):
     """The vehicle's end: `operators` are the names and keys of who may drive."""
 
     def __init__(self, vehicle: str, key: PrivateKey, operators: Mapping[str, PublicKey]) -> None:
@@ -141,7 +141,7 @@ class VehicleSeal(NoSeal):
         self._agreements: dict[bytes, tuple[bytes, bytes]] = {}
         """By the client's public key: the secret, and the public key of this end."""
         self._holder = ""
-        self._codes = _Codes()
+        self._codes = _SessionMacs()
 
     # What comes in.
 
@@ -177,7 +177,7 @@ class VehicleSeal(NoSeal):
         except BadMessage:
             return False
 
-    def open_request(self, channel: str, data: bytes) -> Request | None:
+    def open_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
         """Give the query in an envelope that one of the operators has signed in his own name; None for any other."""
         signed, signature = _signed(data), data[-SIGNATURE_BYTES:]
         at = PLACE_BYTES + PUBLIC_KEY_BYTES + _WHO_BYTES
@@ -196,7 +196,7 @@ class VehicleSeal(NoSeal):
         # An emergency stop has a number of its own, and no time to ask twice.
         stale = body == b"" or not (next_in_place or _is_emergency_stop(channel, body))
         self._counts[f"{channel}_requests_of_another_time"] += stale and body != b""
-        return Request(channel, who, body, _digest(data), *agreed, stale)
+        return VerifiedRequest(channel, who, body, _digest(data), *agreed, stale)
 
     def _is_own(self, channel: str, who: str, body: bytes) -> bool:
         """Whether a request is in the name of who has signed it; an empty one only asks for the place."""
@@ -212,7 +212,7 @@ class VehicleSeal(NoSeal):
     def _agree(self, public: bytes) -> tuple[bytes, bytes] | None:
         """Agree on a secret with whoever has this public key: the secret and the public key of this end."""
         if public not in self._agreements:
-            agreement = Agreement()
+            agreement = KeyAgreement()
             secret = agreement.secret(public, _context("secret", self._vehicle) + public + agreement.public)
             if secret is None:
                 return None
@@ -229,7 +229,7 @@ class VehicleSeal(NoSeal):
         signed = self._instance + self._states.to_bytes(8, "big") + body
         return signed + self._codes.of("state", signed) + self._key.sign(_context("state", self._vehicle) + signed)
 
-    def seal_reply(self, request: Request, body: bytes) -> bytes:
+    def seal_reply(self, request: VerifiedRequest, body: bytes) -> bytes:
         """Sign the reply to `request`, encrypted for who asked; of a stale one `body` is empty."""
         if not request.is_stale:
             self._note_session(request, body)
@@ -238,19 +238,19 @@ class VehicleSeal(NoSeal):
         signed = request.digest + (_AGAIN if request.is_stale else _HERE) + place + request.public + encrypted
         return signed + self._key.sign(_context(f"{request.channel} reply", self._vehicle) + signed)
 
-    def _note_session(self, request: Request, body: bytes) -> None:
+    def _note_session(self, request: VerifiedRequest, body: bytes) -> None:
         """Follow who holds the vehicle: whose commands are admitted, and by which codes."""
         if request.channel != "session":
             return
         reply, operation = decode(SessionReply, body), decode(SessionRequest, request.body).operation
         if reply.granted and operation == "release":
-            self._holder, self._codes = "", _Codes()
+            self._holder, self._codes = "", _SessionMacs()
         elif reply.granted and reply.token:
-            self._holder, self._codes = request.who, _Codes(reply.token)
+            self._holder, self._codes = request.who, _SessionMacs(reply.token)
 
 
 @value
-class Reply:
+class VerifiedReply:
     """What a reply says: a `body`, or that the request must be sent `again`, in these bytes; or neither."""
 
     body: bytes | None
@@ -258,7 +258,7 @@ class Reply:
 
 
 @value
-class OpenedState:
+class VerifiedState:
     """A state, or None where it is not to be shown."""
 
     body: bytes | None
@@ -266,7 +266,7 @@ class OpenedState:
     """It is the vehicle's, and may be old: of a server's process that has not answered a request yet. So ask it."""
 
 
-class OperatorSeal:
+class OperatorAuthenticator:
     """The operator's end; `vehicle_key` is the vehicle's."""
 
     def __init__(self, vehicle: str, who: str, key: PrivateKey, vehicle_key: PublicKey) -> None:
@@ -275,11 +275,11 @@ class OperatorSeal:
         self._who = who.encode().ljust(_WHO_BYTES, b"\0")
         self._key = key
         self._vehicle_key = vehicle_key
-        self._agreement = Agreement()
+        self._agreement = KeyAgreement()
         self._places: dict[str, bytes] = dict.fromkeys(REQUESTS, bytes(PLACE_BYTES))
         self._asked: dict[bytes, tuple[str, bytes]] = {}
         """By digest: the channel and the body of requests that wait for a reply."""
-        self._codes = _Codes()
+        self._codes = _SessionMacs()
         self._newest_state = bytes(PLACE_BYTES)
 
     # What goes out.
@@ -299,7 +299,7 @@ class OperatorSeal:
 
     # What comes in.
 
-    def open_reply(self, channel: str, data: bytes) -> Reply:
+    def open_reply(self, channel: str, data: bytes) -> VerifiedReply:
         """Give the answer of the vehicle to a request of ours; each is taken once."""
         digest, because = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
         at = DIGEST_BYTES + 1
@@ -323,10 +323,10 @@ class OperatorSeal:
         self._forget(channel, digest)
         self._note_place(channel, place)
         if because == _AGAIN:
-            return Reply(None, self.seal_request(channel, asked[1]) if asked[1] else None)
+            return VerifiedReply(None, self.seal_request(channel, asked[1]) if asked[1] else None)
         if channel == "session":
             self._note_session(body)
-        return Reply(body, None)
+        return VerifiedReply(body, None)
 
     def _forget(self, channel: str, answered: bytes) -> None:
         """Take no reply any more to a request, nor to those of its kind from before it: what they say is older."""
@@ -336,9 +336,9 @@ class OperatorSeal:
             if digest == answered:
                 return
 
-    def _forged(self, name: str) -> Reply:
+    def _forged(self, name: str) -> VerifiedReply:
         self.counts[name] += 1
-        return Reply(None, None)
+        return VerifiedReply(None, None)
 
     def _note_place(self, channel: str, place: bytes) -> None:
         self._places[channel] = place
@@ -351,28 +351,28 @@ class OperatorSeal:
         except BadMessage:
             return
         if reply.granted and reply.token:
-            self._codes = _Codes(reply.token)
+            self._codes = _SessionMacs(reply.token)
 
     def is_next_state(self, data: bytes) -> bool:
         """Tell by number and code, which is cheap, whether a state is a newer one for who holds the vehicle."""
         return data[:PLACE_BYTES] > self._newest_state and self._codes.fit("state", data)
 
-    def open_state(self, data: bytes) -> OpenedState:
+    def open_state(self, data: bytes) -> VerifiedState:
         """Give a state that the vehicle has signed, newer than any before."""
         signed, signature = _signed(data), data[-SIGNATURE_BYTES:]
         place = signed[:PLACE_BYTES]
         known = place[:8] == self._newest_state[:8]
         if known and place <= self._newest_state:
             self.counts["states_replayed"] += 1
-            return OpenedState(None, ask=False)
+            return VerifiedState(None, ask=False)
         if not self._vehicle_key.verifies(signature, _context("state", self._vehicle) + signed):
             self.counts["states_forged"] += 1
-            return OpenedState(None, ask=False)
+            return VerifiedState(None, ask=False)
         if not known:
             self.counts["states_of_another_time"] += 1
-            return OpenedState(None, ask=True)
+            return VerifiedState(None, ask=True)
         self._newest_state = place
-        return OpenedState(signed[PLACE_BYTES:], ask=False)
+        return VerifiedState(signed[PLACE_BYTES:], ask=False)
 
 
 def _digest(data: bytes) -> bytes:

@@ -24,7 +24,7 @@ _HEAD_BYTES: Final = 32
 """More than version, epoch and sequence take."""
 
 
-class Budget:
+class RateLimiter:
     """So many a second, and no more."""
 
     def __init__(self, per_s: int) -> None:
@@ -40,7 +40,7 @@ class Budget:
         return self._left >= 0
 
 
-class CommandScreen:
+class FloodFilter:
     """Says whether a command is worth being looked at.
 
     `in_force` gives the epoch in force and the sequence last obeyed; `is_from_holder` tells it of an envelope, cheaply.
@@ -53,8 +53,8 @@ class CommandScreen:
         self._newest = (0, -1)
         """Epoch and sequence of the newest command that was let in; of one that the vehicle refuses they do not become
         those in force, and it may come again and again."""
-        self._old = Budget(OTHERS_PER_S)
-        self._strange = Budget(OTHERS_PER_S)
+        self._old = RateLimiter(OTHERS_PER_S)
+        self._strange = RateLimiter(OTHERS_PER_S)
         """Apart from the others, so that a stranger cannot hide what the holder says under an old epoch."""
 
     def passes(self, data: bytes, body: bytes, now_ns: int) -> bool:

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from lavt.domain import NS_PER_S, Now
 from lavt.node import Peer, Send
-from lavt.transport.security.envelope import REQUESTS, NoSeal, OperatorSeal, Request
-from lavt.transport.security.flood_filter import QUERIES_PER_S, Budget, CommandScreen
+from lavt.transport.security.envelope import REQUESTS, NoVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
+from lavt.transport.security.flood_filter import QUERIES_PER_S, FloodFilter, RateLimiter
 
 Deliver = Callable[[str, Any, Now, Peer], None]
 Carry = Callable[..., None]
@@ -26,7 +26,7 @@ STATES_PER_S: Final = 500
 """Ten times what a vehicle tells; as many signatures take 7 % of a core."""
 
 
-class OpenDoor:
+class OpenClientGateway:
     """The operator's door where nothing is signed."""
 
     counts: Mapping[str, int] = {}
@@ -36,16 +36,18 @@ class OpenDoor:
         self.send = carry
 
 
-class ServerDoor:
+class ServerGateway:
     """The vehicle's door. `in_force` gives the epoch in force and the sequence last obeyed."""
 
-    def __init__(self, deliver: Deliver, carry: Carry, in_force: Callable[[], tuple[int, int]], seal: NoSeal) -> None:
+    def __init__(
+        self, deliver: Deliver, carry: Carry, in_force: Callable[[], tuple[int, int]], seal: NoVehicleAuthenticator
+    ) -> None:
         self._deliver = deliver
         self._carry = carry
         self._seal = seal
-        self._screen = CommandScreen(in_force, seal.is_from_holder)
-        self._budgets = {channel: Budget(QUERIES_PER_S) for channel in REQUESTS}
-        self._requests: dict[tuple[str, Peer], Request] = {}
+        self._screen = FloodFilter(in_force, seal.is_from_holder)
+        self._budgets = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
+        self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
         self._again: Send | None = None
         """What a stale request is answered, as soon as the turn is over."""
         self._counts: Counter[str] = Counter()
@@ -103,14 +105,14 @@ class ServerDoor:
         return None if request is None else Send(send.channel, self._seal.seal_reply(request, send.payload), send.peer)
 
 
-class ClientDoor:
+class ClientGateway:
     """The operator's door."""
 
-    def __init__(self, deliver: Deliver, carry: Carry, seal: OperatorSeal) -> None:
+    def __init__(self, deliver: Deliver, carry: Carry, seal: OperatorAuthenticator) -> None:
         self._deliver = deliver
         self._carry = carry
         self._seal = seal
-        self._states = Budget(STATES_PER_S)
+        self._states = RateLimiter(STATES_PER_S)
         self._counts: Counter[str] = Counter()
         self._asked_ns: int | None = None
         self._turn = threading.Lock()

@@ -100,7 +100,7 @@ def _read(path: Path) -> bytes:
         raise UserError(f"the key {path} cannot be read ({error.strerror}): make keys with `lavt keys DIR`") from error
 
 
-class Agreement:
+class KeyAgreement:
     """One end of an agreement on a secret that nobody in between learns (X25519, RFC 7748); used for one session."""
 
     def __init__(self) -> None:

@@ -32,7 +32,7 @@ KEPT_PICTURES: Final = 300
 """Pictures that are on their way at most: 10 s of them at 30 Hz, and 280 MB."""
 
 
-class Received(Protocol):
+class ReceivedPicture(Protocol):
     """What came of an access unit."""
 
     @property
@@ -69,7 +69,7 @@ class PictureSender(Protocol):
 class PictureReceiver(Protocol):
     """The driver's end."""
 
-    def decode(self, access_unit: bytes) -> Received | None:
+    def decode(self, access_unit: bytes) -> ReceivedPicture | None:
         """Give the picture of an access unit; None when there is none."""
         ...
 
@@ -147,7 +147,7 @@ class RenderedPicture:
     corrupt: bool = False
 
 
-class HandedOver:
+class InMemoryFrameCodec:
     """Both ends for pictures as they were rendered: the access unit is a key, the pixels wait here until it arrives.
 
     Access units arrive in order: what is older than one that arrived was lost, and goes.

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleEvent, VehicleState
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import (
     AXES,
     CLEARING_PERIOD_NS,
@@ -19,10 +19,10 @@ from lavt.vehicle.dbw.profile import (
     Axis,
     Profile,
 )
-from lavt.vehicle.dbw.reports import Reports
-from lavt.vehicle.dbw.sending import Asked, Plan, Sender
+from lavt.vehicle.dbw.reports import NewestReports
+from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
 from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STANDING_BELOW_MPS, Situation, State, following
-from lavt.vehicle.vehicle import Reached
+from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_NS: Final = NS_PER_S
 """Ours: a shift that was begun may be reported so late."""
@@ -37,7 +37,7 @@ SEPARATOR: Final = "; "
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
 
-class Adapter:
+class ByWireAdapter:
     """Speaks to one by-wire kit by a profile.
 
     A tick is a call of `ask`; frames leave only while the newest is at most 60 ms old. `hindrance` is of the
@@ -46,7 +46,7 @@ class Adapter:
 
     def __init__(self, profile: Profile, *, start_ns: int, hindrance: str = "") -> None:
         self._profile = profile
-        self._reports, self._sender = Reports(profile, start_ns), Sender(profile, start_ns)
+        self._reports, self._sender = NewestReports(profile, start_ns), FrameSender(profile, start_ns)
         signless = "the steering's sign is not known: set vehicle.dbw.steering_sign"
         self._installation = _joined([hindrance, signless if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
@@ -62,7 +62,7 @@ class Adapter:
         """DRIVE was asked for, and is not reported yet: PARK that is reported is none to rely on."""
         self._asked = Actuation(0.0, 0.0, 0.0)
         self._asked_ns: int | None = None
-        self._plan: Plan | None = None
+        self._plan: KitCommands | None = None
         """What the last set said; None: nothing is being said."""
         self._is_late = False
         self._told: frozenset[str] = frozenset()
@@ -71,7 +71,7 @@ class Adapter:
         """Steering commands sent and not yet seen in a report: in its steps, and when they were asked for."""
         self._expected: int | None = None
         """The steering command of the last set, in its steps; None: it had none."""
-        self._reached: list[Reached] = []
+        self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
         self._seen = self._situation(start_ns)
         """What the table of states looked at last."""
@@ -83,7 +83,7 @@ class Adapter:
 
     # What comes in.
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Take a frame from the bus, whatever it is."""
         self._gone = ""
         before = self._reports.command
@@ -167,7 +167,7 @@ class Adapter:
 
     # What goes out.
 
-    def frames_due(self, now_ns: int) -> list[Frame]:
+    def frames_due(self, now_ns: int) -> list[CanFrame]:
         """Give the frames that leave now: none where the newest tick is too old, or there is nothing to say."""
         self._settle(now_ns)
         plan = self._planned()
@@ -193,52 +193,54 @@ class Adapter:
     def _is_fresh(self, now_ns: int) -> bool:
         return self._asked_ns is not None and now_ns - self._asked_ns <= TICK_LIMIT_NS
 
-    def _due_ns(self, asked: Asked) -> int:
+    def _due_ns(self, asked: DriveCommand) -> int:
         """Tell when the next set is due: soon where it brings something new."""
         if self._state == "clearing":
             return self._sender.sent_ns + CLEARING_PERIOD_NS
         return self._sender.sent_ns + (PERIOD_NS if asked == self._sender.sent else LEAST_GAP_NS)
 
-    def _planned(self) -> Plan | None:
+    def _planned(self) -> KitCommands | None:
         """Give what each state says to the kit."""
         reports, everything = self._reports, frozenset(AXES)
         if self._state == "clearing":
-            return Plan(NO_AXES, is_clearing=True)
+            return KitCommands(NO_AXES, is_clearing=True)
         if self._state == "enabling":
             is_enabled = reports.enabled == everything
-            return Plan(everything, gear="drive" if is_enabled and reports.gear != "drive" else None, system="enable")
+            return KitCommands(
+                everything, gear="drive" if is_enabled and reports.gear != "drive" else None, system="enable"
+            )
         if self._state == "engaged":
-            return Plan(everything, system="enable")
+            return KitCommands(everything, system="enable")
         if self._state == "lost":
-            return Plan(self._kept, system="enable" if self._kept else "")
+            return KitCommands(self._kept, system="enable" if self._kept else "")
         if self._state == "parking":
             return self._parking()
-        return Plan(NO_AXES) if self._state == "overridden" else None
+        return KitCommands(NO_AXES) if self._state == "overridden" else None
 
-    def _parking(self) -> Plan:
+    def _parking(self) -> KitCommands:
         """Brake, then PARK, then let go: a kit that is let go of in gear trips."""
         is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_NS
         if self._reports.gear == "park" and not is_shifting:
-            return Plan(NO_AXES, system="disable")
+            return KitCommands(NO_AXES, system="disable")
         has_stood = self._now_ns - self._moved_ns >= STOOD_NS
-        return Plan(
+        return KitCommands(
             self._kept,
             gear="park" if has_stood and self._kept else None,
             system="enable" if self._kept else "",
         )
 
-    def _to_ask(self) -> Asked:
+    def _to_ask(self) -> DriveCommand:
         """Give how the car is to drive in this state, before the limits."""
         asked, limits = self._asked, self._profile.limits
         wheel_deg = self._profile.wheel_deg(asked.steering_rad)
         if self._state == "engaged":
-            return Asked(wheel_deg, asked.throttle, asked.brake)
+            return DriveCommand(wheel_deg, asked.throttle, asked.brake)
         is_held = self._state in {"enabling", "parking"}
-        return Asked(wheel_deg, 0.0, max(asked.brake, limits.holding_brake) if is_held else asked.brake)
+        return DriveCommand(wheel_deg, 0.0, max(asked.brake, limits.holding_brake) if is_held else asked.brake)
 
     # What has reached the wheels.
 
-    def _expect_echo(self, plan: Plan) -> None:
+    def _expect_echo(self, plan: KitCommands) -> None:
         if "steering" not in plan.enabled or self._asked_ns is None:
             self._echoes.clear()
             self._expected = None
@@ -257,7 +259,7 @@ class Adapter:
         while self._echoes:
             number, asked_ns = self._echoes.popleft()
             if number == self._reports.command:
-                self._reached.append(Reached(asked_ns, now_ns))
+                self._reached.append(ReachedCommand(asked_ns, now_ns))
                 return
 
     # What it tells.
@@ -295,7 +297,7 @@ class Adapter:
         events, self._events = self._events, []
         return events
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Take which changes of the steering the kit has reported since the last call to steer by."""
         reached, self._reached = self._reached, []
         return reached

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 
 if TYPE_CHECKING:
     from can import BusABC, Message
@@ -67,13 +67,13 @@ class CanPort:
         self._interface, self._channel, self._options = interface, channel, dict(options)
         self._clock = clock
         self._mark = secrets.token_hex(8) if interface == HEARS_ITSELF else None
-        self._heard: deque[HeardFrame] = deque(maxlen=QUEUE_FRAMES)
+        self._heard: deque[ReceivedCanFrame] = deque(maxlen=QUEUE_FRAMES)
         self._why = ""
         self._tried_ns = clock.now().mono_ns
         self.counts: Counter[str] = Counter()
         self._open()
 
-    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Write frames that were made at a time, in order and without waiting, but none older than `TICK_LIMIT_NS`.
 
         The age is looked at just before each write. Raises `BusGone`; then the rest is not written.
@@ -93,7 +93,7 @@ class CanPort:
                     self._lose(why)
                 raise BusGone(why) from error
 
-    def take(self, now_ns: int) -> list[HeardFrame]:
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Take what has come since the last call, in order; own frames are not among it.
 
         A bus that has gone is opened again, at most each `REOPEN_NS`. Raises `BusGone` until that is done.
@@ -174,9 +174,9 @@ class CanPort:
                 return
             arrived_ns -= max(waited_ns, 0)
         self.counts["overflowed"] += len(self._heard) == QUEUE_FRAMES
-        self._heard.append(HeardFrame(frame, arrived_ns))
+        self._heard.append(ReceivedCanFrame(frame, arrived_ns))
 
-    def _message(self, frame: Frame) -> Message:
+    def _message(self, frame: CanFrame) -> Message:
         message: Message = _library().Message(
             arbitration_id=frame.identifier,
             is_extended_id=frame.is_extended,
@@ -195,7 +195,7 @@ def is_virtual(interface: str, channel: str) -> bool:
     return _link_kind(channel) == "vcan"
 
 
-def read_log(path: Path) -> Iterator[HeardFrame]:
+def read_log(path: Path) -> Iterator[ReceivedCanFrame]:
     """Read the frames of a log (candump's `.log`, or another that python-can knows), with the log's own times.
 
     Raises `UserError` where it cannot be read.
@@ -208,14 +208,14 @@ def read_log(path: Path) -> Iterator[HeardFrame]:
                 frame = _frame(message, counts)
                 if frame is not None:
                     heard += 1
-                    yield HeardFrame(frame, round(message.timestamp * NS_PER_S))
+                    yield ReceivedCanFrame(frame, round(message.timestamp * NS_PER_S))
     except Exception as error:  # of any of the readers
         raise UserError(
             f"{path} cannot be read after {heard} frames ({_text(error)}): name a log, as `candump -L` writes it"
         ) from error
 
 
-def log_line(heard_ns: int, channel: str, frame: Frame) -> str:
+def log_line(heard_ns: int, channel: str, frame: CanFrame) -> str:
     """Write a frame as a line of `candump -L`."""
     digits = 8 if frame.is_extended else 3
     seconds, nanoseconds = divmod(heard_ns, NS_PER_S)
@@ -260,7 +260,7 @@ REMEDIES: Final[Mapping[int | None, str]] = {
 }
 
 
-def _frame(message: Message, counts: Counter[str]) -> Frame | None:
+def _frame(message: Message, counts: Counter[str]) -> CanFrame | None:
     """The data frame that a message is; None for anything else, counted."""
     if message.is_error_frame:
         counts["error_frames"] += 1
@@ -271,7 +271,7 @@ def _frame(message: Message, counts: Counter[str]) -> Frame | None:
     elif type(message.arbitration_id) is not int or len(message.data) > 8:  # by udp_multicast anything comes
         counts["unreadable"] += 1
     else:
-        return Frame(message.arbitration_id, bytes(message.data), bool(message.is_extended_id))
+        return CanFrame(message.arbitration_id, bytes(message.data), bool(message.is_extended_id))
     return None
 
 

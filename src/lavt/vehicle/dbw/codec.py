@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
@@ -123,7 +123,7 @@ class Codec:
         data = bytes(self._messages[message].encode(full, strict=False))
         return data if length is None else data[:length]
 
-    def decode(self, frame: Frame, *, short: bool = False) -> tuple[str, dict[str, float | None]] | None:
+    def decode(self, frame: CanFrame, *, short: bool = False) -> tuple[str, dict[str, float | None]] | None:
         """Tell a frame's message and its physical values; None for what the DBC does not know, counted.
 
         A frame must have the message's length; with `short` it may have less, and tells the signals that are whole in

@@ -78,7 +78,7 @@ class SystemCommand:
 
 
 @dataclass(frozen=True, slots=True)
-class Sign:
+class SignalCondition:
     """A signal that means something: where it is `number`, or anything but 0 where that is None."""
 
     signal: str
@@ -87,7 +87,7 @@ class Sign:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class ReportSpec:
     """How a report is read."""
 
     part: str
@@ -98,10 +98,10 @@ class Report:
     no_value: Mapping[str, float]
     """Our word: what stands for none, in the DBC's unit. The lowest number of a signed signal does, though generation
     2's facts do not say so."""
-    override: tuple[Sign, ...]
-    trip: tuple[Sign, ...]
-    lapse: tuple[Sign, ...]
-    fault: tuple[Sign, ...]
+    override: tuple[SignalCondition, ...]
+    trip: tuple[SignalCondition, ...]
+    lapse: tuple[SignalCondition, ...]
+    fault: tuple[SignalCondition, ...]
     needs: Mapping[str, frozenset[int]]
     reasons: tuple[str, ...]
     """Signals that tell why something is refused; 0 is no reason."""
@@ -118,7 +118,7 @@ class OwnBrake:
 
 
 @dataclass(frozen=True, slots=True)
-class Car:
+class ByWireCar:
     """The car that the kit is in."""
 
     wheelbase_m: float
@@ -130,7 +130,7 @@ class Car:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ByWireLimits:
     """What is never exceeded on the bus; rates of pedals are of pressing."""
 
     steering_wheel_deg: float
@@ -150,14 +150,14 @@ class Profile:
     kit: Literal["dataspeed_1", "dataspeed_2"]
     commands: Literal["remote", "user"] | None
     """Which of the kit's sets of commands; None: it has one."""
-    car: Car
-    limits: Limits
+    car: ByWireCar
+    limits: ByWireLimits
     command_step_deg: float
     axes: Mapping[Axis, AxisCommand]
     gear: GearCommand
     system: SystemCommand | None
     clearing_bytes: int | None
-    reports: Mapping[str, Report]
+    reports: Mapping[str, ReportSpec]
     """By message."""
     watchdog: OwnBrake | None
     """How it is seen that the kit's watchdog brakes; None: it is not."""

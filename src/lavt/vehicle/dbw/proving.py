@@ -12,11 +12,11 @@ from typing import Final, Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.value import value
-from lavt.vehicle.can_frame import Frame
-from lavt.vehicle.dbw.adapter import Adapter
+from lavt.vehicle.can_frame import CanFrame
+from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, OwnBrake, Profile
-from lavt.vehicle.dbw.reports import Kind, Reports
+from lavt.vehicle.dbw.reports import Kind, NewestReports
 from lavt.vehicle.dbw.states import STANDING_BELOW_MPS
 
 BRAKE: Final = 0.3
@@ -38,7 +38,7 @@ Phase = Literal["looking", "enabling", "watching", "done"]
 
 
 @value
-class Seen:
+class WatchdogObservation:
     """What was seen of a kit that was left alone, in ns after the last frame that it got."""
 
     let_go_ns: int
@@ -51,7 +51,7 @@ class Seen:
     """What else the kit said about it."""
 
 
-class Proving:
+class WatchdogTest:
     """One attempt; call `receive` for each frame heard and `frames_due` each few milliseconds, until it `is_done`.
 
     In the end `failure` says why nothing is proved, or `seen` what was.
@@ -59,8 +59,8 @@ class Proving:
 
     def __init__(self, profile: Profile, watchdog: OwnBrake, *, start_ns: int) -> None:
         self._profile, self._watchdog = profile, watchdog
-        self._adapter = Adapter(profile, start_ns=start_ns)
-        self._reports = Reports(profile, start_ns)
+        self._adapter = ByWireAdapter(profile, start_ns=start_ns)
+        self._reports = NewestReports(profile, start_ns)
         self._phase: Phase = "looking"
         self._since_ns = self._tick_ns = self._last_ns = start_ns
         self._enabled_ns: int | None = None
@@ -73,7 +73,7 @@ class Proving:
         self._commands = {messages[message].identifier for message in commands}
         self._gear_command = messages[profile.gear.message].identifier
         self.failure = ""
-        self.seen: Seen | None = None
+        self.seen: WatchdogObservation | None = None
 
     @property
     def is_done(self) -> bool:
@@ -85,7 +85,7 @@ class Proving:
         """The gear that the car was left in."""
         return self._reports.gear or "unknown"
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Take a frame that was heard."""
         if frame.identifier in self._commands:
             self._fail(f"somebody else commands the kit (0x{frame.identifier:03X}): leave the bus to this program")
@@ -104,9 +104,9 @@ class Proving:
         """Hear from the port that the bus is gone."""
         self._fail(f"the bus is gone: {why}")
 
-    def frames_due(self, now_ns: int) -> list[Frame]:
+    def frames_due(self, now_ns: int) -> list[CanFrame]:
         """Give the frames that leave now."""
-        steps: dict[Phase, Callable[[int], list[Frame]]] = {
+        steps: dict[Phase, Callable[[int], list[CanFrame]]] = {
             "looking": self._look,
             "enabling": self._enable,
             "watching": self._wait,
@@ -114,7 +114,7 @@ class Proving:
         }
         return steps[self._phase](now_ns)
 
-    def _look(self, now_ns: int) -> list[Frame]:
+    def _look(self, now_ns: int) -> list[CanFrame]:
         """Wait until the kit is heard, and make sure that it may be enabled."""
         passed_ns, missing = now_ns - self._since_ns, self._reports.missing(now_ns)
         if missing:
@@ -136,7 +136,7 @@ class Proving:
             self._adapter.engage(True, now_ns)
         return []
 
-    def _enable(self, now_ns: int) -> list[Frame]:
+    def _enable(self, now_ns: int) -> list[CanFrame]:
         """Have the kit enabled, and hold it so for a while."""
         if now_ns - self._tick_ns >= TICK_NS:
             self._tick_ns = now_ns
@@ -155,7 +155,7 @@ class Proving:
             self._last_ns = now_ns
         return frames
 
-    def _wait(self, now_ns: int) -> list[Frame]:
+    def _wait(self, now_ns: int) -> list[CanFrame]:
         """Send nothing, and tell what came of it."""
         if now_ns - self._last_ns < WATCH_NS:
             return []
@@ -174,7 +174,7 @@ class Proving:
         else:
             words = "; ".join(words for kind in SAID for words in reports.said(kind))
             let_go_ns, braked_ns = self._let_go_ns - self._last_ns, self._braked_ns - self._last_ns
-            self.seen = Seen(let_go_ns, braked_ns, self._watched, words)
+            self.seen = WatchdogObservation(let_go_ns, braked_ns, self._watched, words)
             self._phase = "done"
         return []
 
@@ -189,7 +189,7 @@ class Proving:
         if not brakes and self._braked_ns is not None:
             self._fail(f"the kit braked for {(now_ns - self._braked_ns) // NS_PER_MS} ms only, and let go again")
 
-    def _brakes_itself(self, frame: Frame) -> bool | None:
+    def _brakes_itself(self, frame: CanFrame) -> bool | None:
         """Whether a report of the brake says that the kit brakes by itself; None for any other frame."""
         decoded = self._profile.codec.decode(frame)
         if decoded is None or decoded[0] != self._watchdog.message:

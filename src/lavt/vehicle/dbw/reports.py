@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, get_args
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
-from lavt.vehicle.dbw.profile import AXES, Axis, Gear, Profile, Report, Sign
+from lavt.vehicle.dbw.profile import AXES, Axis, Gear, Profile, ReportSpec, SignalCondition
 
 Values = Mapping[str, float | None]
 Kind = Literal["override", "trip", "lapse", "fault", "reason"]
@@ -19,7 +19,7 @@ FOREIGN_NS: Final = NS_PER_S
 """Ours: somebody else who commanded the kit is taken to do so for so long."""
 
 
-class Reports:
+class NewestReports:
     """The newest of each report of a profile.
 
     `counts` has the frames that could not be used: `wrong_checksum`, `value_unknown`; the codec's has the rest. And
@@ -48,7 +48,7 @@ class Reports:
         """None: one that we do not know."""
         self.enabled: frozenset[Axis] = frozenset()
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Take a frame, whatever it is."""
         if (command := self._commands.get((frame.identifier, frame.is_extended))) is not None:  # of any length
             self.counts["foreign_commands"] += 1
@@ -83,7 +83,7 @@ class Reports:
                 for kind in KINDS
             }
 
-    def _take(self, report: Report, known: Mapping[str, float], now_ns: int) -> None:
+    def _take(self, report: ReportSpec, known: Mapping[str, float], now_ns: int) -> None:
         if "speed" in known:
             self.speed_mps, self.speed_ns = known["speed"] / self._profile.speed_per_mps, now_ns
         if "angle" in known:
@@ -122,7 +122,7 @@ class Reports:
         """Tell what the newest reports say of a kind, in words, each once."""
         return self._all_said[kind]
 
-    def _read(self, message: str, report: Report, values: Values) -> dict[Kind, list[str]]:
+    def _read(self, message: str, report: ReportSpec, values: Values) -> dict[Kind, list[str]]:
         """Put a report's signs into words."""
         needs = [
             f"{message} has {signal} {self._name(message, signal, values[signal])}"
@@ -156,7 +156,7 @@ def _commands(profile: Profile) -> dict[tuple[int, bool], str]:
     return {(messages[name].identifier, messages[name].is_extended): name for name in names}
 
 
-def _shown(signs: Iterable[Sign], values: Values) -> list[str]:
+def _shown(signs: Iterable[SignalCondition], values: Values) -> list[str]:
     """Give the words of the signs that a report shows."""
     return [
         sign.words

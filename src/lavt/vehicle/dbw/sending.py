@@ -8,16 +8,16 @@ from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.value import value
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.crc8 import frame_crc8
-from lavt.vehicle.dbw.profile import AXES, TICK_LIMIT_NS, Axis, AxisCommand, Gear, Limits, Profile, SystemCommand
+from lavt.vehicle.dbw.profile import AXES, TICK_LIMIT_NS, Axis, AxisCommand, ByWireLimits, Gear, Profile, SystemCommand
 
 GEAR_PERIOD_NS = 100 * NS_PER_MS
 """A gear is asked for again so often until it is reported (ours); a kit may be at it still."""
 
 
 @value
-class Plan:
+class KitCommands:
     """What is said to the kit, besides how it is to drive."""
 
     enabled: frozenset[Axis]
@@ -29,7 +29,7 @@ class Plan:
 
 
 @value
-class Asked:
+class DriveCommand:
     """How the car is to drive: the steering wheel's angle on the bus, and pedals as fractions."""
 
     wheel_deg: float
@@ -37,13 +37,13 @@ class Asked:
     brake: float
 
 
-def limited(limits: Limits, asked: Asked, before: Asked, passed_ns: int) -> Asked:
+def limited(limits: ByWireLimits, asked: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
     """Give what of `asked` is allowed `passed_ns` after `before` was sent; with the brake there is no throttle."""
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
     wheel_deg = _within(asked.wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg)
     throttle = 0.0 if asked.brake > 0 else asked.throttle
-    return Asked(
+    return DriveCommand(
         _within(wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg),
         _within(throttle, 0.0, min(limits.throttle, before.throttle + limits.throttle_rate_per_s * passed_s)),
         _within(asked.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
@@ -54,12 +54,12 @@ def _within(number: float, least: float, most: float) -> float:
     return min(max(number, least), most)
 
 
-class Sender:
+class FrameSender:
     """Makes the frames of each set, and knows what the last one said."""
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
-        self.sent = Asked(0.0, 0.0, 0.0)
+        self.sent = DriveCommand(0.0, 0.0, 0.0)
         """What the last set asked for, where its axes were enabled."""
         self.sent_ns = start_ns
         self.counts: Counter[str] = Counter()
@@ -68,17 +68,17 @@ class Sender:
         """How many frames of each message were counted."""
         self._gear_ns: int | None = None
 
-    def frames(self, plan: Plan, asked: Asked, wheel_deg: float, now_ns: int) -> list[Frame]:
+    def frames(self, plan: KitCommands, asked: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
         """Make a set of frames; `wheel_deg` is where the steering wheel is, from which it turns once it is enabled."""
         profile, passed_ns = self._profile, now_ns - self.sent_ns
         self.sent_ns = now_ns
         self.counts["sets"] += 1
         if plan.is_clearing:
-            self.sent = Asked(wheel_deg, 0.0, 0.0)
+            self.sent = DriveCommand(wheel_deg, 0.0, 0.0)
             return self._clearing()
         allowed = limited(profile.limits, asked, self.sent, passed_ns)
         self._count_limits(asked, allowed, plan.enabled)
-        self.sent = Asked(
+        self.sent = DriveCommand(
             allowed.wheel_deg if "steering" in plan.enabled else wheel_deg,
             allowed.throttle if "throttle" in plan.enabled else 0.0,
             allowed.brake if "brake" in plan.enabled else 0.0,
@@ -94,18 +94,18 @@ class Sender:
             frames.append(self.gear_frame(plan.gear))
         return frames
 
-    def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> Frame:
+    def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> CanFrame:
         """Make an axis's command: degrees of the steering wheel, or the fraction of a pedal."""
         command = self._profile.axes[axis]
         said = {command.value: number * command.per_unit if is_enabled else 0.0, command.enable: int(is_enabled)}
         return self._frame(command.message, {**command.constants, **said, **self._next(command)}, command.checksum)
 
-    def gear_frame(self, gear: Gear) -> Frame:
+    def gear_frame(self, gear: Gear) -> CanFrame:
         """Make the command for a gear."""
         command = self._profile.gear
         return self._frame(command.message, {command.value: command.numbers[gear]}, command.checksum)
 
-    def _clearing(self) -> list[Frame]:
+    def _clearing(self) -> list[CanFrame]:
         """Make what takes back overrides: as short as the kit wants it."""
         profile, frames = self._profile, []
         for axis in AXES:
@@ -119,7 +119,7 @@ class Sender:
             frames.append(self._frame(profile.gear.message, {profile.gear.clear: 1}, profile.gear.checksum))
         return frames
 
-    def _system_frame(self, command: SystemCommand, request: Literal["enable", "disable"]) -> Frame:
+    def _system_frame(self, command: SystemCommand, request: Literal["enable", "disable"]) -> CanFrame:
         said = {command.value: command.enable if request == "enable" else command.disable}
         counted = self._counted(command.message, command.count, command.modulus)
         return self._frame(command.message, {**said, **counted}, command.checksum)
@@ -133,14 +133,14 @@ class Sender:
         self._numbers[message] += 1
         return {count: self._numbers[message] % modulus}
 
-    def _frame(self, message: str, said: Mapping[str, float], checksum: str, length: int | None = None) -> Frame:
+    def _frame(self, message: str, said: Mapping[str, float], checksum: str, length: int | None = None) -> CanFrame:
         codec = self._profile.codec
         facts, data = codec.messages[message], codec.encode(message, said, length=length)
         if checksum:  # the last byte, as the profile was checked
             data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1], extended=facts.is_extended)])
-        return Frame(facts.identifier, data, facts.is_extended)
+        return CanFrame(facts.identifier, data, facts.is_extended)
 
-    def _count_limits(self, asked: Asked, allowed: Asked, enabled: frozenset[Axis]) -> None:
+    def _count_limits(self, asked: DriveCommand, allowed: DriveCommand, enabled: frozenset[Axis]) -> None:
         changed: dict[str, tuple[Axis, bool]] = {
             "limited_wheel_deg": ("steering", asked.wheel_deg != allowed.wheel_deg),
             "limited_throttle": ("throttle", asked.throttle != allowed.throttle),

@@ -57,7 +57,7 @@ class Situation:
 
 
 @value
-class Row:
+class TransitionRow:
     """From some states, in a case, to a state; the first row that fits counts.
 
     `case` gives what happened in words, or whether it did.
@@ -98,80 +98,82 @@ def _because(now: Situation) -> str:
     return f" ({said})" if said else ""
 
 
-TABLE: Final[tuple[Row, ...]] = (
-    Row(
+TABLE: Final[tuple[TransitionRow, ...]] = (
+    TransitionRow(
         ("enabling", "engaged", "parking", "lost"),
         "the driver in the car has taken over",
         lambda now: now.overrides and f"the driver has taken over: {now.overrides}",
         "overridden",
     ),
-    Row(
+    TransitionRow(
         ("clearing", "enabling", "engaged", "parking"),
         "the bus is gone, or a report is missing",
         lambda now: now.unheard,
         "lost",
     ),
-    Row(
+    TransitionRow(
         ("enabling", "engaged", "parking"),
         "no command has left for 100 ms",
         lambda now: now.silent_ns >= COMMAND_TIMEOUT_NS,
         "lost",
     ),
-    Row(
+    TransitionRow(
         ("clearing", "enabling", "engaged"),
         "the kit reports a fault, or somebody else commands it",
         lambda now: now.faults,
         "lost",
     ),
-    Row(
+    TransitionRow(
         ("enabling", "engaged"),
         "the kit's watchdog has tripped",
         lambda now: now.trips and now.trips + _because(now),
         "lost",
     ),
-    Row(("engaged",), "the kit has let go of an axis", _let_go, "lost"),
-    Row(("engaged",), "the kit finds our commands late or wrong", lambda now: now.lapses, "lost"),
-    Row(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
-    Row(("clearing", "enabling", "engaged"), "driving is not wanted any more", lambda now: not now.wanted, "parking"),
-    Row(
+    TransitionRow(("engaged",), "the kit has let go of an axis", _let_go, "lost"),
+    TransitionRow(("engaged",), "the kit finds our commands late or wrong", lambda now: now.lapses, "lost"),
+    TransitionRow(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
+    TransitionRow(
+        ("clearing", "enabling", "engaged"), "driving is not wanted any more", lambda now: not now.wanted, "parking"
+    ),
+    TransitionRow(
         ("idle",),
         "driving is wanted, the car stands, and nothing hinders it",
         lambda now: now.wanted and now.is_standing and not now.hindrance,
         "clearing",
     ),
-    Row(
+    TransitionRow(
         ("clearing",),
         "no override and no trip is reported, at the earliest after 120 ms",
         lambda now: now.since_ns >= PAUSE_NS and not now.overrides and not now.trips,
         "enabling",
     ),
-    Row(("clearing",), "it has taken 3 s", _did_not("clear"), "lost"),
-    Row(
+    TransitionRow(("clearing",), "it has taken 3 s", _did_not("clear"), "lost"),
+    TransitionRow(
         ("enabling",),
         "all axes are reported enabled, and the gear is DRIVE",
         lambda now: len(now.enabled) == len(AXES) and now.gear == "drive",
         "engaged",
     ),
-    Row(("enabling",), "it has taken 3 s", _did_not("enable"), "lost"),
-    Row(
+    TransitionRow(("enabling",), "it has taken 3 s", _did_not("enable"), "lost"),
+    TransitionRow(
         ("parking",),
         "no axis is reported enabled, at the earliest after 120 ms",
         lambda now: now.since_ns >= PAUSE_NS and not now.enabled,
         "idle",
     ),
-    Row(
+    TransitionRow(
         ("lost",),
         "driving is not wanted any more, reports come, and an axis is still enabled",
         lambda now: not now.wanted and not now.unheard and bool(now.enabled),
         "parking",
     ),
-    Row(
+    TransitionRow(
         ("lost",),
         "driving is not wanted any more, reports come, and no axis is enabled",
         lambda now: not now.wanted and not now.unheard,
         "idle",
     ),
-    Row(
+    TransitionRow(
         ("overridden",),
         "driving is not wanted any more, and the car stands",
         lambda now: not now.wanted and now.is_standing and not now.unheard and not now.enabled,

@@ -11,7 +11,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.vehicle.can_frame import Frame, HeardFrame
+from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.codec import Codec, MessageFacts, SignalFacts
 from lavt.vehicle.dbw.crc8 import frame_crc8
 
@@ -24,7 +24,7 @@ OTHERS = (-1, False)
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
+class ExpectedMessages:
     """What a profile says of messages, for whoever listens; without one nothing is expected."""
 
     checksums: AbstractSet[str] = frozenset()
@@ -38,7 +38,7 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class MessageSummary:
     """What there is to tell of one message."""
 
     facts: MessageFacts
@@ -51,17 +51,17 @@ class Told:
     wrong: tuple[str, ...]
 
 
-class Traffic:
+class BusTraffic:
     """Listens to a bus; `unknown` counts frames of no message, by identifier (and whether it has 29 bits)."""
 
-    def __init__(self, codec: Codec, expected: Expected, *, start_ns: int) -> None:
+    def __init__(self, codec: Codec, expected: ExpectedMessages, *, start_ns: int) -> None:
         self.unknown: Counter[tuple[int, bool]] = Counter()
         self._codec, self._expected = codec, expected
         self._start_ns = self._told_ns = start_ns
         self._names = {(facts.identifier, facts.is_extended): name for name, facts in codec.messages.items()}
         self._heard = {name: _Heard() for name in codec.messages if name in expected.timeouts_ns}
 
-    def hear(self, heard: HeardFrame) -> None:
+    def hear(self, heard: ReceivedCanFrame) -> None:
         """Take a frame, whatever it is."""
         key = (heard.frame.identifier, heard.frame.is_extended)
         name = self._names.get(key)
@@ -87,7 +87,7 @@ class Traffic:
             tally.frames += 1
             tally.wrong.update(wrong)
 
-    def tell(self, now_ns: int) -> list[Told]:
+    def tell(self, now_ns: int) -> list[MessageSummary]:
         """Tell each message that was ever heard or has to come, as of now; rate, changes and wrongs since last told."""
         told = [self._told(name, message, message.lately, self._told_ns, now_ns) for name, message in self._sorted()]
         for message in self._heard.values():
@@ -95,14 +95,14 @@ class Traffic:
         self._told_ns = now_ns
         return told
 
-    def tell_all(self, now_ns: int) -> list[Told]:
+    def tell_all(self, now_ns: int) -> list[MessageSummary]:
         """The same of the whole time."""
         return [self._told(name, message, message.in_all, self._start_ns, now_ns) for name, message in self._sorted()]
 
     def _sorted(self) -> list[tuple[str, _Heard]]:
         return sorted(self._heard.items(), key=lambda item: self._codec.messages[item[0]].identifier)
 
-    def _told(self, name: str, message: _Heard, tally: _Tally, since_ns: int, now_ns: int) -> Told:
+    def _told(self, name: str, message: _Heard, tally: _Tally, since_ns: int, now_ns: int) -> MessageSummary:
         wrong = [words if count == 1 else f"{words} ({count} times)" for words, count in tally.wrong.items()]
         timeout_ns = self._expected.timeouts_ns.get(name)
         if message.last_ns is None:
@@ -112,7 +112,7 @@ class Traffic:
             if silent_ns > timeout_ns:
                 wrong.append(f"silent for {silent_ns // NS_PER_MS} ms, longer than {timeout_ns // NS_PER_MS} ms")
         ignored = self._expected.checksums | self._expected.counters
-        return Told(
+        return MessageSummary(
             facts=self._codec.messages[name],
             frames=message.in_all.frames,
             rate_hz=tally.frames * NS_PER_S / max(1, now_ns - since_ns),
@@ -121,7 +121,7 @@ class Traffic:
             wrong=tuple(wrong),
         )
 
-    def _wrong(self, frame: Frame, facts: MessageFacts) -> list[str]:
+    def _wrong(self, frame: CanFrame, facts: MessageFacts) -> list[str]:
         """What is wrong with a frame as a whole."""
         length = len(frame.data)
         if length != facts.length:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent, VehicleState
-from lavt.vehicle.can_frame import BusGone, Frame, Port
-from lavt.vehicle.vehicle import Capabilities, Reached
+from lavt.vehicle.can_frame import BusGone, BusPort, CanFrame
+from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 HEAR_PERIOD_NS = 10 * NS_PER_MS
 """So often the bus is listened to; a kit's fastest report comes as often."""
 
 
-class Adapter(Protocol):
+class KitAdapter(Protocol):
     """What speaks to a kind of kit, sans-IO: frames and times in, frames out."""
 
     @property
@@ -26,7 +26,7 @@ class Adapter(Protocol):
         """Whether nothing is sent: the kit has let go, or a driver has the car."""
         ...
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Take a frame from the bus, whatever it is."""
         ...
 
@@ -42,7 +42,7 @@ class Adapter(Protocol):
         """Get the kit to obey, or let go of it."""
         ...
 
-    def frames_due(self, now_ns: int) -> list[Frame]:
+    def frames_due(self, now_ns: int) -> list[CanFrame]:
         """Give the frames that have to leave now, of the newest tick."""
         ...
 
@@ -58,7 +58,7 @@ class Adapter(Protocol):
         """Take what has happened since the last call."""
         ...
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Take what was seen to have reached the wheels since the last call."""
         ...
 
@@ -71,7 +71,13 @@ class DbwVehicle:
     """A `lavt.vehicle.vehicle.Vehicle`. Frames leave in `advance` and `apply` only: of the tick that is being made."""
 
     def __init__(
-        self, adapter: Adapter, port: Port, capabilities: Capabilities, *, start_ns: int, truth: Truth | None = None
+        self,
+        adapter: KitAdapter,
+        port: BusPort,
+        capabilities: Capabilities,
+        *,
+        start_ns: int,
+        truth: Truth | None = None,
     ) -> None:
         self._adapter, self._port, self._truth = adapter, port, truth
         self._capabilities = capabilities
@@ -124,7 +130,7 @@ class DbwVehicle:
         """Get the kit to obey, or let go of it once the car stands."""
         self._adapter.engage(wanted, now_ns)
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Take what the kit has reported to steer by since the last call."""
         return self._adapter.take_reached()
 

@@ -81,7 +81,7 @@ class CarMotion:
     brake: float = 0.0
 
 
-class Car:
+class CarDynamics:
     """A car with parameters, stepped in time steps of one length."""
 
     def __init__(self, parameters: CarParameters, motion: CarMotion, step_s: float) -> None:

@@ -32,7 +32,7 @@ Place = tuple[float, float, float]
 
 
 @value
-class Track:
+class TrackingError:
     """A car against the centre of its lane; see `GroundTruth` for what is measured where."""
 
     cross_track_m: float
@@ -45,7 +45,7 @@ def time_limit_s(length_m: float) -> float:
     return length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
 
 
-class Judge:
+class RouteMonitor:
     """Judges one drive; each ending happens once, lanes are left and rails are touched as often as they are."""
 
     def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
@@ -61,14 +61,14 @@ class Judge:
         self._near_s_m = near_s_m
         self._touched_ns: int | None = None
         self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
-        self._quiet = _Quiet(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
+        self._quiet = _QuietInterval(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
         """Where the body touches a rail at the moment judged last."""
 
-    def track(self, motion: CarMotion) -> Track:
+    def track(self, motion: CarMotion) -> TrackingError:
         """Measure the rear axle against the centre of the lane."""
         s_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
-        return Track(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
+        return TrackingError(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
 
     def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Tell what has happened since the last call; call it at every step."""
@@ -162,7 +162,7 @@ class Judge:
         )
 
 
-class _Quiet:
+class _QuietInterval:
     """Knows for how far nothing can happen: until a point of the body may have reached the nearest line that counts.
 
     Lines that count are edges of lanes and of asphalt, rails, the stations where these begin and end, and the end of

@@ -7,11 +7,11 @@ from collections import deque
 
 from lavt.domain import NS_PER_S, Actuation, GroundTruth, Pose, VehicleEvent, VehicleState
 from lavt.streams import stream
-from lavt.vehicle.sim.dynamics import Car, CarMotion, CarParameters
+from lavt.vehicle.sim.dynamics import CarDynamics, CarMotion, CarParameters
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 from lavt.vehicle.sim.road.road import Road
-from lavt.vehicle.sim.route_monitor import Judge
-from lavt.vehicle.vehicle import Capabilities, Reached
+from lavt.vehicle.sim.route_monitor import RouteMonitor
+from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 STEPS_PER_S = 240
 
@@ -62,8 +62,8 @@ class Simulator:
         ahead_m, lateral_m, turned_rad = start_of(seed)
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
-        self._car = Car(parameters, motion, 1.0 / STEPS_PER_S)
-        self._judge = Judge(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
+        self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)
+        self._judge = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
         self._judge.judge(motion, grid_ns(self._index))
         self._actuation = AT_REST
         self._steering: deque[tuple[int, float]] = deque()
@@ -123,7 +123,7 @@ class Simulator:
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Do nothing: it always obeys."""
 
-    def take_reached(self) -> list[Reached]:
+    def take_reached(self) -> list[ReachedCommand]:
         """Tell nothing: what is applied is in force after the dead times."""
         return []
 

@@ -6,7 +6,7 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.software_car.generations import Generation
-from lavt.vehicle.software_car.state import AXES, Axis, KitState, Reason, System, SystemOrder
+from lavt.vehicle.software_car.state import AXES, Axis, KitState, ReleaseReason, SystemOrder, SystemState
 
 COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
 """An actuator disables itself this long after its last valid command; a request to enable is as old at most."""
@@ -25,7 +25,7 @@ class Authority:
 
     def __init__(self, state: KitState, generation: Generation, *, has_watchdog: bool) -> None:
         self._state, self._generation, self.has_watchdog = state, generation, has_watchdog
-        self.hindrance = Reason.NONE
+        self.hindrance = ReleaseReason.NONE
         """Why generation 2 is not ready, if nothing in the state says so."""
         self._system_count: int | None = None
         self._asked_ns: int | None = None
@@ -42,8 +42,8 @@ class Authority:
             self._asked_ns, self._is_asked = now_ns, not self._is_spent
             return
         self._asked_ns, self._is_asked, self._is_spent = None, False, False
-        if order.request == DISABLE and self._state.system == System.ACTIVE:
-            self.lose("steering", Reason.ASKED)
+        if order.request == DISABLE and self._state.system == SystemState.ACTIVE:
+            self.lose("steering", ReleaseReason.ASKED)
 
     def live(self, now_ns: int) -> None:
         """Forget a request to enable that is too old."""
@@ -55,33 +55,35 @@ class Authority:
         state = self._state
         for axis in AXES:
             if not state.actuators[axis].may_be_enabled:
-                self.lose(axis, Reason.FAULT if state.actuators[axis].faults else Reason.DISABLED)
+                self.lose(axis, ReleaseReason.FAULT if state.actuators[axis].faults else ReleaseReason.DISABLED)
         state.not_ready = self._why_not_ready()
-        if state.not_ready != Reason.NONE and self._generation.is_one_system:
+        if state.not_ready != ReleaseReason.NONE and self._generation.is_one_system:
             self.lose("steering", state.not_ready)
-        ready = [axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == Reason.NONE]
+        ready = [
+            axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == ReleaseReason.NONE
+        ]
         if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_asked):
             self._enable(ready)
         state.system = self._system_state()
         state.throttle, state.brake = self._pedals()
 
-    def _why_not_ready(self) -> Reason:
+    def _why_not_ready(self) -> ReleaseReason:
         """Tell what hinders the kit as a whole."""
         state = self._state
-        if state.watchdog != Reason.NONE or not self._generation.is_one_system:
+        if state.watchdog != ReleaseReason.NONE or not self._generation.is_one_system:
             return state.watchdog
         if state.gear_faults or any(actuator.faults for actuator in state.actuators.values()):
-            return Reason.FAULT
+            return ReleaseReason.FAULT
         if state.is_overridden:
-            return Reason.OVERRIDE
-        return Reason.REMOTE if state.remote_state <= PAUSED else self.hindrance
+            return ReleaseReason.OVERRIDE
+        return ReleaseReason.REMOTE if state.remote_state <= PAUSED else self.hindrance
 
-    def _system_state(self) -> System:
+    def _system_state(self) -> SystemState:
         if self._state.actuators["steering"].is_enabled:
-            return System.ACTIVE
-        if self._state.watchdog != Reason.NONE or self._state.not_ready == Reason.FAULT:
-            return System.FAULT
-        return System.READY if self._state.not_ready == Reason.NONE else System.MANUAL
+            return SystemState.ACTIVE
+        if self._state.watchdog != ReleaseReason.NONE or self._state.not_ready == ReleaseReason.FAULT:
+            return SystemState.FAULT
+        return SystemState.READY if self._state.not_ready == ReleaseReason.NONE else SystemState.MANUAL
 
     def _enable(self, axes: list[Axis]) -> None:
         for axis in axes:
@@ -89,13 +91,13 @@ class Authority:
                 self._state.held_rad = self._state.wheel_rad
             self._state.actuators[axis].is_enabled = True
 
-    def lose(self, axis: Axis, reason: Reason) -> None:
+    def lose(self, axis: Axis, reason: ReleaseReason) -> None:
         """Let go of an enabled axis: with the watchdog's brakes, unless somebody wanted it or has taken over."""
         state = self._state
         if not state.actuators[axis].is_enabled:
             return
-        is_wanted = reason in {Reason.ASKED, Reason.OVERRIDE} or (
-            reason == Reason.DISABLED
+        is_wanted = reason in {ReleaseReason.ASKED, ReleaseReason.OVERRIDE} or (
+            reason == ReleaseReason.DISABLED
             and (self._generation.is_one_system or (state.is_standing and not state.is_in_gear))
         )
         is_trip = self.has_watchdog and not is_wanted and not state.is_overridden
@@ -110,7 +112,7 @@ class Authority:
 
     def override(self, axis: Axis) -> None:
         """Latch that the driver has taken an axis over, and let go of it."""
-        self.lose(axis, Reason.OVERRIDE)
+        self.lose(axis, ReleaseReason.OVERRIDE)
         self._state.actuators[axis].is_overridden = True
 
     def clear(self, axis: Axis) -> None:
@@ -121,7 +123,7 @@ class Authority:
         if self._generation.is_one_system:  # its command for the gear has no such bit
             state.is_gear_overridden = False
         if not state.watchdog_brakes:
-            state.watchdog, state.watchdog_axis = Reason.NONE, None
+            state.watchdog, state.watchdog_axis = ReleaseReason.NONE, None
 
     def _pedals(self) -> tuple[float, float]:
         """Give throttle and brake: the kit's and the driver's, whichever is more; without a gear nothing drives."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lavt.domain import Actuation, VehicleEvent
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.kit import Kit
 
@@ -20,9 +20,9 @@ class SoftwareCar:
         """What has happened to the car so far."""
         self._applied: Actuation | None = None
 
-    def advance(self, to_ns: int) -> list[Frame]:
+    def advance(self, to_ns: int) -> list[CanFrame]:
         """Live on to a time and give the frames that left on the way, in order; they say nothing of their times."""
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         while (wake_ns := self.next_wake_ns()) <= to_ns:
             self.events += self.simulator.advance(wake_ns)
             self.kit.sense(self.simulator.state(), wake_ns)
@@ -33,7 +33,7 @@ class SoftwareCar:
                 self._applied = actuation
         return frames
 
-    def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
+    def receive(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
         """Take a frame from the bus at a time, and give those that left until then."""
         left = self.advance(now_ns)
         self.kit.receive(frame, now_ns)

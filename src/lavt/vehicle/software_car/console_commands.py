@@ -19,7 +19,7 @@ LONGEST_SHOWN = 40
 
 
 @value
-class Word:
+class ConsoleCommand:
     """A word, what it takes, and what it does to a kit at a time."""
 
     takes: str
@@ -49,64 +49,64 @@ def switch(text: str) -> int:
     return SWITCH[known(text, set(SWITCH), "state of the remote's switch")]
 
 
-WORDS: Final[dict[str, Word]] = {
-    "driver_steers": Word(
+WORDS: Final[dict[str, ConsoleCommand]] = {
+    "driver_steers": ConsoleCommand(
         "NM", "hands on the wheel, with so much torque, left positive",
         lambda kit, text, now_ns: kit.driver_steers(number(text), now_ns),
     ),
-    "driver_brakes": Word(
+    "driver_brakes": ConsoleCommand(
         "FRACTION", "a foot on the brake, 0 to 1",
         lambda kit, text, now_ns: kit.driver_brakes(number(text), now_ns),
     ),
-    "driver_throttles": Word(
+    "driver_throttles": ConsoleCommand(
         "FRACTION", "a foot on the throttle, 0 to 1",
         lambda kit, text, now_ns: kit.driver_throttles(number(text), now_ns),
     ),
-    "driver_shifts": Word(
+    "driver_shifts": ConsoleCommand(
         "GEAR", "PARK, NEUTRAL or DRIVE by the shifter",
         lambda kit, text, now_ns: kit.driver_shifts(gear(text), now_ns),
     ),
-    "fault": Word(
+    "fault": ConsoleCommand(
         "PART.BIT", "break a part, as in steering.FLTPWR",
         lambda kit, text, now_ns: kit.set_fault(text, now_ns),
     ),
-    "mend": Word(
+    "mend": ConsoleCommand(
         "PART.BIT", "mend it",
         lambda kit, text, now_ns: kit.set_fault(text, now_ns, is_set=False),
     ),
-    "unknown": Word(
+    "unknown": ConsoleCommand(
         "VALUE", "report angle, speed or wheel_speed as unknown",
         lambda kit, text, _: kit.set_unknown(text),
     ),
-    "known": Word(
+    "known": ConsoleCommand(
         "VALUE", "report it again",
         lambda kit, text, _: kit.set_unknown(text, is_unknown=False),
     ),
-    "hinder": Word(
+    "hinder": ConsoleCommand(
         "WHAT", "generation 2 is not ready, because of: seat belt, door, speed, acceleration, reverse",
         lambda kit, text, now_ns: kit.hinder(text, now_ns),
     ),
-    "unhinder": Word(
+    "unhinder": ConsoleCommand(
         "", "it is ready again",
         lambda kit, _, now_ns: kit.hinder(None, now_ns),
     ),
-    "switch_remote": Word(
+    "switch_remote": ConsoleCommand(
         "STATE", f"the remote's switch: {', '.join(SWITCH)}",
         lambda kit, text, now_ns: kit.switch_remote(switch(text), now_ns),
     ),
-    "bus_off": Word(
+    "bus_off": ConsoleCommand(
         "", "the kit says and hears nothing any more",
         lambda kit, _, now_ns: kit.bus_off(now_ns),
     ),
-    "bus_on": Word(
+    "bus_on": ConsoleCommand(
         "", "it does again",
         lambda kit, _, now_ns: kit.bus_off(now_ns, is_off=False),
     ),
-    "no_watchdog": Word(
+    "no_watchdog": ConsoleCommand(
         "", "a kit without the watchdog that brakes",
         lambda kit, _, now_ns: kit.switch_watchdog(now_ns, is_there=False),
     ),
-    "watchdog": Word(
+    "watchdog": ConsoleCommand(
         "", "with it again",
         lambda kit, _, now_ns: kit.switch_watchdog(now_ns),
     ),

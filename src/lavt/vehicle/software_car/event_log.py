@@ -6,11 +6,11 @@ from collections.abc import Callable, Hashable
 from typing import Any, Final
 
 from lavt.value import value
-from lavt.vehicle.software_car.state import AXES, KitState, Reason, Reject
+from lavt.vehicle.software_car.state import AXES, GearRejection, KitState, ReleaseReason
 
 
 @value
-class News:
+class KitEvent:
     """Something that happened at a time of the machine's monotonic clock."""
 
     mono_ns: int
@@ -20,27 +20,27 @@ class News:
 
 
 REASONS: Final = {
-    Reason.NONE: "nothing",
-    Reason.TIMEOUT: "no command in time",
-    Reason.CRC: "a wrong checksum",
-    Reason.COUNTER: "a wrong counter",
-    Reason.OVERRIDE: "the driver has taken over",
-    Reason.SEAT_BELT: "the seat belt is open",
-    Reason.DOOR: "a door is open",
-    Reason.LOCKOUT_SPEED: "locked out by the speed",
-    Reason.LOCKOUT_ACCELERATION: "locked out by the acceleration",
-    Reason.LOCKOUT_REVERSE: "locked out by the reverse gear",
-    Reason.ASKED: "it was asked to",
-    Reason.DISABLED: "a command without its enable bit, or none",
-    Reason.FAULT: "a fault",
-    Reason.REMOTE: "the remote's switch",
+    ReleaseReason.NONE: "nothing",
+    ReleaseReason.TIMEOUT: "no command in time",
+    ReleaseReason.CRC: "a wrong checksum",
+    ReleaseReason.COUNTER: "a wrong counter",
+    ReleaseReason.OVERRIDE: "the driver has taken over",
+    ReleaseReason.SEAT_BELT: "the seat belt is open",
+    ReleaseReason.DOOR: "a door is open",
+    ReleaseReason.LOCKOUT_SPEED: "locked out by the speed",
+    ReleaseReason.LOCKOUT_ACCELERATION: "locked out by the acceleration",
+    ReleaseReason.LOCKOUT_REVERSE: "locked out by the reverse gear",
+    ReleaseReason.ASKED: "it was asked to",
+    ReleaseReason.DISABLED: "a command without its enable bit, or none",
+    ReleaseReason.FAULT: "a fault",
+    ReleaseReason.REMOTE: "the remote's switch",
 }
 REJECTS: Final = {
-    Reject.IN_PROGRESS: "it is shifting",
-    Reject.OVERRIDE: "the driver has moved the shifter",
-    Reject.VEHICLE: "the brake is not pressed, or the car moves",
-    Reject.UNSUPPORTED: "this car has no such gear",
-    Reject.FAULT: "a fault",
+    GearRejection.IN_PROGRESS: "it is shifting",
+    GearRejection.OVERRIDE: "the driver has moved the shifter",
+    GearRejection.VEHICLE: "the brake is not pressed, or the car moves",
+    GearRejection.UNSUPPORTED: "this car has no such gear",
+    GearRejection.FAULT: "a fault",
 }
 
 
@@ -76,7 +76,7 @@ def _of_refused(state: KitState, _: Any) -> str:
 
 
 def _of_watchdog(state: KitState, _: Any) -> str:
-    if state.watchdog == Reason.NONE:
+    if state.watchdog == ReleaseReason.NONE:
         return "watchdog cleared"
     why = f"{REASONS[state.watchdog]} ({state.watchdog_axis})"
     return (
@@ -85,7 +85,7 @@ def _of_watchdog(state: KitState, _: Any) -> str:
 
 
 def _of_readiness(state: KitState, _: Any) -> str:
-    return f"not ready: {REASONS[state.not_ready]}" if state.not_ready != Reason.NONE else "ready"
+    return f"not ready: {REASONS[state.not_ready]}" if state.not_ready != ReleaseReason.NONE else "ready"
 
 
 TOLD: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, Any], str]]]] = {
@@ -99,17 +99,17 @@ TOLD: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, 
 """By kind: what is looked at, and the words for it once it has changed, from the state and what was seen before."""
 
 
-class Onlooker:
+class StateObserver:
     """Looks at a kit again and again and tells what has changed."""
 
     def __init__(self, state: KitState) -> None:
         self._seen = [look(state) for look, _ in TOLD.values()]
 
-    def look(self, state: KitState, now_ns: int) -> list[News]:
+    def look(self, state: KitState, now_ns: int) -> list[KitEvent]:
         """Tell what has changed since the last look."""
         seen = [look(state) for look, _ in TOLD.values()]
         if seen == self._seen:
             return []
         before, self._seen = self._seen, seen
         told = zip(TOLD.items(), before, seen, strict=True)
-        return [News(now_ns, kind, words(state, was)) for (kind, (_, words)), was, now in told if was != now]
+        return [KitEvent(now_ns, kind, words(state, was)) for (kind, (_, words)), was, now in told if was != now]

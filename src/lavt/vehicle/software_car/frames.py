@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lavt.value import value
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 
 
 @value
@@ -79,7 +79,7 @@ def sealed(identifier: int, data: bytes) -> bytes:
     return data[:-1] + bytes([checksum(identifier, data[:-1])])
 
 
-def is_sealed(frame: Frame) -> bool:
+def is_sealed(frame: CanFrame) -> bool:
     """Tell whether the last byte is the right checksum."""
     return bool(frame.data) and frame.data[-1] == checksum(
         frame.identifier, frame.data[:-1], is_extended=frame.is_extended

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, KitState, Reject
+from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, GearRejection, KitState
 
 GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
 """Ours: the simulator's car has no reverse and no low gear."""
@@ -17,20 +17,20 @@ def shift(state: KitState, order: GearOrder) -> None:
     if order.is_clearing:
         state.is_gear_overridden = False
     state.gear_order, state.gear_reject = order.gear, reject(state, order.gear)
-    if order.gear != Gear.NONE and state.gear_reject == Reject.NONE:
+    if order.gear != Gear.NONE and state.gear_reject == GearRejection.NONE:
         state.gear = Gear(order.gear)
 
 
-def reject(state: KitState, gear: int) -> Reject:
+def reject(state: KitState, gear: int) -> GearRejection:
     """Tell why a gear cannot be had now."""
     if gear in {Gear.NONE, state.gear}:
-        return Reject.NONE
+        return GearRejection.NONE
     if state.gear_faults:
-        return Reject.FAULT
+        return GearRejection.FAULT
     if state.is_gear_overridden:
-        return Reject.OVERRIDE
+        return GearRejection.OVERRIDE
     if gear not in GEARS:
-        return Reject.UNSUPPORTED
+        return GearRejection.UNSUPPORTED
     if state.brake < OVERRIDE_PEDAL or (gear == Gear.PARK and not state.is_standing):
-        return Reject.VEHICLE
-    return Reject.NONE
+        return GearRejection.VEHICLE
+    return GearRejection.NONE

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.frames import Field, Layout, pack, unpack
 from lavt.vehicle.software_car.mechanics import (
     Mechanics,
@@ -14,7 +14,7 @@ from lavt.vehicle.software_car.mechanics import (
     wheel_angle,
     within,
 )
-from lavt.vehicle.software_car.state import AXES, Axis, GearOrder, KitState, Order, Reason, SystemOrder
+from lavt.vehicle.software_car.state import AXES, Axis, GearOrder, KitState, Order, ReleaseReason, SystemOrder
 
 FULL_PEDAL = 65535
 FULL_TORQUE_NM = 3412
@@ -105,10 +105,12 @@ FAULTS: dict[str, tuple[str, ...]] = {
 PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
 """From where to where a pedal goes, as a fraction of its number (CMD_TYPE 1)."""
 
-SOURCES: dict[tuple[Axis, Reason], int] = {
+SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
     (axis, reason): 1 + 4 * place + kind
     for place, axis in enumerate(AXES)
-    for kind, reason in enumerate((Reason.COUNTER, Reason.DISABLED, Reason.TIMEOUT, Reason.FAULT))
+    for kind, reason in enumerate(
+        (ReleaseReason.COUNTER, ReleaseReason.DISABLED, ReleaseReason.TIMEOUT, ReleaseReason.FAULT)
+    )
 }
 """Numbers of the watchdog's sources, 1 to 15: the facts give the range and the kinds, the numbers are ours."""
 
@@ -127,7 +129,7 @@ def pedal_fraction(axis: Axis, kind: int, command: int, mechanics: Mechanics) ->
     return None
 
 
-def read(frame: Frame, mechanics: Mechanics, _: bool) -> Order | GearOrder | SystemOrder | None:
+def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | SystemOrder | None:
     """Give what a frame orders; None for one that is not for the kit."""
     if frame.is_extended:
         return None
@@ -166,7 +168,7 @@ def flags(state: KitState, axis: Axis) -> dict[str, int]:
     return {
         "enabled": actuator.is_enabled,
         "override": actuator.is_overridden,
-        "FLTWDC": state.watchdog != Reason.NONE,
+        "FLTWDC": state.watchdog != ReleaseReason.NONE,
         "timeout": actuator.has_timed_out,
         **dict.fromkeys(actuator.faults, 1),
     }

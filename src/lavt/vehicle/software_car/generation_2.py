@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.frames import is_sealed, pack, sealed, unpack
 from lavt.vehicle.software_car.generation_2_layouts import (
     GEAR_COMMAND,
@@ -28,7 +28,7 @@ from lavt.vehicle.software_car.state import (
     GearOrder,
     KitState,
     Order,
-    Reason,
+    ReleaseReason,
     SystemOrder,
 )
 
@@ -53,7 +53,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def read(frame: Frame, mechanics: Mechanics, is_remote: bool) -> Order | GearOrder | SystemOrder | None:
+def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | GearOrder | SystemOrder | None:
     """Give what a frame orders; None for one that is not for the kit, or is of the other set."""
     if frame.is_extended:
         return None
@@ -137,9 +137,9 @@ def gear_report(state: KitState, _: Mechanics) -> dict[str, int]:
     }
 
 
-def reported(reason: Reason) -> int:
+def reported(reason: ReleaseReason) -> int:
     """Give the number of a reason; 0 for one that the facts do not name."""
-    return reason if reason <= Reason.LOCKOUT_REVERSE else 0
+    return reason if reason <= ReleaseReason.LOCKOUT_REVERSE else 0
 
 
 def system_report(state: KitState, _: Mechanics) -> dict[str, int]:

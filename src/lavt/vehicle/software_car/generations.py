@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from lavt.value import value
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
 from lavt.vehicle.software_car.state import GearOrder, KitState, Order, SystemOrder
@@ -16,7 +16,7 @@ from lavt.vehicle.software_car.state import GearOrder, KitState, Order, SystemOr
 class Generation:
     """What a kit of one generation reads, writes and demands."""
 
-    read: Callable[[Frame, Mechanics, bool], Order | GearOrder | SystemOrder | None]
+    read: Callable[[CanFrame, Mechanics, bool], Order | GearOrder | SystemOrder | None]
     reports: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]]
     """By identifier: every how many milliseconds, and what."""
     faults: dict[str, tuple[str, ...]]

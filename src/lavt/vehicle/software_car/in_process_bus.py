@@ -7,29 +7,29 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from lavt.domain import NS_PER_US, GroundTruth, VehicleEvent
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame
+from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.software_car.car import SoftwareCar
 
 FRAME_NS: Final = 250 * NS_PER_US
 """What a frame of 8 bytes takes at 500 kbit/s: 125 bits, of 111 to 135 with its stuff bits."""
 
 
-class Wire:
+class BusDirection:
     """One direction of a bus: frames come one after another, each `delay_ns` after it left or after the one before."""
 
     def __init__(self, delay_ns: int) -> None:
         self._delay_ns, self._free_ns = delay_ns, 0
-        self._frames: deque[HeardFrame] = deque()
+        self._frames: deque[ReceivedCanFrame] = deque()
 
-    def put(self, frames: Sequence[Frame], now_ns: int) -> None:
+    def put(self, frames: Sequence[CanFrame], now_ns: int) -> None:
         """Let frames leave at a time."""
         for frame in frames:
             self._free_ns = max(self._free_ns, now_ns) + self._delay_ns
-            self._frames.append(HeardFrame(frame, self._free_ns))
+            self._frames.append(ReceivedCanFrame(frame, self._free_ns))
 
-    def come(self, now_ns: int) -> list[HeardFrame]:
+    def come(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Take those that have come by a time."""
-        came: list[HeardFrame] = []
+        came: list[ReceivedCanFrame] = []
         while self._frames and self._frames[0].arrived_ns <= now_ns:
             came.append(self._frames.popleft())
         return came
@@ -47,7 +47,7 @@ class Wire:
         self._frames.clear()
 
 
-class InsidePort:
+class InProcessPort:
     """A `lavt.vehicle.can_frame.Port` to a software car that lives when somebody looks.
 
     It reads no clock: the same calls give the same frames at the same times, and how often it is asked makes no
@@ -56,7 +56,7 @@ class InsidePort:
 
     def __init__(self, car: SoftwareCar, *, delay_ns: int = FRAME_NS) -> None:
         self.car = car
-        self._there, self._back = Wire(delay_ns), Wire(delay_ns)
+        self._there, self._back = BusDirection(delay_ns), BusDirection(delay_ns)
         self._now_ns = 0
         """Until when the car has lived."""
         self._told = 0
@@ -68,13 +68,13 @@ class InsidePort:
         """Nothing is counted: nothing gets lost by itself."""
         return {}
 
-    def send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         """Send frames that were made at a time; raises `BusGone` while the bus is cut."""
         if self._cut:
             raise BusGone(self._cut)
         self._there.put(frames, max(made_ns, self._now_ns))
 
-    def take(self, now_ns: int) -> list[HeardFrame]:
+    def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Let the car live on to a time and take what has come from it by then; raises `BusGone` as `send` does."""
         self._live(now_ns)
         if self._cut:

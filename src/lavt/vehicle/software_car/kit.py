@@ -10,7 +10,7 @@ from typing import Final, Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import Frame
+from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.authority import COMMAND_TIMEOUT_NS, CONTROL_ALLOWED, REMOTE, Authority
 from lavt.vehicle.software_car.gearbox import GEARS, shift
 from lavt.vehicle.software_car.generations import GENERATIONS
@@ -23,18 +23,18 @@ from lavt.vehicle.software_car.state import (
     GearOrder,
     KitState,
     Order,
-    Reason,
+    ReleaseReason,
     SystemOrder,
 )
 
 OVERRIDE_TORQUE_NM: Final = 2.0
 """Ours: from where on hands are an override."""
 HINDRANCES: Final = {
-    "seat belt": Reason.SEAT_BELT,
-    "door": Reason.DOOR,
-    "speed": Reason.LOCKOUT_SPEED,
-    "acceleration": Reason.LOCKOUT_ACCELERATION,
-    "reverse": Reason.LOCKOUT_REVERSE,
+    "seat belt": ReleaseReason.SEAT_BELT,
+    "door": ReleaseReason.DOOR,
+    "speed": ReleaseReason.LOCKOUT_SPEED,
+    "acceleration": ReleaseReason.LOCKOUT_ACCELERATION,
+    "reverse": ReleaseReason.LOCKOUT_REVERSE,
 }
 REPORTED: Final = {"angle", "speed", "wheel_speed"}
 
@@ -75,7 +75,7 @@ class Kit:
 
     # What comes from the bus.
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: CanFrame, now_ns: int) -> None:
         """Take a frame from the bus; what is not for the kit is dropped."""
         self._live(now_ns)
         if self._is_bus_off:
@@ -94,14 +94,14 @@ class Kit:
         actuator = self.state.actuators[order.axis]
         if not order.is_valid:
             actuator.is_crc_bad = True
-            self._authority.lose(order.axis, Reason.CRC)
+            self._authority.lose(order.axis, ReleaseReason.CRC)
             return
         actuator.is_crc_bad = False
         if order.count is not None:
             before, actuator.count = actuator.count, order.count
             actuator.is_count_bad = not self._follows(before, order.count)
             if actuator.is_count_bad:
-                self._authority.lose(order.axis, Reason.COUNTER)
+                self._authority.lose(order.axis, ReleaseReason.COUNTER)
                 return
         if order.is_clearing:
             self._authority.clear(order.axis)
@@ -124,7 +124,7 @@ class Kit:
             actuator = state.actuators[axis]
             self._turn(end_ns)
             actuator.has_timed_out = actuator.order is not None and actuator.order.is_enabling
-            self._authority.lose(axis, Reason.TIMEOUT)
+            self._authority.lose(axis, ReleaseReason.TIMEOUT)
             actuator.order = None
             self._authority.settle()
         self._authority.live(now_ns)
@@ -149,7 +149,7 @@ class Kit:
 
     # What goes out.
 
-    def frames_due(self, now_ns: int) -> list[Frame]:
+    def frames_due(self, now_ns: int) -> list[CanFrame]:
         """Give the reports that are due, each once however late the call is."""
         self._live(now_ns)
         if now_ns < self._next_due_ns:
@@ -160,7 +160,7 @@ class Kit:
             if late_ns >= 0:
                 period_ns = period_ms * NS_PER_MS
                 self._due_ns[identifier] += (late_ns // period_ns + 1) * period_ns
-                frames.append(Frame(identifier, make(self.state, self._mechanics)))
+                frames.append(CanFrame(identifier, make(self.state, self._mechanics)))
                 self.state.sent[identifier] = self.state.sent.get(identifier, 0) + 1
         self._next_due_ns = min(self._due_ns.values())
         return [] if self._is_bus_off else frames
@@ -214,7 +214,7 @@ class Kit:
         state.gear = gear
         if any(actuator.is_enabled for actuator in state.actuators.values()):
             if self._generation.is_one_system:
-                self._authority.lose("steering", Reason.OVERRIDE)
+                self._authority.lose("steering", ReleaseReason.OVERRIDE)
             state.is_gear_overridden = True
         state.watchdog_brakes = False
         self._authority.settle()
@@ -239,7 +239,7 @@ class Kit:
         """Let generation 2 have a reason not to be ready, one of `HINDRANCES`; None takes it away."""
         self._live(now_ns)
         self._authority.hindrance = (
-            Reason.NONE if name is None else HINDRANCES[known(name, set(HINDRANCES), "hindrance")]
+            ReleaseReason.NONE if name is None else HINDRANCES[known(name, set(HINDRANCES), "hindrance")]
         )
         self._authority.settle()
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
-from lavt.vehicle.can_frame import BusGone, Frame, HeardFrame, Port
+from lavt.vehicle.can_frame import BusGone, BusPort, CanFrame, ReceivedCanFrame
 from lavt.vehicle.ground_truth_wire import TruthSender
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.console_commands import HELP, act, help_lines
-from lavt.vehicle.software_car.event_log import News, Onlooker
+from lavt.vehicle.software_car.event_log import KitEvent, StateObserver
 
 
 class Runner:
@@ -22,15 +22,15 @@ class Runner:
     that a port can refuse those that are too old.
     """
 
-    def __init__(self, car: SoftwareCar, port: Port, *, start_ns: int) -> None:
+    def __init__(self, car: SoftwareCar, port: BusPort, *, start_ns: int) -> None:
         self._car, self._port = car, port
         self._now_ns = self._told_ns = start_ns
         self._events = self._events_told = 0
         """How many events of the car are in the news, and in the truth."""
         self._sender = TruthSender(start_ns)
-        self._onlooker = Onlooker(car.kit.state)
+        self._onlooker = StateObserver(car.kit.state)
         self._is_lost, self._lost_ns = False, 0
-        self._news: list[News] = []
+        self._news: list[KitEvent] = []
         self.counts: Counter[str] = Counter(frames_sent=0, frames_heard=0, frames_lost=0)
         self.latest_ns = 0
         """How late a step was at worst."""
@@ -57,14 +57,14 @@ class Runner:
             return
         self.step(now_ns)
         if word == HELP:
-            self._news += [News(now_ns, "help", each) for each in help_lines()]
+            self._news += [KitEvent(now_ns, "help", each) for each in help_lines()]
             return
         try:
             act(self._car.kit, word, now_ns)
         except UserError as error:
-            self._news.append(News(now_ns, "refused", str(error)))
+            self._news.append(KitEvent(now_ns, "refused", str(error)))
             return
-        self._news.append(News(now_ns, "done", word))
+        self._news.append(KitEvent(now_ns, "done", word))
         self._look(now_ns)
 
     def truth(self) -> bytes | None:
@@ -76,7 +76,7 @@ class Runner:
         told, self._events_told = self._events_told, len(self._car.events)
         return self._sender.datagram(truth, self._car.events[told:])
 
-    def take_news(self) -> list[News]:
+    def take_news(self) -> list[KitEvent]:
         """Take what has happened since the last call."""
         news, self._news = self._news, []
         return news
@@ -94,17 +94,17 @@ class Runner:
         """See what has happened."""
         self._news += self._onlooker.look(self._car.kit.state, now_ns)
         for event in self._car.events[self._events :]:
-            self._news.append(News(event.mono_ns, "event", f"{event.kind}: {event.detail}"))
+            self._news.append(KitEvent(event.mono_ns, "event", f"{event.kind}: {event.detail}"))
         self._events = len(self._car.events)
 
-    def _heard(self, now_ns: int) -> Sequence[HeardFrame]:
+    def _heard(self, now_ns: int) -> Sequence[ReceivedCanFrame]:
         try:
             return self._port.take(now_ns)
         except BusGone as gone:
             self._is_gone(str(gone), now_ns)
             return []
 
-    def _send(self, frames: Sequence[Frame], made_ns: int) -> None:
+    def _send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
         try:
             self._port.send(frames, made_ns)
         except BusGone as gone:
@@ -116,11 +116,11 @@ class Runner:
 
     def _is_gone(self, why: str, now_ns: int) -> None:
         if not self._is_lost:
-            self._news.append(News(now_ns, "bus", f"the bus is gone: {why}"))
+            self._news.append(KitEvent(now_ns, "bus", f"the bus is gone: {why}"))
         self._is_lost, self._lost_ns = True, now_ns
 
     def _is_there(self, now_ns: int) -> None:
         """Tell that the bus is there again, once it has been so long enough: a full queue comes and goes."""
         if self._is_lost and now_ns - self._lost_ns >= NS_PER_S:
             self._is_lost = False
-            self._news.append(News(now_ns, "bus", "the bus is there again"))
+            self._news.append(KitEvent(now_ns, "bus", "the bus is there again"))

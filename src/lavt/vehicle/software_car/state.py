@@ -31,7 +31,7 @@ class Gear(IntEnum):
     LOW = 5
 
 
-class Reject(IntEnum):
+class GearRejection(IntEnum):
     """Why a gear was refused."""
 
     NONE = 0
@@ -42,7 +42,7 @@ class Reject(IntEnum):
     FAULT = 7
 
 
-class System(IntEnum):
+class SystemState(IntEnum):
     """State of a kit of generation 2."""
 
     MANUAL = 0
@@ -51,7 +51,7 @@ class System(IntEnum):
     FAULT = 7
 
 
-class Reason(IntEnum):
+class ReleaseReason(IntEnum):
     """Why a kit let go, or is not ready.
 
     The facts name those up to the lockouts and give no numbers: they are counted in the order of the names.
@@ -162,14 +162,14 @@ class KitState:
     # The gearbox.
     gear: Gear = Gear.PARK
     gear_order: int = 0
-    gear_reject: Reject = Reject.NONE
+    gear_reject: GearRejection = GearRejection.NONE
     is_gear_overridden: bool = False
     gear_faults: set[str] = field(default_factory=set)
     # The kit as a whole.
-    system: System = System.MANUAL
-    disengaged: Reason = Reason.NONE
-    not_ready: Reason = Reason.NONE
-    watchdog: Reason = Reason.NONE
+    system: SystemState = SystemState.MANUAL
+    disengaged: ReleaseReason = ReleaseReason.NONE
+    not_ready: ReleaseReason = ReleaseReason.NONE
+    watchdog: ReleaseReason = ReleaseReason.NONE
     """Why the watchdog tripped; latched until it is cleared after somebody has taken over."""
     watchdog_axis: Axis | None = None
     watchdog_brakes: bool = False

@@ -8,7 +8,7 @@ import numpy as np
 
 from lavt.domain import CameraModel, FloatArray
 from lavt.vehicle.sim.rendering.ground import TILE_M
-from lavt.vehicle.sim.rendering.pinhole import View, row_of_depth
+from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, row_of_depth
 from lavt.vehicle.sim.rendering.textures import SCALES_M
 
 BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
@@ -51,7 +51,7 @@ class Band:
         first = self.first_row + 0.5 / self.lines - 0.5
         return np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / self.lines, first], [0.0, 0.0, 1.0]])
 
-    def low_tile(self, view: View) -> tuple[int, int]:
+    def low_tile(self, view: CameraPlacement) -> tuple[int, int]:
         """Index (x, y) of the square's first tile."""
         x_m = view.x_m + self._ahead_m * math.cos(view.heading_rad)
         y_m = view.y_m + self._ahead_m * math.sin(view.heading_rad)

@@ -23,7 +23,7 @@ _PAVER_M = 3.5
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
+class SurfaceWear:
     """Strips of one kind, how wide they are (m), and how many grey levels the asphalt is darker there."""
 
     places: Strips
@@ -31,7 +31,7 @@ class Damage:
     grey: int
 
 
-def damages(road: Road) -> list[Damage]:
+def damages(road: Road) -> list[SurfaceWear]:
     """All of one road, in the order of painting."""
     repairs, edges = _repairs(road)
     seams = [
@@ -40,11 +40,11 @@ def damages(road: Road) -> list[Damage]:
         for offset_m in np.arange(strip.right_m + _PAVER_M, strip.left_m - 1.0, _PAVER_M)
     ]
     return [
-        *(Damage(join(found), 2.0, grey) for grey, found in repairs.items()),
-        Damage(join(seams), _SEAM_M, 12),
-        Damage(edges, 0.05, 30),
-        Damage(_cracks(road, "cracks", 0.018), 0.018, 34),
-        Damage(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
+        *(SurfaceWear(join(found), 2.0, grey) for grey, found in repairs.items()),
+        SurfaceWear(join(seams), _SEAM_M, 12),
+        SurfaceWear(edges, 0.05, 30),
+        SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
+        SurfaceWear(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
     ]
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from lavt.domain import CameraModel, FloatArray, Pose
 from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
-from lavt.vehicle.sim.road.cross_section import Along, Paved, Rail, RoadMark
+from lavt.vehicle.sim.road.cross_section import Along, PavedArea, Rail, RoadMark
 from lavt.vehicle.sim.road.road import Road
 
 VIEWS = 4
@@ -105,7 +105,7 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     half_m = road.lanes.widths_m[road.lanes.driven] / 2
     for strip in _within(road.paved, first_m, last_m):
         _fill(axes, road, strip, (_low(strip, first_m), _high(strip, last_m)), _ASPHALT)
-    _fill(axes, road, Paved(half_m, -half_m), (0.0, road.length_m), _LANE)
+    _fill(axes, road, PavedArea(half_m, -half_m), (0.0, road.length_m), _LANE)
     axes.plot(*road.across(_along(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)  # seen from any height
     for colour, paint in _PAINT.items():
         lines = [
@@ -122,7 +122,7 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     axes.autoscale_view()
 
 
-def _fill(axes: Axes, road: Road, strip: Paved, ends_m: tuple[float, float], colour: str) -> None:
+def _fill(axes: Axes, road: Road, strip: PavedArea, ends_m: tuple[float, float], colour: str) -> None:
     along = _along(*ends_m)
     outline = np.concatenate([road.across(along, strip.left_m), road.across(along[::-1], strip.right_m)])
     axes.add_collection(PolyCollection([outline], facecolors=colour, edgecolors="none"))
@@ -138,11 +138,11 @@ def _painted(mark: RoadMark, first_m: float, last_m: float) -> list[tuple[float,
     return [(begin_m, begin_m + mark.dash_m) for begin_m in mark.dashes_m(first_m, last_m).tolist()]
 
 
-def _low(each: Paved | RoadMark | Rail, first_m: float) -> float:
+def _low(each: PavedArea | RoadMark | Rail, first_m: float) -> float:
     return max(each.from_m, first_m)
 
 
-def _high(each: Paved | RoadMark | Rail, last_m: float) -> float:
+def _high(each: PavedArea | RoadMark | Rail, last_m: float) -> float:
     return min(each.to_m, last_m)
 
 

@@ -15,7 +15,7 @@ from lavt.domain import CameraModel, FloatArray, Pose
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraPlacement:
     """A camera at a place: its position (m) and heading (rad) in the world's frame, above the ground by `z_m`."""
 
     model: CameraModel
@@ -67,12 +67,12 @@ class View:
         return np.asarray(ground_from_level @ level_from_picture)
 
 
-def view_from(model: CameraModel, pose: Pose) -> View:
+def view_from(model: CameraModel, pose: Pose) -> CameraPlacement:
     """Place the camera of a vehicle at `pose`."""
     cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     x_m = pose.x_m + model.x_m * cosine - model.y_m * sine
     y_m = pose.y_m + model.x_m * sine + model.y_m * cosine
-    return View(model, x_m, y_m, pose.heading_rad + model.yaw_rad)
+    return CameraPlacement(model, x_m, y_m, pose.heading_rad + model.yaw_rad)
 
 
 def rolled(roll_rad: float) -> FloatArray:

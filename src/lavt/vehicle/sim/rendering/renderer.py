@@ -21,7 +21,7 @@ from lavt.vehicle.sim.rendering.bands import Band, bands_of
 from lavt.vehicle.sim.rendering.ground import Ground
 from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
 from lavt.vehicle.sim.rendering.panorama import Panorama
-from lavt.vehicle.sim.rendering.pinhole import View, levelled, principal_point, rolled, view_from
+from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, levelled, principal_point, rolled, view_from
 from lavt.vehicle.sim.rendering.roadside_objects import standing
 from lavt.vehicle.sim.rendering.scenery import HAZE_M, Scenery
 from lavt.vehicle.sim.rendering.shadows import Shadows
@@ -111,7 +111,7 @@ class Renderer:
             self._scenery.draw(view, picture)
         return picture if self._level is self._model else self._rolled(picture)
 
-    def _warp(self, band: Band, view: View, homography: FloatArray) -> None:
+    def _warp(self, band: Band, view: CameraPlacement, homography: FloatArray) -> None:
         rows = self._canvas[band.first_row : band.end_row]
         if not len(rows):
             return
@@ -134,7 +134,7 @@ class Renderer:
             self._windows[band.level] = held
         return held[1]
 
-    def _prepare_ground(self, view: View) -> None:
+    def _prepare_ground(self, view: CameraPlacement) -> None:
         for band in self._bands[_KEPT_FROM_LEVEL:]:
             low = band.low_tile(view)
             for index in range(band.tiles**2 if self._ground.room(band.level) else 0):
@@ -157,7 +157,7 @@ class Renderer:
         turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
         return np.asarray(turned, dtype=np.uint8)
 
-    def _blur_near(self, views: Sequence[View]) -> None:
+    def _blur_near(self, views: Sequence[CameraPlacement]) -> None:
         rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
         light = np.zeros(rows.shape, dtype=np.uint16)
         for view in views:

@@ -73,7 +73,7 @@ _NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class RoadsideObjects:
     """Everything that stands along one road.
 
     `poles` are (n, 5): x, y, foot, top, width in metres; `trees` (n, 4): x, y, height (m), kind; `tree_road_rad` (n,)
@@ -87,11 +87,11 @@ class Standing:
     walls: Walls
 
 
-def standing(road: Road, *, trees: bool) -> Standing:
+def standing(road: Road, *, trees: bool) -> RoadsideObjects:
     """Place everything along a road; `trees` says whether trees, lamp posts and buildings are there too."""
     runs = [_stations(road, rail) for rail in road.rails]
     planted = _plant(road) if trees else np.empty((0, 4))
-    return Standing(
+    return RoadsideObjects(
         faces=_join_faces([*_rail_faces(road, runs), *_lamp_faces(road, runs if trees else [])]),
         poles=_poles(road, runs, lamps=trees),
         trees=planted,

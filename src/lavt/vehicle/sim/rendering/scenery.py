@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
 from lavt.vehicle.sim.rendering.light import Light
-from lavt.vehicle.sim.rendering.pinhole import View
-from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, Standing
+from lavt.vehicle.sim.rendering.pinhole import CameraPlacement
+from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, Trees
 
 HAZE_M = 240.0
@@ -34,7 +34,7 @@ Drawing = tuple[float, Callable[..., None], Any, Any]
 class Scenery:
     """Everything that stands along one road, in one light."""
 
-    def __init__(self, standing: Standing, light: Light) -> None:
+    def __init__(self, standing: RoadsideObjects, light: Light) -> None:
         self._standing = standing
         faces, walls = standing.faces, standing.walls
         self._colours = faces.colours * light.upright(faces.normals)
@@ -51,7 +51,7 @@ class Scenery:
         """Paint beforehand what is slow."""
         self._sprites.prepare()
 
-    def draw(self, view: View, picture: Picture) -> None:
+    def draw(self, view: CameraPlacement, picture: Picture) -> None:
         """Draw into `picture` what is in view."""
         things: list[Drawing] = [
             *self._faces(view), *self._poles(view), *self._tree_drawings(view), *self._walls(view)
@@ -60,7 +60,7 @@ class Scenery:
         for _, draw, shape, look in things:
             draw(picture, shape, look)
 
-    def _faces(self, view: View) -> Iterable[Drawing]:
+    def _faces(self, view: CameraPlacement) -> Iterable[Drawing]:
         faces = self._standing.faces
         corners = faces.corners_m
         ahead = _ahead(corners[:, :2, :2], view)
@@ -73,7 +73,7 @@ class Scenery:
         shades = self._hazed(self._colours[near[inside]], depth)
         return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
 
-    def _poles(self, view: View) -> Iterable[Drawing]:
+    def _poles(self, view: CameraPlacement) -> Iterable[Drawing]:
         ahead = _ahead(self._standing.poles[:, :2], view)
         shown = (ahead > 1.0) & (ahead < FAR_M)
         poles, depth = self._standing.poles[shown], ahead[shown]
@@ -86,7 +86,7 @@ class Scenery:
         # A pole stands behind the face it carries.
         return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), looks)
 
-    def _tree_drawings(self, view: View) -> Iterable[Drawing]:
+    def _tree_drawings(self, view: CameraPlacement) -> Iterable[Drawing]:
         ahead = _ahead(self._trees[:, :2], view)
         trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
         feet = view.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
@@ -98,7 +98,7 @@ class Scenery:
         haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
         return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
 
-    def _walls(self, view: View) -> Iterable[Drawing]:
+    def _walls(self, view: CameraPlacement) -> Iterable[Drawing]:
         walls = self._standing.walls
         outlines = walls.outlines_m
         begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
@@ -137,7 +137,7 @@ def _facade(
     cv2.fillPoly(picture, shape[1], colours[1], cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _ahead(points_m: FloatArray, view: View) -> FloatArray:
+def _ahead(points_m: FloatArray, view: CameraPlacement) -> FloatArray:
     """How far ahead of the camera points (..., 2) are."""
     along = (points_m[..., 0] - view.x_m) * math.cos(view.heading_rad)
     return np.asarray(along + (points_m[..., 1] - view.y_m) * math.sin(view.heading_rad))

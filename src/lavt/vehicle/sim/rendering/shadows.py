@@ -9,7 +9,7 @@ import numpy as np
 
 from lavt.domain import FloatArray
 from lavt.vehicle.sim.rendering.light import Light
-from lavt.vehicle.sim.rendering.roadside_objects import Standing
+from lavt.vehicle.sim.rendering.roadside_objects import RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, tree_shape
 from lavt.vehicle.sim.rendering.textures import seamless_noise
 from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join, strips
@@ -24,7 +24,7 @@ _MARGIN_M = 1.0
 class Shadows:
     """The shadows of one road's things in one light."""
 
-    def __init__(self, standing: Standing, light: Light, *, clouds: bool) -> None:
+    def __init__(self, standing: RoadsideObjects, light: Light, *, clouds: bool) -> None:
         self._falls = light.shadow_m
         self._upright = join([_of_faces(standing, self._falls), _of_poles(standing.poles, self._falls)])
         self._trees = standing.trees
@@ -63,7 +63,7 @@ class Shadows:
             cv2.max(mask, cv2.warpAffine(shape, ground_from_shape, size, flags=cv2.INTER_LINEAR), mask)
 
 
-def _of_faces(standing: Standing, falls: FloatArray) -> Strips:
+def _of_faces(standing: RoadsideObjects, falls: FloatArray) -> Strips:
     """Shadows of rails, barriers, arms of lamps and walls."""
     corners = np.concatenate([standing.faces.corners_m, standing.walls.outlines_m])
     return strips(corners[..., :2] + corners[..., 2:] * falls)

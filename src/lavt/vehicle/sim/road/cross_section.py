@@ -40,7 +40,7 @@ class Lanes:
 
 
 @dataclass(frozen=True, slots=True)
-class Paved:
+class PavedArea:
     """A strip of asphalt, between two lateral offsets and two stations."""
 
     left_m: float
@@ -85,7 +85,7 @@ class Rail:
     to_m: float = math.inf
 
 
-Along = TypeVar("Along", Paved, RoadMark, Rail)
+Along = TypeVar("Along", PavedArea, RoadMark, Rail)
 
 
 def moved_start(each: Along, by_m: float) -> Along:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from lavt.domain import FloatArray
 from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Centreline, Segment
-from lavt.vehicle.sim.road.cross_section import Lanes, Paved, Rail, RoadMark, moved_start
+from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, moved_start
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
@@ -39,7 +39,7 @@ class Road:
     length_m: float
     segments: tuple[Segment, ...]
     lanes: Lanes
-    paved: tuple[Paved, ...]
+    paved: tuple[PavedArea, ...]
     marks: tuple[RoadMark, ...]
     rails: tuple[Rail, ...]
 

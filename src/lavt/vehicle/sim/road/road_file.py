@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Segment
-from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M, Lanes, Paved, Rail, RoadMark
+from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M, Lanes, PavedArea, Rail, RoadMark
 
 SOLID_M = 0.125
 """Width of a mark where a file does not say: that of the map the six routes come from."""
@@ -152,12 +152,12 @@ class RoadFile(_Keys):
         return Lanes(tuple(self.lane_keys.widths_m), self.lane_keys.driven)
 
     @property
-    def all_paved(self) -> tuple[Paved, ...]:
+    def all_paved(self) -> tuple[PavedArea, ...]:
         """Strips of asphalt: the lanes and their shoulders, where the file does not say."""
         if self.paved is not None:
-            return tuple(Paved(**dict(each)) for each in self.paved)
+            return tuple(PavedArea(**dict(each)) for each in self.paved)
         edges_m, shoulders = self.lanes.edges_m, self.shoulders or _ShoulderKeys()
-        return (Paved(edges_m[-1] + shoulders.left_m, edges_m[0] - shoulders.right_m),)
+        return (PavedArea(edges_m[-1] + shoulders.left_m, edges_m[0] - shoulders.right_m),)
 
     @property
     def all_marks(self) -> tuple[RoadMark, ...]:
