@@ -157,24 +157,24 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=10.0, help="at 50 Hz, in each run")
     parser.add_argument("--messages", type=int, default=2000, help="back to back, in each run")
     parser.add_argument("--only", action="append", choices=CARRIERS, help="a carrier; may be given again")
-    asked = parser.parse_args(words)
-    if asked.rounds < 1 or asked.seconds <= 0 or asked.messages < 1:
+    requested = parser.parse_args(words)
+    if requested.rounds < 1 or requested.seconds <= 0 or requested.messages < 1:
         parser.error("--rounds, --seconds and --messages must be above zero")
-    return asked
+    return requested
 
 
 def main() -> int:
     """Measure what is asked for and there; 2 where what is asked for is not there."""
-    asked = arguments()
+    requested = arguments()
     process_priority.take()  # as the server and the client do; routers and both sides inherit it
-    missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (asked.only or CARRIERS)]
+    missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (requested.only or CARRIERS)]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)
-    carriers = [name for name in CARRIERS if name in (asked.only or CARRIERS) and name not in missing]
+    carriers = [name for name in CARRIERS if name in (requested.only or CARRIERS) and name not in missing]
     if not carriers:
         return 2
     try:
-        found = measure(carriers, asked.rounds, asked.seconds, asked.messages)
+        found = measure(carriers, requested.rounds, requested.seconds, requested.messages)
     except LavtError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1

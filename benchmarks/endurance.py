@@ -113,13 +113,13 @@ def main() -> int:
     """Measure, print a table, and say whether anything grew: 1 if so."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--minutes", type=float, default=2.0)
-    asked = parser.parse_args()
-    if not 0 < asked.minutes <= 60:
+    requested = parser.parse_args()
+    if not 0 < requested.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
     process_priority.take()  # as the server and the client do
-    sampler = Sampler(asked.minutes * 60)  # the run has a warm-up besides
+    sampler = Sampler(requested.minutes * 60)  # the run has a warm-up besides
     with tempfile.TemporaryDirectory() as name:
-        run = clean_run(Path(name), SIZES[0], asked.minutes * 60)
+        run = clean_run(Path(name), SIZES[0], requested.minutes * 60)
         render_loop(run.loop, run.width_px, run.height_px)
         outcome = measure("ours", run, when_started=sampler.watch)
     print("| process | memory MB, begin | end | kB a minute | threads, begin | end |\n|---|---|---|---|---|---|")

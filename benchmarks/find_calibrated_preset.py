@@ -67,8 +67,8 @@ def drive(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Count
     """Drive the whole grid, and count."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     axes = {"controller.lookahead_s": list(LOOKAHEADS_S), "controller.steering_limit_rad": list(LIMITS_RAD)}
-    asked = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
-    planned = plan_sweep(parse_config(SweepConfig, asked, "the grid"))
+    requested = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
+    planned = plan_sweep(parse_config(SweepConfig, requested, "the grid"))
     with TemporaryDirectory() as directory:
         driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None)
     if driven.failed:

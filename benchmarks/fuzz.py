@@ -49,8 +49,8 @@ TARGETS: dict[str, tuple[Callable[[int], Target], float]] = {
     "pictures": (operator_side.pictures, 0.01),
     "probe_at_operator": (operator_side.probe_at_operator, 0.02),
     "stamps": (operator_side.stamps, 0.03),
-    "door_of_vehicle": (secured.door_of_vehicle, 0.03),
-    "door_of_operator": (secured.door_of_operator, 0.03),
+    "gateway_of_vehicle": (secured.gateway_of_vehicle, 0.03),
+    "gateway_of_operator": (secured.gateway_of_operator, 0.03),
     "encrypted_video": (secured.encrypted_video, 0.03),
     "encrypted_feedback": (secured.encrypted_feedback, 0.02),
     "rendezvous": (between.rendezvous, 0.03),
@@ -69,7 +69,7 @@ class Outcome:
     name: str
     inputs: int
     cpu_s: float
-    refused: int
+    rejected: int
     grown_kb: int
     said: str
     broke: str
@@ -79,7 +79,7 @@ class Outcome:
     def line(self) -> str:
         """The outcome in words."""
         rate = self.inputs / self.cpu_s if self.cpu_s else 0.0
-        words = f"{self.name}: {self.inputs} inputs, {rate:.0f}/s, {self.refused} refused, {self.grown_kb:+d} kB"
+        words = f"{self.name}: {self.inputs} inputs, {rate:.0f}/s, {self.rejected} refused, {self.grown_kb:+d} kB"
         return words + (f", {self.said}" if self.said else "")
 
     @property
@@ -118,7 +118,7 @@ def fuzz(name: str, inputs: int, seed: int) -> Outcome:
         said = target.finish()
     except Exception:  # whatever it is, it is what was looked for
         broke = f"{name} broke at input {number} of seed {seed}, on {channel}: {data.hex()}\n{traceback.format_exc()}"
-    return Outcome(name, number + 1, cpu_s() - begin_s, target.refused(), memory_kb() - warm_kb, said, broke)
+    return Outcome(name, number + 1, cpu_s() - begin_s, target.rejected(), memory_kb() - warm_kb, said, broke)
 
 
 def fuzz_all(names: list[str], inputs: int, seed: int, jobs: int) -> list[Outcome]:
@@ -142,17 +142,17 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at a time")
     parser.add_argument("--only", action="append", choices=TARGETS, help="a target by name; may be given again")
-    asked = parser.parse_args(words)
-    if asked.inputs < 1 or asked.jobs < 1:
+    requested = parser.parse_args(words)
+    if requested.inputs < 1 or requested.jobs < 1:
         parser.error("--inputs and --jobs must be above zero")
-    return asked
+    return requested
 
 
 def main() -> int:
     """Fuzz; 1 where something broke or grew."""
-    asked = arguments()
+    requested = arguments()
     try:
-        outcomes = fuzz_all(asked.only or list(TARGETS), asked.inputs, asked.seed, asked.jobs)
+        outcomes = fuzz_all(requested.only or list(TARGETS), requested.inputs, requested.seed, requested.jobs)
     except (ImportError, UserError) as error:
         print(f"{error}: pip install 'lavt[secure]'", file=sys.stderr)
         return 2

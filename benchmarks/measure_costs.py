@@ -36,17 +36,17 @@ def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, 
     """Give node, channel, stamp, arrival and hops of every timeline of a record."""
     table = record.table("timeline")
     columns = (table.texts("node"), table.texts("channel"), table.ints("stamp_ns").tolist(),
-               table.ints("arrived_mono_ns").tolist(), table.objects("hops"))  # fmt: skip
+               table.ints("arrived_mono_ns").tolist(), table.objects("stages"))  # fmt: skip
     return list(zip(*columns, strict=True))
 
 
-def add_hops(record: Record, hops: Samples) -> None:
+def add_stages(record: Record, stages: Samples) -> None:
     """Collect the duration of every hop, and of waking for every message."""
     for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
         if channel != "wake":
-            hops[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / US)
+            stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / US)
         for (_, begin_ns), (name, end_ns) in pairwise(ends):
-            hops[node, name].append((end_ns - begin_ns) / US)
+            stages[node, name].append((end_ns - begin_ns) / US)
 
 
 def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> None:
@@ -63,7 +63,7 @@ def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> 
 
 def costs_of(drives: int) -> dict[str, Any]:
     """Drive and measure."""
-    hops: Samples = defaultdict(list)
+    stages: Samples = defaultdict(list)
     links: dict[str, list[float]] = defaultdict(list)
     loads = []
     for number in range(drives):
@@ -74,17 +74,21 @@ def costs_of(drives: int) -> dict[str, Any]:
             print(f"drive {number + 1}: {result['ending']}, tau_v {result['tau_v_ms']['p50']:.2f} ms, "
                   f"tau_c {result['tau_c_ms']['p50']:.2f} ms, loop {result['loop_ms']['p50']:.2f} ms")  # fmt: skip
             server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-            add_hops(server, hops)
-            add_hops(client, hops)
+            add_stages(server, stages)
+            add_stages(client, stages)
             add_links(server, client, links)
             loads.append(os.getloadavg()[0])
     table: dict[str, dict[str, float]] = defaultdict(dict)
-    for (node, hop), samples in sorted(hops.items()):
-        table[node][hop] = round(median(samples), 1)
+    for (node, stage), samples in sorted(stages.items()):
+        table[node][stage] = round(median(samples), 1)
     link_us = {name: round(float(np.median(samples)), 1) for name, samples in sorted(links.items())}
     link_us["control"] = round(link_us["control"] - table["driver"]["command"], 1)
     machine = f"{os.cpu_count()} cores, {platform.machine()}, load {max(loads):.1f}, {drives} drives"
-    return {"measured_on": machine, "hops_us": {node: dict(each) for node, each in table.items()}, "links_us": link_us}
+    return {
+        "measured_on": machine,
+        "stages_us": {node: dict(each) for node, each in table.items()},
+        "links_us": link_us,
+    }
 
 
 def main() -> None:

@@ -132,21 +132,21 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--rerun-survivors", action="store_true", help="run what survived in --out again, and only that"
     )
-    asked = parser.parse_args(words)
-    if asked.count < 1 or asked.jobs < 1 or not asked.timeout_factor >= 1:
+    requested = parser.parse_args(words)
+    if requested.count < 1 or requested.jobs < 1 or not requested.timeout_factor >= 1:
         parser.error("--count and --jobs must be above zero, --timeout-factor at least 1")
-    if asked.rerun_survivors and (asked.out is None or not asked.out.exists()):
+    if requested.rerun_survivors and (requested.out is None or not requested.out.exists()):
         parser.error("--rerun-survivors needs --out with the file of an earlier run")
-    return asked
+    return requested
 
 
-def measure(asked: argparse.Namespace, tell: Callable[[str], None]) -> str:
+def measure(requested: argparse.Namespace, tell: Callable[[str], None]) -> str:
     """Run what is asked, and return the report. Raises `UserError`."""
     every = sites_of(list(MODULES))
     accepted = load_accepted(ACCEPTED_FILE, every)
-    sites = {module: every[module] for module in asked.only or MODULES}
-    results = read_results(asked.out) if asked.out else {}
-    if asked.rerun_survivors:
+    sites = {module: every[module] for module in requested.only or MODULES}
+    results = read_results(requested.out) if requested.out else {}
+    if requested.rerun_survivors:
         of_sources = {mutation.key: mutation for of_module in sites.values() for site in of_module for mutation in site}
         again = [each for each in results.values() if not each.caught and each.place not in accepted]
         for each in again:
@@ -154,27 +154,27 @@ def measure(asked: argparse.Namespace, tell: Callable[[str], None]) -> str:
                 tell(f"not in the sources any more: {described(each)}")
         wanted = todo = [of_sources[each.key] for each in again if each.key in of_sources]
     else:
-        wanted = sample(sites, asked.seed, asked.count)
+        wanted = sample(sites, requested.seed, requested.count)
         todo = [mutation for mutation in wanted if mutation.key not in results]
-    if asked.list:
+    if requested.list:
         return "\n".join(map(described, wanted))
     with TemporaryDirectory(prefix="lavt_mutation_") as directory:
-        runner = Runner(Path(directory), min(asked.jobs, max(1, len(todo))), asked.timeout_factor)
+        runner = Runner(Path(directory), min(requested.jobs, max(1, len(todo))), requested.timeout_factor)
         for number, result in enumerate(runner.run(todo), start=1):
             results[result.key] = result
-            if asked.out:
-                append_result(asked.out, result)
+            if requested.out:
+                append_result(requested.out, result)
             said = f"caught by {result.by}" if result.caught else "SURVIVED"
             tell(f"{number} of {len(todo)}, {result.took_s:.1f} s: {described(result)}: {said}")
-    counted = results if asked.rerun_survivors else [mutation.key for mutation in wanted]
+    counted = results if requested.rerun_survivors else [mutation.key for mutation in wanted]
     return report([results[key] for key in counted], accepted)
 
 
 def main() -> int:
     """Measure; 2 for what the user did wrong."""
-    asked = arguments()
+    requested = arguments()
     try:
-        print(measure(asked, tell=lambda line: print(line, file=sys.stderr, flush=True)))
+        print(measure(requested, tell=lambda line: print(line, file=sys.stderr, flush=True)))
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

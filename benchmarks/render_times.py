@@ -54,12 +54,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--route", default="b")
     parser.add_argument("--drives", type=int, default=3)
-    asked = parser.parse_args()
-    road = load_road(asked.route)
+    requested = parser.parse_args()
+    road = load_road(requested.route)
     print("picture    scenery  light     drive     prepare s  median ms  p99 ms  longest ms  memory MB")
     for model, scenery, light, swerving in CASES:
         found = []
-        for _ in range(asked.drives):
+        for _ in range(requested.drives):
             renderer.world.cache_clear()
             begin_s = time.process_time()
             drawing = Renderer(road, model, seed=1, scenery=scenery, light=light)

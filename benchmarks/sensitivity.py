@@ -61,7 +61,7 @@ def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -
     """Drive every value under every condition, and give the results."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     base["controller"]["preset"] = preset
-    asked = {
+    requested = {
         **base,
         "fidelity": "geometry",
         "routes": options.routes.split(","),
@@ -69,7 +69,7 @@ def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -
         "repetitions": options.repetitions,
         "axes": {key: list(values)},
     }
-    planned = plan_sweep(parse_config(SweepConfig, asked, "sensitivity"))
+    planned = plan_sweep(parse_config(SweepConfig, requested, "sensitivity"))
     with TemporaryDirectory() as directory:
         driven, _ = run_all(planned, Path(directory), jobs=options.jobs, tell=lambda _: None)
     if driven.failed:

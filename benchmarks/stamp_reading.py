@@ -145,20 +145,20 @@ class Sender:
         )
         self.packetizer = Packetizer(ssrc=1, first_sequence=65_000)
         self.repair = RepairSender(ssrc=2, first_sequence=65_000)
-        self.asked_for: int | None = None
-        self.answered = self.asked = -PAUSE_FRAMES
+        self.requested_for: int | None = None
+        self.answered = self.requested = -PAUSE_FRAMES
 
     def ask(self, number: int) -> None:
         """Ask for a keyframe, which is heard after a round trip, from frame `number` on."""
-        if number - self.asked >= PAUSE_FRAMES:
-            self.asked = number
-            self.asked_for = number + ROUND_TRIP_FRAMES
+        if number - self.requested >= PAUSE_FRAMES:
+            self.requested = number
+            self.requested_for = number + ROUND_TRIP_FRAMES
 
     def send(self, number: int, planes: Planes, stamp_ns: int) -> list[bytes]:
         """Stamp a frame and make its datagrams."""
-        keyframe = self.asked_for is not None and self.asked_for <= number >= self.answered + PAUSE_FRAMES
+        keyframe = self.requested_for is not None and self.requested_for <= number >= self.answered + PAUSE_FRAMES
         if keyframe:
-            self.asked_for, self.answered = None, number
+            self.requested_for, self.answered = None, number
         write_stamp_i420(planes, stamp_ns)
         return self.packetizer.packetize(self.encoder.encode_planes(planes, keyframe), rtp_timestamp(stamp_ns))
 
@@ -245,9 +245,9 @@ def study(found: Found, frames: int) -> Found:
         repair = sender.repair.repair(datagrams, found.repair)
         arrived = [datagram for datagram in (*datagrams, *repair) if chance.random() >= found.loss]
         timestamp = rtp_timestamp(stamp_ns)
-        taken_ns = stamp_ns - int(chance.integers(FOREIGN_JITTER_NS))
+        captured_ns = stamp_ns - int(chance.integers(FOREIGN_JITTER_NS))
         reader.sent_ns[timestamp] = stamp_ns
-        reader.foreign_timestamp[timestamp] = (rtp_timestamp(taken_ns) + FOREIGN_BASE) % 2**32
+        reader.foreign_timestamp[timestamp] = (rtp_timestamp(captured_ns) + FOREIGN_BASE) % 2**32
         media, units = receiver.receive(arrived, now_ns)
         reader.missing[timestamp] = len(datagrams) - media
         found.counts.update(frames=1, intact=reader.missing[timestamp] == 0)
@@ -325,10 +325,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", action="store_true", help="print everything on one last line, too")
-    asked = parser.parse_args()
-    found = study_all(asked.sizes, asked.rates_kbps, asked.frames, asked.processes)
+    requested = parser.parse_args()
+    found = study_all(requested.sizes, requested.rates_kbps, requested.frames, requested.processes)
     print("\n".join(tables(found)))
-    if asked.json:
+    if requested.json:
         print(as_json(found))
 
 

@@ -30,12 +30,12 @@ from lavt.runtime import process_priority
 QUICK = {"pairs": 1, "seconds": 4.0, "frames": 120}
 
 
-def parts(asked: argparse.Namespace, folder: Path) -> dict[str, Callable[[], dict[str, float]]]:
+def parts(requested: argparse.Namespace, folder: Path) -> dict[str, Callable[[], dict[str, float]]]:
     """Give what is measured, by its name in the last line."""
     clean: dict[str, Callable[[], dict[str, float]]] = {
-        size.name: partial(clean_part, folder, size, pairs=asked.pairs, seconds=asked.seconds) for size in SIZES
+        size.name: partial(clean_part, folder, size, pairs=requested.pairs, seconds=requested.seconds) for size in SIZES
     }
-    return clean | {case.name: partial(impaired_part, folder, case, frames=asked.frames) for case in CASES}
+    return clean | {case.name: partial(impaired_part, folder, case, frames=requested.frames) for case in CASES}
 
 
 def arguments(words: list[str] | None = None) -> argparse.Namespace:
@@ -46,30 +46,30 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=1800, help="of each run on the impaired link")
     parser.add_argument("--only", action="append", help="a part by its name in the last line; may be given again")
     parser.add_argument("--quick", action="store_true", help="for trying: everything as short as can be")
-    asked = parser.parse_args(words)
-    if asked.quick:
+    requested = parser.parse_args(words)
+    if requested.quick:
         for name, value in QUICK.items():
-            setattr(asked, name, value)
-    if asked.pairs < 1 or asked.seconds <= 0 or asked.frames < 1:
+            setattr(requested, name, value)
+    if requested.pairs < 1 or requested.seconds <= 0 or requested.frames < 1:
         parser.error("--pairs, --seconds and --frames must be above zero")
-    return asked
+    return requested
 
 
 def main() -> int:
     """Measure what is asked for; 2 where GStreamer is missing."""
-    asked = arguments()
+    requested = arguments()
     process_priority.take()  # as the server and the client do; the processes of both sides and the relay inherit it
     try:
         gstreamer()
         with tempfile.TemporaryDirectory() as name:
-            all_parts = parts(asked, Path(name))
-            unknown = set(asked.only or ()) - all_parts.keys()
+            all_parts = parts(requested, Path(name))
+            unknown = set(requested.only or ()) - all_parts.keys()
             if unknown:
                 raise UserError(f"there is no part {', '.join(sorted(unknown))}: choose of {', '.join(all_parts)}")
             for size in SIZES:
                 print(f"rendering the pictures of {size.name}", file=sys.stderr)
                 render_loop(Path(name) / f"{size.width_px}x{size.height_px}", size.width_px, size.height_px)
-            found = {part: measure() for part, measure in all_parts.items() if part in (asked.only or all_parts)}
+            found = {part: measure() for part, measure in all_parts.items() if part in (requested.only or all_parts)}
     except LavtError as error:
         print(error, file=sys.stderr)
         return 2 if isinstance(error, UserError) else 1

@@ -45,7 +45,7 @@ SETTINGS = {
 }
 """By the name that the JSON has with `_x`: the whole loop, that without scenery and codec, that without pixels."""
 
-STAGES = {
+PARTS = {
     "render": (("camera", "capture"),),
     "encode": (("camera", "encode"),),
     "decode": (("driver", "decode"),),
@@ -96,10 +96,10 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
     """
     spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
 
-    def timed(node: Node, name: str, hop: Callable[..., Any]) -> Hop:
+    def timed(node: Node, name: str, stage: Callable[..., Any]) -> Hop:
         def run(value: Any, now: Any) -> Any:
             begin_s = cpu_s()
-            result = hop(value, now)
+            result = stage(value, now)
             spent_s[node.name, name] += cpu_s() - begin_s
             return result
 
@@ -109,13 +109,13 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
         for host in loop.runtime.hosts.values():
             for running in host.running.values():  # the runtime has looked the chains up already
                 running.chains = {
-                    channel: (tuple(timed(running.node, name, hop) for name, hop in hops), spent_ns)
-                    for channel, (hops, spent_ns) in running.chains.items()
+                    channel: (tuple(timed(running.node, name, stage) for name, stage in stages), spent_ns)
+                    for channel, (stages, spent_ns) in running.chains.items()
                 }
 
     driven = drive_once(changes, limit_s, watch)
-    stages = {stage: 1e3 * sum(spent_s[hop] for hop in hops) / driven.frames for stage, hops in STAGES.items()}
-    return with_rest(stages, 1e3 * driven.drive_cpu_s / driven.frames)
+    parts = {part: 1e3 * sum(spent_s[stage] for stage in stages) / driven.frames for part, stages in PARTS.items()}
+    return with_rest(parts, 1e3 * driven.drive_cpu_s / driven.frames)
 
 
 def with_rest(stages: Mapping[str, float], whole: float) -> dict[str, float]:

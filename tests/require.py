@@ -8,9 +8,9 @@ from typing import NoReturn
 import pytest
 
 
-def need(part: str, because: str) -> NoReturn:
+def need(part: str, reason: str) -> NoReturn:
     """Skip the test that asks; fail it where LAVT_REQUIRE, a list with commas, names the part."""
     required = os.environ.get("LAVT_REQUIRE", "").replace(" ", "").split(",")
     if part in required:
-        pytest.fail(f"LAVT_REQUIRE names {part}: {because}", pytrace=False)
-    pytest.skip(because)
+        pytest.fail(f"LAVT_REQUIRE names {part}: {reason}", pytrace=False)
+    pytest.skip(reason)

@@ -56,9 +56,9 @@ def test_the_benchmark_of_the_onset_runs() -> None:
 @pytest.mark.full
 def test_the_study_of_the_stamp_runs() -> None:
     """`benchmarks/stamp_reading.py` prints a table for each size and one of the checks, and last, if asked, JSON."""
-    asked = ["--sizes", "320x240", "--rates-kbps", "460", "--frames", "40", "--processes", "1", "--json"]
+    requested = ["--sizes", "320x240", "--rates-kbps", "460", "--frames", "40", "--processes", "1", "--json"]
     done = subprocess.run(
-        [sys.executable, BENCHMARKS / "stamp_reading.py", *asked],
+        [sys.executable, BENCHMARKS / "stamp_reading.py", *requested],
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     lines = done.stdout.splitlines()

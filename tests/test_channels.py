@@ -59,11 +59,11 @@ def test_what_nodes_listen_to(nodes: Sequence[Node]) -> None:
     assert listened == {(channel, name) for channel, row in CHANNELS.items() for name in row.receivers}
 
 
-def test_every_chain_has_named_hops(nodes: Sequence[Node]) -> None:
+def test_every_chain_has_named_stages(nodes: Sequence[Node]) -> None:
     """A chain has at least one hop, and its hops have different names: the timeline tells them apart by these."""
     for node in nodes:
-        for hops in node.chains.values():
-            names = [name for name, _ in hops]
+        for stages in node.chains.values():
+            names = [name for name, _ in stages]
             assert names
             assert len(set(names)) == len(names)
 

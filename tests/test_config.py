@@ -108,7 +108,7 @@ def test_sweeps_over_further_axes(name: str, count: int) -> None:
 def test_every_condition_can_be_driven(name: str) -> None:
     """Virtual time and the relay accept every condition that comes with LAVT."""
     for time in ("virtual", "real"):
-        assert plan_run(RunConfig(time=time, network=NetworkConfig(condition=name))).asked == condition(name)
+        assert plan_run(RunConfig(time=time, network=NetworkConfig(condition=name))).requested == condition(name)
 
 
 PAPER = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (150, 75), "L5": (225, 100)}
@@ -127,7 +127,7 @@ def test_unknown_condition() -> None:
         condition("L6")
 
 
-def refused(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes: tuple[str, ...] = ()) -> str:
+def rejected(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes: tuple[str, ...] = ()) -> str:
     """Give the sentence with which a config of this text is refused."""
     path = tmp_path / "my.yaml"
     path.write_text(text)
@@ -150,7 +150,7 @@ def refused(text: str, tmp_path: Path, kind: type[Section] = RunConfig, changes:
 )
 def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
     """A key that does not exist is refused with its place and the nearest one that does, in sections too."""
-    said = refused(text, tmp_path)
+    said = rejected(text, tmp_path)
     assert repr(key) in said
     assert repr(near) in said
 
@@ -169,18 +169,18 @@ def test_unknown_key(text: str, key: str, near: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [ServerConfig, ClientConfig])
 def test_sources_of_time(text: str, said: str, kind: type[Section], tmp_path: Path) -> None:
     """A source of time that does not exist, lacks a figure, or has one that is not its own is refused."""
-    assert said in refused(text, tmp_path, kind)
+    assert said in rejected(text, tmp_path, kind)
 
 
 def test_a_client_must_know_the_port_of_the_probe(tmp_path: Path) -> None:
     """Any free port, 0, is for the server alone: a client could not know which it is."""
-    assert "clock.probe_port" in refused("clock: {probe_port: 0}", tmp_path, ClientConfig)
+    assert "clock.probe_port" in rejected("clock: {probe_port: 0}", tmp_path, ClientConfig)
     assert ServerConfig(clock=ClockConfig(probe_port=0)).clock.probe_port == 0
 
 
 def test_unknown_key_like_no_other(tmp_path: Path) -> None:
     """A key that is like none is refused with all that there are."""
-    sentence = refused("clocks: {xyzzy: 1}", tmp_path)
+    sentence = rejected("clocks: {xyzzy: 1}", tmp_path)
     assert "'clocks.xyzzy'" in sentence
     assert "bound_us, drift_ppm, error_us, offset_ms" in sentence
 
@@ -206,7 +206,7 @@ def test_unknown_key_like_no_other(tmp_path: Path) -> None:
 )
 def test_bad_set(change: str, said: str, tmp_path: Path) -> None:
     """A change by --set is checked like the file, and one that is not of its form is named."""
-    assert said in refused("seed: 1", tmp_path, changes=(change,))
+    assert said in rejected("seed: 1", tmp_path, changes=(change,))
 
 
 def test_set(tmp_path: Path) -> None:
@@ -276,14 +276,14 @@ BAD_VALUES: list[tuple[type[Section], str, str]] = [
 @pytest.mark.parametrize(("kind", "text", "said"), BAD_VALUES, ids=[text for _, text, _ in BAD_VALUES])
 def test_bad_values(kind: type[Section], text: str, said: str, tmp_path: Path) -> None:
     """A value of a wrong type, out of range or not finite is refused with its key; nothing is converted silently."""
-    sentence = refused(text, tmp_path, kind)
+    sentence = rejected(text, tmp_path, kind)
     assert said in sentence
     assert "my.yaml" in sentence
 
 
 def test_all_problems_at_once(tmp_path: Path) -> None:
     """Everything that is wrong in a config is said in one go."""
-    sentence = refused("seed: -1\ncamera: {width: 1, rate_hz: 0}", tmp_path)
+    sentence = rejected("seed: -1\ncamera: {width: 1, rate_hz: 0}", tmp_path)
     assert all(key in sentence for key in ("'seed'", "'camera.width'", "'camera.rate_hz'"))
 
 
@@ -302,7 +302,7 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
 )
 def test_bad_files(text: str, said: str, tmp_path: Path) -> None:
     """A file that is not YAML, or not a mapping, is refused in one line that names it."""
-    sentence = refused(text, tmp_path)
+    sentence = rejected(text, tmp_path)
     assert said in sentence
     assert "my.yaml" in sentence
 
@@ -355,7 +355,11 @@ def test_configs_do_not_change() -> None:
 
 @pytest.mark.parametrize(
     "safety",
-    [SafetyConfig(lateral_acceleration_mps2=3.1), SafetyConfig(picture_age_limit_ms=501.0), SafetyConfig(sight_m=21.0)],
+    [
+        SafetyConfig(lateral_acceleration_mps2=3.1),
+        SafetyConfig(picture_age_limit_ms=501.0),
+        SafetyConfig(stopping_distance_limit_m=21.0),
+    ],
 )
 def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
     """Limits beyond the defaults are for a simulated vehicle only; any other is refused with the keys to lower."""
@@ -365,16 +369,20 @@ def test_wide_limits_are_for_simulators(safety: SafetyConfig) -> None:
     wide = limits_of(safety, simulated=True)
     assert wide.lateral_acceleration_mps2 == safety.lateral_acceleration_mps2
     assert wide.picture_age_limit_ns == safety.picture_age_limit_ms * 1e6
-    assert wide.sight_m == safety.sight_m
+    assert wide.stopping_distance_limit_m == safety.stopping_distance_limit_m
 
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_limits(simulated: bool) -> None:
     """The defaults, and limits tighter than they are, hold for every vehicle, and no other limit can be configured."""
     assert limits_of(SafetyConfig(), simulated=simulated) == LIMITS
-    asked = SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0, sight_m=10.0)
-    tight = limits_of(asked, simulated=simulated)
-    assert (tight.lateral_acceleration_mps2, tight.picture_age_limit_ns, tight.sight_m) == (2.0, 300_000_000, 10.0)
+    requested = SafetyConfig(lateral_acceleration_mps2=2.0, picture_age_limit_ms=300.0, stopping_distance_limit_m=10.0)
+    tight = limits_of(requested, simulated=simulated)
+    assert (tight.lateral_acceleration_mps2, tight.picture_age_limit_ns, tight.stopping_distance_limit_m) == (
+        2.0,
+        300_000_000,
+        10.0,
+    )
     assert tight.stop_after_ns == LIMITS.stop_after_ns
     assert tight.stamp_memory_ns == LIMITS.stamp_memory_ns
 

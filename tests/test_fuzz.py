@@ -76,13 +76,13 @@ def test_growth_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert outcome.grown_kb > 16_000
 
 
-def test_a_stranger_who_is_obeyed_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stranger_who_is_accepted_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the check of the sequence the fuzzer finds that a command of the operator's, said again, is obeyed."""
-    true_objection = SafetyGate._objection
+    true_objection = SafetyGate.rejection_reason
 
     def objection(self: SafetyGate, *about: object) -> str:
         said = true_objection(self, *about)  # type: ignore[arg-type]
         return "" if said == "not newer than the last command" else said
 
-    monkeypatch.setattr(SafetyGate, "_objection", objection)
+    monkeypatch.setattr(SafetyGate, "rejection_reason", objection)
     assert "a stranger's command was obeyed" in fuzz.fuzz("vehicle_driven", 5000, 1).broke

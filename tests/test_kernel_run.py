@@ -13,7 +13,7 @@ from tests.kernel.lane.command import pytest_arguments, writable
 RUN = Path(__file__).parent / "kernel" / "run"
 
 
-def refusal(*arguments: str, **environment: str) -> str:
+def rejection(*arguments: str, **environment: str) -> str:
     done = subprocess.run(
         [sys.executable, str(RUN), *arguments],
         env={**os.environ, **environment},
@@ -45,7 +45,7 @@ def test_tests_are_named_by_their_file_alone(given: list[str], passed: list[str]
 
 def test_without_debian_it_says_what_to_do(tmp_path: Path) -> None:
     """Where there is no apt-get, one sentence names a system that has it."""
-    assert "use Debian or Ubuntu" in refusal(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
+    assert "use Debian or Ubuntu" in rejection(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
 
 
 def test_without_the_archive_it_says_what_to_do(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_without_the_archive_it_says_what_to_do(tmp_path: Path) -> None:
         stand_in.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('E: Could not resolve the archive')\n")
         stand_in.chmod(0o755)
 
-    said = refusal(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
+    said = rejection(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
 
     assert "Could not resolve the archive" in said
     assert "connect this machine" in said
@@ -65,7 +65,7 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     """Where the cache directory cannot be made, one sentence names LAVT_KERNEL."""
     (tmp_path / "file").touch()
 
-    assert "LAVT_KERNEL" in refusal(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
+    assert "LAVT_KERNEL" in rejection(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
 
 
 @pytest.mark.parametrize("told", [False, True])

@@ -181,7 +181,7 @@ def test_counts_are_read_from_pytests_closing_line() -> None:
 
 def test_the_table_says_what_failed() -> None:
     """The table has a line for each lane with its time and counts, and below it why lanes failed."""
-    outcomes = [Outcome("quick", 61.2, Counter(passed=5, rerun=1)), Outcome("field", 5, Counter(failed=1), ["because"])]
+    outcomes = [Outcome("quick", 61.2, Counter(passed=5, rerun=1)), Outcome("field", 5, Counter(failed=1), ["reason"])]
     lines = table(outcomes).splitlines()
     assert lines[1].split() == ["quick", "1:01", "5", "0", "0", "0", "1", "0"]
     assert lines[2].split()[-1] == "FAILED"

@@ -45,7 +45,7 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
             epoch, number, 0, WALL_NS + at_ns, 0, 0.0, throttle=0.0, brake=1.0,
             path_curvature_per_m=(0.0,) * 10, mode="arm", emergency_stop=0,
         )  # fmt: skip
-        assert gate.admit(neutral, car.state(), at_ns).obeyed
+        assert gate.admit(neutral, car.state(), at_ns).accepted
     assert gate.state == "driving"
     return gate, epoch
 
@@ -138,8 +138,8 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     picture_age_ns = now_ns - START_NS
     assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + LEAST_HOLD_NS
     car.advance(now_ns)
-    assert gate.admit(received, car.state(), now_ns).obeyed
-    assert not gate.admit(received, car.state(), now_ns).obeyed, "nothing is obeyed twice"
+    assert gate.admit(received, car.state(), now_ns).accepted
+    assert not gate.admit(received, car.state(), now_ns).accepted, "nothing is obeyed twice"
 
     # 13. The vehicle obeys: it stood until now, and moves from now on.
     assert car.state().speed_mps == 0.0

@@ -211,9 +211,10 @@ def test_bad_arguments(words: list[str]) -> None:
 def test_mutants_of_a_small_module_are_tried(tmp_path: Path) -> None:
     """The program tries some mutants, keeps the results, runs none of them twice, and runs survivors again."""
     file = tmp_path / "results.jsonl"
-    asked = [sys.executable, str(PROGRAM), "--only", "vehicle/dbw/crc8.py", "--out", str(file)]
+    requested = [sys.executable, str(PROGRAM), "--only", "vehicle/dbw/crc8.py", "--out", str(file)]
     first, second = (
-        subprocess.run([*asked, "--count", "3"], capture_output=True, text=True, check=True, timeout=250) for _ in "12"
+        subprocess.run([*requested, "--count", "3"], capture_output=True, text=True, check=True, timeout=250)
+        for _ in "12"
     )
     kept = [json.loads(line) for line in file.read_text().splitlines()]
     assert len(kept) == 3
@@ -224,7 +225,7 @@ def test_mutants_of_a_small_module_are_tried(tmp_path: Path) -> None:
     source = (REPOSITORY / "src/lavt/vehicle/dbw/crc8.py").read_text()
     assert all(each["line"] in source for each in kept)
     file.write_text(json.dumps({**kept[0], "caught": False, "by": ""}) + "\n")
-    subprocess.run([*asked, "--rerun-survivors"], capture_output=True, text=True, check=True, timeout=250)
+    subprocess.run([*requested, "--rerun-survivors"], capture_output=True, text=True, check=True, timeout=250)
     assert [json.loads(line)["caught"] for line in file.read_text().splitlines()] == [False, kept[0]["caught"]]
 
 

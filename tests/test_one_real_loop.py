@@ -35,19 +35,19 @@ def records(out: Path) -> tuple[Record, Record]:
     return read_record(out / "server.mcap"), read_record(out / "client.mcap")
 
 
-def test_pictures_arrive_and_commands_are_obeyed(records: tuple[Record, Record]) -> None:
+def test_pictures_arrive_and_commands_are_accepted(records: tuple[Record, Record]) -> None:
     """The client reads stamps that the vehicle wrote in its pictures, and the vehicle obeys commands made from them."""
     server, client = records
     sent, read = (set(table.ints("stamp_ns").tolist()) for table in (server.table("frame"), client.table("picture")))
     assert len(sent & read) > 30
     admissions = server.table("admission")
-    obeyed = {
+    accepted = {
         stamp_ns
         for stamp_ns, verdict in zip(admissions.ints("stamp_ns").tolist(), admissions.texts("verdict"), strict=True)
-        if verdict == "obeyed"
+        if verdict == "accepted"
     }
-    assert len(obeyed) > 10
-    assert obeyed <= sent & read
+    assert len(accepted) > 10
+    assert accepted <= sent & read
 
 
 def test_the_car_moved(records: tuple[Record, Record]) -> None:

@@ -40,10 +40,10 @@ class FakeProbe:
 
     reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
     above: bool = True
-    asked: int = 0
+    requested: int = 0
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
-        self.asked += 1
+        self.requested += 1
         return self.reports.pop(0) if self.reports else (2**62, [])
 
     def end(self) -> None:  # noqa: D102 (of `Probe`)
@@ -80,11 +80,11 @@ def test_the_share_is_that_of_the_worst_processor_within_the_time() -> None:
 def test_what_is_in_time_asks_for_no_record() -> None:
     """A verdict on what is as it should be does not wait for the probes."""
     stalls = stalls_of()
-    asked = stalls.probes[0].asked  # type: ignore[attr-defined]
+    requested = stalls.probes[0].requested  # type: ignore[attr-defined]
     stalls.require(True, "late", 0, 100)
     with stalls.judging(0, 100):
         pass
-    assert stalls.probes[0].asked == asked  # type: ignore[attr-defined]
+    assert stalls.probes[0].requested == requested  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ class EndedProbe(FakeProbe):
     """Has ended after its first report."""
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
-        if self.asked:
+        if self.requested:
             raise ProbeEnded("the lateness probe of processor 7 ended with -9")
         return super().report()
 

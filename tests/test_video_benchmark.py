@@ -22,11 +22,11 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 def test_what_is_not_said_on_the_command_line_is_as_the_claim_needs_it() -> None:
     """Without options there are several pairs, a minute of frames on the impaired link, and no part is left out."""
-    asked = video_vs_gstreamer.arguments([])
-    assert asked.pairs > 1
-    assert asked.frames >= 60 * 30
-    assert asked.only is None
-    assert set(video_vs_gstreamer.parts(asked, Path())) >= {"480p", "720p", "reorder", "loss1", "loss5"}
+    requested = video_vs_gstreamer.arguments([])
+    assert requested.pairs > 1
+    assert requested.frames >= 60 * 30
+    assert requested.only is None
+    assert set(video_vs_gstreamer.parts(requested, Path())) >= {"480p", "720p", "reorder", "loss1", "loss5"}
 
 
 @pytest.mark.parametrize("words", [["--pairs", "0"], ["--seconds", "0"], ["--frames", "0"]])

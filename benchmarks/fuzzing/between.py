@@ -42,7 +42,7 @@ def rendezvous(_seed: int) -> Target:
     key = Code()
     forwarder = Forwarder("vehicle-1", "video", key)
     now_ns, registered_ns = START.mono_ns, 0
-    asked = set[tuple[str, int]]()
+    requested = set[tuple[str, int]]()
 
     def registration(wall_ns: int) -> bytes:
         said = write_registration("vehicle-1", "video", wall_ns, None)
@@ -65,17 +65,17 @@ def rendezvous(_seed: int) -> Target:
         if passed is not None and sender != VEHICLE:
             expect(passed[1] == VEHICLE, "a stranger has something sent to somebody else")
             expect(unwrap(passed[0]) == (sender, data), "the vehicle is told something else than was sent")
-            asked.add(sender)
+            requested.add(sender)
         elif passed is not None:
-            expect(passed[1] in asked, "something goes to who has not asked")
+            expect(passed[1] in requested, "something goes to who has not asked")
         expect(forwarder.vehicle_at(now_ns) == VEHICLE, "the vehicle is somewhere else")
         clients = forwarder._clients
         expect(max(len(clients._answered), len(clients._unanswered)) <= MOST_CLIENTS, "clients are kept for ever")
 
-    def refused() -> int:
+    def rejected() -> int:
         counts = forwarder.counts
         return total(counts, "") - counts["registrations"] - total(counts, "to_clients", "to_vehicle")
 
     expect(len(key.sign(b"")) == SIGNATURE_BYTES, "a code is as long as a signature")
     corpora = {"registration": registrations, "wrapped": wrapped, "client": client}
-    return Target(corpora, feed, refused, lambda: f"{forwarder.counts['to_clients']} passed on to clients")
+    return Target(corpora, feed, rejected, lambda: f"{forwarder.counts['to_clients']} passed on to clients")

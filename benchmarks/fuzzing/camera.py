@@ -131,14 +131,14 @@ def feedback(seed: int) -> Target:
             bench.give("feedback", reports[0], HOME)
         expect(strayed == 0, "video went where nobody has proven to be")
 
-    def refused() -> int:
+    def rejected() -> int:
         return total(node.counts, "path_", "feedback_")
 
     def finish() -> str:
         expect(node.counts.get("frames_sent", 0) == frames, "frames were lost")
         return f"{frames} frames sent, {node.counts.get('keyframes_on_request', 0)} keyframes"
 
-    return Target({"path": path, "rtcp": rtcp}, feed, refused, finish)
+    return Target({"path": path, "rtcp": rtcp}, feed, rejected, finish)
 
 
 def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
@@ -160,7 +160,7 @@ def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chance i
         bench.go(STEP_NS)
 
     def finish() -> str:
-        expect(answered + node.counts["probes_refused"] == inputs, "probes were lost")
+        expect(answered + node.counts["probes_rejected"] == inputs, "probes were lost")
         return f"{answered} answered"
 
-    return Target({"probe_request": corpus}, feed, lambda: node.counts["probes_refused"], finish)
+    return Target({"probe_request": corpus}, feed, lambda: node.counts["probes_rejected"], finish)

@@ -106,8 +106,10 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
 
     bench = Bench(new_driver(), hear)
     wall_ns = START.wall_ns
-    state = State(wall_ns, START.mono_ns, 8.0, 0.01, "drive", "driving", "armed by the client", 12, "", holder="alice")
-    stopped = replace(state, speed_mps=0.0, safety="safe_stop", refused="not the epoch in force", asked_by="bob")
+    state = State(
+        wall_ns, START.mono_ns, 8.0, 0.01, "drive", "driving", "armed by the client", 12, "", active_operator="alice"
+    )
+    stopped = replace(state, speed_mps=0.0, safety="safe_stop", rejected="not the epoch in force", requested_by="bob")
     reply = SessionReply(True, "", 2**63 + 1, TOKEN, 5600, "kernel", 0)
     states = Corpus([encode(each) for each in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True)
     replies = Corpus([encode(each) for each in (reply, SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns))],
@@ -119,7 +121,7 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         nonlocal inputs, unreadable
         inputs += 1
         if stops_after is None and inputs % ANEW == 0:
-            unreadable = refused()
+            unreadable = rejected()
             bench.node = new_driver()
         bench.give(channel, data)
         bench.go(STEP_NS)
@@ -128,14 +130,14 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
         if inputs == stops_after:
             bench.give("operator", "emergency_stop")
 
-    def refused() -> int:
+    def rejected() -> int:
         return unreadable + total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
 
     def finish() -> str:
         expect(inputs < 1000 or commands > 0, "the driver said nothing")
         return f"{commands} commands, {modes} of them to drive"
 
-    return Target({"state": states, "session_reply": replies}, feed, refused, finish)
+    return Target({"state": states, "session_reply": replies}, feed, rejected, finish)
 
 
 def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
@@ -160,15 +162,15 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no cha
         if inputs % 500 == 0:
             bench.give("injected", InjectionResult(1, "", "", (("control", 75.1),)))
 
-    def refused() -> int:
+    def rejected() -> int:
         return node.counts["netem_replies_unreadable"]
 
     def finish() -> str:
-        expect(told + refused() == inputs, "replies were lost")
+        expect(told + rejected() == inputs, "replies were lost")
         return f"{told} told to the driver"
 
     corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob holds the vehicle"))], packed=True)
-    return Target({"netem_reply": corpus}, feed, refused, finish)
+    return Target({"netem_reply": corpus}, feed, rejected, finish)
 
 
 def units(seed: int, number: int) -> list[tuple[int, bytes]]:
@@ -249,7 +251,7 @@ def video(seed: int) -> Target:
         if inputs % 33 == 0:
             true_frame()
 
-    def refused() -> int:
+    def rejected() -> int:
         unreadable = total(node.counts, "packets_unreadable", "challenges_unreadable")
         return unreadable + total(node.counts, "repair_malformed", "payloads_malformed")
 
@@ -257,7 +259,7 @@ def video(seed: int) -> Target:
         recovered = node.counts["packets_recovered"]
         return f"{shown} access units, {whole} whole, {recovered} packets made again"
 
-    return Target(corpora, feed, refused, finish)
+    return Target(corpora, feed, rejected, finish)
 
 
 def pictures(seed: int) -> Target:
@@ -300,13 +302,13 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance 
         ],
         fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
     )
-    asked = taken = inputs = 0
+    requested = taken = inputs = 0
 
     def hear(send: Send) -> None:
-        nonlocal asked, taken
+        nonlocal requested, taken
         taken += send.channel == "clock_probe"
         if send.channel == "probe_request":
-            asked += 1
+            requested += 1
             sequence, sent_wall_ns = decode_request(send.payload)
             corpus.heard.append(
                 encode_reply(ProbeReply(sequence, sent_wall_ns, sent_wall_ns + 5, sent_wall_ns + 9, None, None))
@@ -321,11 +323,11 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance 
         bench.go(STEP_NS)
 
     def finish() -> str:
-        expect(taken <= asked, "a request was answered twice")
-        expect(taken + node.counts["probes_refused"] == inputs, "answers were lost")
-        return f"{taken} of {asked} probes answered"
+        expect(taken <= requested, "a request was answered twice")
+        expect(taken + node.counts["probes_rejected"] == inputs, "answers were lost")
+        return f"{taken} of {requested} probes answered"
 
-    return Target({"probe_reply": corpus}, feed, lambda: node.counts["probes_refused"], finish)
+    return Target({"probe_reply": corpus}, feed, lambda: node.counts["probes_rejected"], finish)
 
 
 def stamps(seed: int) -> Target:
@@ -336,10 +338,10 @@ def stamps(seed: int) -> Target:
         luma = generator.integers(0, 256, (STAMP_PX, STAMP_PX), dtype=np.uint8)
         write_stamp_luma(luma, START.wall_ns + each)
         planes.append(bytes((STAMP_PX, STAMP_PX)) + luma.tobytes())
-    refusals = 0
+    rejections = 0
 
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal refusals
+        nonlocal rejections
         sides = (data[0], data[1]) if len(data) > 1 else (0, 0)
         pixels = np.frombuffer(data[2:], np.uint8)
         whole = sides[0] * sides[1] > 0 and pixels.size >= sides[0] * sides[1]
@@ -348,7 +350,7 @@ def stamps(seed: int) -> Target:
             try:
                 expect(0 <= read(luma) < 2**64, "a stamp of more than 64 bits")
             except BadPacket:
-                refusals += 1
+                rejections += 1
 
     corpus = Corpus(planes, fields=((0, 1), (1, 1), (2, 8)))
-    return Target({"luma": corpus}, feed, lambda: refusals)
+    return Target({"luma": corpus}, feed, lambda: rejections)

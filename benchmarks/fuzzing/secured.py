@@ -34,7 +34,7 @@ from lavt.transport.video.cipher import SrtpCipher
 from lavt.transport.video.path_validation import PathClient, PathServer, is_path_datagram
 from lavt.transport.video.stream_sender import StreamSender
 
-DOOR_STEP_NS = 4 * NS_PER_MS
+GATEWAY_STEP_NS = 4 * NS_PER_MS
 """Between two inputs: more of them a second would stay outside unread."""
 EPOCH = 2**63 + 7
 EVERYWHERE = tuple((at, 1) for at in range(0, 400, 3))
@@ -51,13 +51,13 @@ def keys(seed: int) -> tuple[PrivateKey, PrivateKey]:
     return vehicle, operator
 
 
-def door_of_vehicle(seed: int) -> Target:
+def gateway_of_vehicle(seed: int) -> Target:
     """Altered and replayed envelopes at the vehicle's door: only what the operator has said gets in, a query once."""
     vehicle_key, operator_key = keys(seed)
     inside: list[tuple[str, bytes]] = []
     outside: list[Send] = []
     sequence = 0
-    door = ServerGateway(
+    gateway = ServerGateway(
         lambda channel, body, _arrived, _peer: inside.append((channel, body)),
         lambda *sends: outside.extend(sends),
         lambda: (EPOCH, sequence),
@@ -68,16 +68,16 @@ def door_of_vehicle(seed: int) -> Target:
 
     def ask(body: bytes, answer: bytes) -> bytes:
         """Ask as the operator does, twice where the vehicle wants that; gives the request that was taken."""
-        request = desk.seal_request("session", body)
-        door.let_in("session", request, now, "query")
+        request = desk.sign_request("session", body)
+        gateway.receive("session", request, now, "query")
         if not inside:
             again = desk.open_reply("session", outside.pop().payload).again
             expect(again is not None, "the operator was not told to ask again")
             request = again or b""
-            door.let_in("session", request, now, "query")
+            gateway.receive("session", request, now, "query")
         expect(inside == [("session", body)], "the operator's request did not get in")
         inside.clear()
-        door.send(Send("session_reply", answer, "query"))
+        gateway.send(Send("session_reply", answer, "query"))
         expect(desk.open_reply("session", outside.pop().payload).body == answer, "the operator cannot read his answer")
         return request
 
@@ -85,7 +85,7 @@ def door_of_vehicle(seed: int) -> Target:
 
     def command() -> bytes:
         said.append(encode(Command(EPOCH, sequence + 1, 1, 2, 3, 0.1, 0.5, 0.0, STRAIGHT, "drive", 0)))
-        return desk.seal_command(said[-1])
+        return desk.sign_command(said[-1])
 
     corpora = {
         "session": Corpus([ask(HOLD, GRANTED), ask(HOLD, GRANTED)], fields=EVERYWHERE),
@@ -97,55 +97,55 @@ def door_of_vehicle(seed: int) -> Target:
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, now, sequence
         inputs += 1
-        now = now.later(DOOR_STEP_NS)
-        door.let_in(channel, data, now, "stranger")
+        now = now.later(GATEWAY_STEP_NS)
+        gateway.receive(channel, data, now, "stranger")
         for came, body in inside:
             expect(came == "control" and (body in said or body in first), f"what nobody said got in at {came}")
         inside.clear()
         outside.clear()
         if inputs % 20 == 0:
-            sealed = command()
-            door.let_in("control", sealed, now, None)
+            signed = command()
+            gateway.receive("control", signed, now, None)
             expect(inside == [("control", said[-1])], "the operator's command did not get in")
             inside.clear()
-            corpora["control"].heard.append(sealed)
+            corpora["control"].heard.append(signed)
             sequence += 1
 
-    return Target(corpora, feed, lambda: total(door.counts, "commands_", "session_"))
+    return Target(corpora, feed, lambda: total(gateway.counts, "commands_", "session_"))
 
 
-def door_of_operator(seed: int) -> Target:
+def gateway_of_operator(seed: int) -> Target:
     """Altered and replayed states and replies at the operator's door: only what the vehicle says gets in, once."""
     vehicle_key, operator_key = keys(seed)
     car = VehicleAuthenticator("car", vehicle_key, {"alice": operator_key.public})
     inside: list[bytes] = []
     outside: list[Send] = []
-    door = ClientGateway(
+    gateway = ClientGateway(
         lambda _channel, body, _arrived, _peer: inside.append(body),
         lambda *sends: outside.extend(sends),
         OperatorAuthenticator("car", "alice", operator_key, vehicle_key.public),
     )
     hurry: Any = outside.append
-    door._send_soon = hurry  # type: ignore[method-assign]  # noqa: SLF001 (here no thread is needed)
+    gateway._send_soon = hurry  # type: ignore[method-assign]  # noqa: SLF001 (here no thread is needed)
     now = START
 
     def answer(body: bytes) -> bytes:
         """Answer the request that is outside, and let the door hear it; gives the reply's bytes."""
         request = car.open_request("session", outside.pop().payload)
         assert request is not None
-        reply = car.seal_reply(request, b"" if request.is_stale else body)
-        door.let_in("session_reply", reply, now, None)
+        reply = car.sign_reply(request, b"" if request.is_stale else body)
+        gateway.receive("session_reply", reply, now, None)
         return reply
 
     def state(number: int) -> tuple[bytes, bytes]:
         body = encode(State(number, number, 8.0, 0.0, "drive", "driving", "", number, ""))
-        return body, car.seal_state(body)
+        return body, car.sign_state(body)
 
-    door.send(Send("session", HOLD))
+    gateway.send(Send("session", HOLD))
     replies = [answer(GRANTED), answer(GRANTED)]
     old = [state(number)[1] for number in range(8)]
     for each in old:
-        door.let_in("state", each, now, None)
+        gateway.receive("state", each, now, None)
     expect(len(inside) == 1 + len(old), "the vehicle's own messages did not get in")
     inside.clear()
     corpora = {
@@ -158,18 +158,18 @@ def door_of_operator(seed: int) -> Target:
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, now
         inputs += 1
-        now = now.later(DOOR_STEP_NS)
-        door.let_in(channel, data, now, None)
+        now = now.later(GATEWAY_STEP_NS)
+        gateway.receive(channel, data, now, None)
         expect(inside == [], f"what the vehicle did not say, or said before, got in as {channel}")
         outside.clear()
         if inputs % 20 == 0:
-            body, sealed = state(100 + inputs)
-            door.let_in("state", sealed, now, None)
+            body, signed = state(100 + inputs)
+            gateway.receive("state", signed, now, None)
             expect(inside == [body], "the vehicle's state did not get in")
             inside.clear()
-            corpora["state"].heard.append(sealed)
+            corpora["state"].heard.append(signed)
 
-    return Target(corpora, feed, lambda: total(door.counts, "state", "session_", "netem_"))
+    return Target(corpora, feed, lambda: total(gateway.counts, "state", "session_", "netem_"))
 
 
 def encrypted_video(seed: int) -> Target:
@@ -201,26 +201,26 @@ def encrypted_video(seed: int) -> Target:
     encoded = [unit for _, unit in units(seed, 30)]
     corpora = video_corpora(encoded[:10])
     report = sender_report(77, wall_ns=1, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=[])
-    corpora["rtcp"].heard.append(server.cipher.seal_control(report))
+    corpora["rtcp"].heard.append(server.cipher.protect_control(report))
 
     def true_frame() -> list[bytes]:
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         frame += 1
-        return [server.cipher.seal(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
+        return [server.cipher.authenticator(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
 
-    sealed = true_frame()
-    corpora["rtp"] = Corpus(sealed, fields=EVERYWHERE)
+    signed = true_frame()
+    corpora["rtp"] = Corpus(signed, fields=EVERYWHERE)
 
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, sent, sealed
+        nonlocal inputs, sent, signed
         inputs += 1
         if inputs % 33 == 1:
-            sealed = sealed if inputs == 1 else true_frame()
-            for datagram in sealed:
+            signed = signed if inputs == 1 else true_frame()
+            for datagram in signed:
                 bench.give("rtp", datagram)
-            sent += len(sealed)
-            corpora["rtp"].heard.extend(sealed)
+            sent += len(signed)
+            corpora["rtp"].heard.extend(signed)
         bench.give("rtp", data)
         bench.go(STEP_NS)
         counted = node.counts.get("packets", 0) + node.counts.get("packets_of_repair", 0)
@@ -246,26 +246,26 @@ def encrypted_feedback(seed: int) -> Target:
     bench.give("feedback", client.answer(challenge.payload), HOME)
     report, please = rtcp_reports()[0], picture_loss(1, 2)
     corpus = Corpus(
-        [client.seal_control(each) for each in (report, please, report)], fields=tuple((at, 1) for at in range(96))
+        [client.protect_control(each) for each in (report, please, report)], fields=tuple((at, 1) for at in range(96))
     )
     for each in corpus.entries:
         bench.give("feedback", each, HOME)
-    inputs, asked = 0, 1
+    inputs, requested = 0, 1
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, asked
+        nonlocal inputs, requested
         inputs += 1
         bench.give(channel, data, HOME)
         bench.go(STEP_NS)
         if inputs % 500 == 0:
-            said = client.seal_control(please if inputs % 1000 == 0 else report)
-            asked += inputs % 1000 == 0
+            said = client.protect_control(please if inputs % 1000 == 0 else report)
+            requested += inputs % 1000 == 0
             bench.give("feedback", said, HOME)
             corpus.heard.append(said)
-        expect(node.counts.get("keyframes_on_request", 0) <= asked, "a keyframe was made that nobody asked for")
+        expect(node.counts.get("keyframes_on_request", 0) <= requested, "a keyframe was made that nobody asked for")
 
     def finish() -> str:
         expect(path.open_address(bench.now.mono_ns) == HOME, "the path of a client that reports was closed")
-        return f"{node.counts['keyframes_on_request']} of {asked} requests for a keyframe heard"
+        return f"{node.counts['keyframes_on_request']} of {requested} requests for a keyframe heard"
 
     return Target({"feedback": corpus}, feed, lambda: total(node.counts, "path_", "feedback_"), finish)

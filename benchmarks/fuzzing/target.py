@@ -30,7 +30,7 @@ class Target:
     corpora: Mapping[str, Corpus]
     """By channel."""
     feed: Callable[[str, bytes, Chance], None]
-    refused: Callable[[], int]
+    rejected: Callable[[], int]
     """How many inputs were refused until now."""
     finish: Callable[[], str] = field(default=lambda: "")
     """Checks what must hold in the end, and gives something to say of the run."""

@@ -60,7 +60,7 @@ class Standing:
 
     def __init__(self) -> None:
         self.now_ns = START.mono_ns
-        self.asked = Actuation(0.0, 0.0, 1.0)
+        self.requested = Actuation(0.0, 0.0, 1.0)
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Live until then."""
@@ -69,7 +69,7 @@ class Standing:
 
     def apply(self, actuation: Actuation, _now_ns: int) -> None:
         """Obey."""
-        self.asked = actuation
+        self.requested = actuation
 
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Do nothing."""
@@ -147,7 +147,7 @@ class Vehicle:
             self.turn()
             if self.gate.state == "driving":
                 return
-        raise Wrong(f"the operator cannot arm the vehicle: {self.gate.refused}")
+        raise Wrong(f"the operator cannot arm the vehicle: {self.gate.rejected}")
 
 
 def old_commands() -> list[bytes]:
@@ -173,7 +173,7 @@ def _feed(side: Vehicle, channel: str, data: bytes) -> list[Send]:
     """Give an input of a stranger's: none of his commands is obeyed, and what he is answered can be read."""
     sends = side.bench.give(channel, data, 2)
     for admission in of(sends, "admission"):
-        expect(admission.verdict == "refused", "a stranger's command was obeyed")
+        expect(admission.verdict == "rejected", "a stranger's command was obeyed")
     for reply in of(sends, "session_reply"):
         decode(SessionReply, reply)
         expect(len(reply) <= MAX_MESSAGE_BYTES, "a reply is too long")
@@ -188,11 +188,11 @@ def _counted(side: Vehicle, given: dict[str, int]) -> None:
     expect(queries == given["session"], f"{given['session']} queries were given, {queries} counted")
 
 
-def _refused(side: Vehicle) -> int:
+def _rejected(side: Vehicle) -> int:
     counts = side.node.counts
-    refusals = sum(number for name, number in counts.items() if name.startswith("session ") and "refused" in name)
+    rejections = sum(number for name, number in counts.items() if name.startswith("session ") and "rejected" in name)
     unreadable = counts.get("commands_unreadable", 0) + counts.get("session_requests_unreadable", 0)
-    return unreadable + total(counts, "refused: ") + refusals
+    return unreadable + total(counts, "refused: ") + rejections
 
 
 def vehicle_at_rest(seed: int) -> Target:
@@ -207,14 +207,14 @@ def vehicle_at_rest(seed: int) -> Target:
             side.picture()
         _feed(side, channel, data)
         expect(side.gate.state in ("disarmed", "emergency_stop"), f"a stranger has led to {side.gate.state}")
-        asked = side.vehicle.asked
-        expect((asked.throttle, asked.brake) == (0.0, 1.0), "the vehicle does not brake")
+        requested = side.vehicle.requested
+        expect((requested.throttle, requested.brake) == (0.0, 1.0), "the vehicle does not brake")
 
     def finish() -> str:
         _counted(side, given)
         return f"ended {side.gate.state}"
 
-    return Target({"control": side.control, "session": side.session}, feed, lambda: _refused(side), finish)
+    return Target({"control": side.control, "session": side.session}, feed, lambda: _rejected(side), finish)
 
 
 def vehicle_driven(seed: int) -> Target:
@@ -234,22 +234,28 @@ def vehicle_driven(seed: int) -> Target:
         inputs += 1
         if side.gate.state != "driving" and inputs % 500 == 0:
             side.arm()
-        before, holder = side.gate.state, side.gate.holder
+        before, active_operator = side.gate.state, side.gate.active_operator
         driven += before == "driving"
         _feed(side, channel, data)
-        taken = before == "emergency_stop" and side.gate.holder is not None and side.gate.holder[0] != "operator"
+        taken = (
+            before == "emergency_stop"
+            and side.gate.active_operator is not None
+            and side.gate.active_operator[0] != "operator"
+        )
         allowed = (before, "emergency_stop", *(("disarmed",) if taken else ()))
         expect(side.gate.state in allowed, f"a stranger has led from {before} to {side.gate.state}")
-        expect(side.gate.holder == holder or before != "driving", "a stranger has taken a driven vehicle")
+        expect(
+            side.gate.active_operator == active_operator or before != "driving", "a stranger has taken a driven vehicle"
+        )
         side.bench.go(STEP_NS)
         if inputs % TURN == 0 and side.gate.state == "driving":
             side.turn()
-            expect(side.vehicle.asked.throttle > 0, f"the operator is not obeyed: {side.gate.refused}")
+            expect(side.vehicle.requested.throttle > 0, f"the operator is not obeyed: {side.gate.rejected}")
 
     return Target(
         {"control": side.control, "session": side.session},
         feed,
-        lambda: _refused(side),
+        lambda: _rejected(side),
         lambda: f"{driven / inputs:.0%} while driving",
     )
 
@@ -282,15 +288,15 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
         bench.give(channel, data, inputs)
         bench.go(STEP_NS * chance.below(20))
         if inputs % 500 == 0:  # the queues are slow: until then nobody is answered who asked for another condition
-            because = "" if chance.below(4) else "there is no such interface"
-            bench.give("injected", InjectionResult(newest, because, "", (("video", 150.2),)))
+            reason = "" if chance.below(4) else "there is no such interface"
+            bench.give("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
-    def refused() -> int:
+    def rejected() -> int:
         return node.counts["netem_requests_unreadable"] + node.counts["netem refused"]
 
     def finish() -> str:
-        answered = refused() + node.counts["netem granted"]
+        answered = rejected() + node.counts["netem granted"]
         expect(answered == inputs, f"{inputs} queries were given, {answered} counted")
         return f"{node.counts['netem granted']} granted"
 
-    return Target({"netem": corpus}, feed, refused, finish)
+    return Target({"netem": corpus}, feed, rejected, finish)

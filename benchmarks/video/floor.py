@@ -10,14 +10,14 @@ from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from benchmarks.video.pictures import picture_of, planes_loop
-from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, asked_run, freeze, tell, wall_ns
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, freeze, requested_run, tell, wall_ns
 
 from lavt.transport.video.stamp import write_stamp_i420
 
 
 def main() -> None:
     """Measure as many frames as asked."""
-    run = asked_run()
+    run = requested_run()
     loop = planes_loop(run.loop)
     encoder, decoder = _encoder(run), plain_decoder()
     planes = np.empty_like(loop[0])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.video.gstreamer import gstreamer, receiving
-from benchmarks.video.run import Run, asked_run, freeze, tell, wait_for_line, wall_ns
+from benchmarks.video.run import Run, freeze, requested_run, tell, wait_for_line, wall_ns
 from benchmarks.video.watch import Watch
 
 from lavt.transport.video.stamp import read_stamp
@@ -16,7 +16,7 @@ from lavt.transport.video.stamp import read_stamp
 
 def main() -> None:
     """Receive until it is told to end."""
-    run = asked_run()
+    run = requested_run()
     gst = gstreamer()
     pipeline = gst.parse_launch(receiving(run))
     pipeline.set_state(gst.State.PLAYING)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from benchmarks.video.gstreamer import gstreamer, sending
 from benchmarks.video.pictures import picture_of, planes_loop
-from benchmarks.video.run import Pace, Run, asked_run, cpu_ns, freeze, save_units, tell, wait_for_line, wall_ns
+from benchmarks.video.run import Pace, Run, cpu_ns, freeze, requested_run, save_units, tell, wait_for_line, wall_ns
 from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_S
@@ -16,7 +16,7 @@ from lavt.transport.video.stamp import write_stamp_i420
 
 def main() -> None:
     """Send as many frames as asked from when it is told to begin."""
-    run = asked_run()
+    run = requested_run()
     gst = gstreamer()
     pipeline = gst.parse_launch(sending(run))
     pipeline.set_state(gst.State.PLAYING)

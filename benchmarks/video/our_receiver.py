@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.video.product import LOOPBACK, Ends, WatchedPictures, receiver_nodes
-from benchmarks.video.run import TOKEN, asked_run, tell, wait_for_line
+from benchmarks.video.run import TOKEN, requested_run, tell, wait_for_line
 from benchmarks.video.watch import Watch
 
 from lavt.domain import Now
@@ -31,7 +31,7 @@ class ReadPictures:
 
 def main() -> None:
     """Receive until it is told to end."""
-    run = asked_run()
+    run = requested_run()
     watch = Watch(run)
     read = ReadPictures(watch)
     ends = Ends("rtp", read, remote=(LOOPBACK, run.port))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from benchmarks.video.product import Ends, sender_nodes
-from benchmarks.video.run import TOKEN, Run, Table, asked_run, cpu_ns, save_units, tell, wait_for_line
+from benchmarks.video.run import TOKEN, Run, Table, cpu_ns, requested_run, save_units, tell, wait_for_line
 
 from lavt.domain import Now
 
@@ -42,7 +42,7 @@ class SentFrames:
 
 def main() -> None:
     """Send as many frames as asked from when it is told to begin."""
-    run = asked_run()
+    run = requested_run()
     sent = SentFrames(run)
     ends = Ends("feedback", sent)
     tell({"port": ends.port})

@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from benchmarks.video.run import asked_run, freeze, tell
+from benchmarks.video.run import freeze, requested_run, tell
 from benchmarks.video.sides import WARM_UP_FRAMES
 
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -126,7 +126,7 @@ def carry(near: socket.socket, far: socket.socket, there: Address, case: Case, *
 
 def main() -> None:
     """Carry until told to end, then tell what was carried."""
-    run, side, case = asked_run(), sys.argv[2], Case(**json.loads(sys.argv[3]))
+    run, side, case = requested_run(), sys.argv[2], Case(**json.loads(sys.argv[3]))
     near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     for each in (near, far):
         each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)

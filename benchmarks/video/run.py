@@ -75,7 +75,7 @@ def load_units(run: Run) -> list[bytes]:
     return [data[begin:end] for begin, end in zip([0, *ends], ends, strict=False)]
 
 
-def asked_run() -> Run:
+def requested_run() -> Run:
     """Take the run from the command line."""
     return Run(**json.loads(sys.argv[1]))
 

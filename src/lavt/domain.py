@@ -70,7 +70,7 @@ class VehicleState:
     speed_mps: float
     steering_rad: float
     gear: Literal["park", "reverse", "neutral", "drive"]
-    hindrance: str = ""
+    inhibit_reason: str = ""
     """Why the vehicle cannot be driven by command, in words; empty: it can."""
     is_engaged: bool = True
     """It obeys commands now; where that takes time, after `Vehicle.engage`."""
@@ -212,19 +212,19 @@ class State:
     steering_rad: float
     gear: str
     safety: SafetyState
-    because: str
+    reason: str
     """Why the safety state is what it is, in words."""
     applied_sequence: int
     """Sequence of the command last obeyed; -1: none in this epoch."""
-    refused: str
+    rejected: str
     """Why a command was refused, of those in the last second the last; empty: none was."""
     limited: str = ""
     """Which limits changed the command last obeyed; empty: none did."""
-    holder: str = ""
+    active_operator: str = ""
     """Who holds the vehicle; empty: nobody."""
-    holder_instance: int = 0
+    active_operator_instance: int = 0
     """As in that one's `SessionRequest`s: two clients of one name are told apart."""
-    asked_by: str = ""
+    requested_by: str = ""
     """Who asks the holder for the vehicle; empty: nobody."""
     instance: int = 0
     """Random number of the server's process."""
@@ -270,7 +270,7 @@ class NetemReply:
     """The server's answer to a `NetemRequest`: whether the condition is in force."""
 
     granted: bool
-    because: str
+    reason: str
 
 
 @value
@@ -278,7 +278,7 @@ class SessionReply:
     """The server's answer to a `SessionRequest`."""
 
     granted: bool
-    because: str
+    reason: str
     epoch: int
     token: bytes
     """Opens the path of the video (16 bytes); empty when refused."""

@@ -157,9 +157,9 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
     every_step, on_demand, careful = (
         build_server(
             config, lambda: Now(10**12, 10**18), SeededEntropy(1, "server"), host="", video_port=1,
-            fidelity=replace(FIDELITIES["geometry"](), plant=plant), lives_on_demand=asked,
+            fidelity=replace(FIDELITIES["geometry"](), plant=plant), lives_on_demand=requested,
         ).actuator
-        for plant, asked in (
+        for plant, requested in (
             (build_unpictured, False),
             (build_unpictured, True),
             (lambda config: replace(build_unpictured(config), catches_up=False), True),
@@ -178,7 +178,7 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
     assert woken[1] <= 82
 
 
-def test_a_condition_that_cannot_be_asked_for_is_refused_at_the_start() -> None:
+def test_a_condition_that_cannot_be_requested_for_is_rejected_at_the_start() -> None:
     """A client needs an interface for what it must delay itself, and a condition that fits into a request."""
     with pytest.raises(UserError, match=r"injection\.interface"):
         injection_client(ClientInjectionConfig(condition="L4"), "alice", 7, 0)

@@ -18,7 +18,7 @@ def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
 
 
 @pytest.mark.parametrize(
-    ("profile", "obeyed"),
+    ("profile", "accepted"),
     [
         ("dataspeed_gen1", "generation 1"),
         ("dataspeed_gen2", "remote"),
@@ -26,14 +26,14 @@ def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
         ("dataspeed_gen2:user", "user"),
     ],
 )
-def test_the_kit_is_the_profiles(profile: str, obeyed: str) -> None:
+def test_the_kit_is_the_profiles(profile: str, accepted: str) -> None:
     """The kit obeys the commands of the generation and set that the profile is for, and no others."""
     hands: dict[str, Hand1 | Hand2] = {"generation 1": Hand1(), "remote": Hand2(), "user": Hand2(first=0x210)}
     for name, hand in hands.items():
         car = built(profile)
         for frame in hand.commands(Asked(brake=0.5)):
             car.receive(frame, START_NS)
-        assert (car.kit.state.actuators["brake"].order is not None) == (name == obeyed)
+        assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted)
 
 
 def test_the_car_is_the_servers() -> None:

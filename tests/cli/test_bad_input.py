@@ -108,7 +108,7 @@ def test_bad_runs(command: str, case: str, run: Run, tmp_path: Path) -> None:
         changes = [re.sub(r"network\.condition=(\w+)", r"conditions=[\1]", each) for each in changes]
         changes = [each.replace("vehicle.route=nowhere", "routes=[nowhere]") for each in changes]
     ended = run(command, SWEEP if command == "sweep" else DEMO, *changes, "--out", "mine")
-    assert said in ended.refused()
+    assert said in ended.rejected()
     assert files(tmp_path) == {}
 
 
@@ -128,7 +128,7 @@ def test_bad_boundaries(case: str, run: Run, tmp_path: Path) -> None:
     """A boundary that cannot be searched is refused in one sentence, and no directory is made for it."""
     changes, said = BAD_BOUNDARIES[case]
     options = [part for change in changes for part in ("--set", change)]
-    assert said in run("boundary", BOUNDARY, *options, "--out", "mine").refused()
+    assert said in run("boundary", BOUNDARY, *options, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
@@ -157,8 +157,8 @@ BAD_NETEM = {
 def test_bad_netem(case: str, run: Run) -> None:
     """What netem must not or cannot do is refused in one sentence before anything is changed."""
     arguments, said = BAD_NETEM[case]
-    refused = run("netem", *arguments).refused()
-    assert said in refused or "there is no tc" in refused
+    rejected = run("netem", *arguments).rejected()
+    assert said in rejected or "there is no tc" in rejected
 
 
 def test_netem_tells_what_it_would_do(run: Run) -> None:
@@ -189,7 +189,7 @@ MISSING = {
 @pytest.mark.parametrize("command", MISSING)
 def test_missing_file(command: str, run: Run, tmp_path: Path) -> None:
     """A file or directory that is not there is named in one sentence, and nothing is made."""
-    assert "nothing" in run(*MISSING[command]).refused()
+    assert "nothing" in run(*MISSING[command]).rejected()
     assert files(tmp_path) == {}
 
 
@@ -207,7 +207,7 @@ WRONG_CONFIG = {
 @pytest.mark.parametrize("command", WRONG_CONFIG)
 def test_config_of_another_command(command: str, run: Run) -> None:
     """A config that is another command's is refused in one sentence."""
-    run(*WRONG_CONFIG[command]).refused()
+    run(*WRONG_CONFIG[command]).rejected()
 
 
 OUT = {
@@ -231,7 +231,7 @@ def test_nothing_is_overwritten(command: str, occupied: str, run: Run, tmp_path:
     else:
         mine.write_bytes(b"weeks of work")
     before = files(tmp_path)
-    assert "mine" in run(*OUT[command], "mine").refused()
+    assert "mine" in run(*OUT[command], "mine").rejected()
     assert files(tmp_path) == before
 
 
@@ -239,16 +239,16 @@ def test_out_that_cannot_be_made(run: Run, tmp_path: Path) -> None:
     """A directory that cannot be made is refused in one sentence."""
     (tmp_path / "file").write_bytes(b"")
     for arguments in (["demo"], ["sweep", SWEEP]):
-        assert "file/inside" in run(*arguments, "--out", "file/inside").refused()
+        assert "file/inside" in run(*arguments, "--out", "file/inside").rejected()
 
 
 def test_report_of_nothing(run: Run, tmp_path: Path) -> None:
     """A report of a directory without runs is refused, and nothing is written into it."""
     (tmp_path / "empty").mkdir()
-    assert "empty" in run("report", "empty").refused()
-    assert "empty" in run("report", "empty", "--out", "elsewhere").refused()
+    assert "empty" in run("report", "empty").rejected()
+    assert "empty" in run("report", "empty", "--out", "elsewhere").rejected()
     (tmp_path / "file").write_bytes(b"x")
-    assert "file" in run("report", "empty", "--out", "file").refused()
+    assert "file" in run("report", "empty", "--out", "file").rejected()
     assert files(tmp_path) == {"empty": None, "file": b"x"}
 
 
@@ -284,7 +284,7 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
     """A boundary alone is refused, and a boundary.json that is none ends the report with 1 and one sentence."""
     (tmp_path / "found").mkdir()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [{}], "groups": [{}]}')
-    assert "found" in run("report", "found").refused()
+    assert "found" in run("report", "found").rejected()
     (tmp_path / "found" / "boundary.json").write_text('{"runs": [], "groups": 3}')
     ended = run("report", "found")
     assert (ended.code, ended.out) == (1, "")
@@ -294,7 +294,7 @@ def test_report_of_a_boundary_without_runs(run: Run, tmp_path: Path) -> None:
 
 def test_nothing_to_resume(run: Run, tmp_path: Path) -> None:
     """A sweep that was never begun cannot be resumed."""
-    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").refused()
+    assert "never" in run("sweep", SWEEP, "--resume", "--out", "never").rejected()
     assert files(tmp_path) == {}
 
 
@@ -327,7 +327,7 @@ def test_bad_sides(case: str, run: Run, tmp_path: Path) -> None:
     """A server, client, router or relay whose config cannot work is refused in one sentence, and nothing is made."""
     arguments, said = SIDES[case]
     out = ["--out", "mine"] if arguments[0] in {"server", "client"} else []
-    assert said in run(*arguments, *out).refused()
+    assert said in run(*arguments, *out).rejected()
     assert files(tmp_path) == {}
 
 
@@ -372,7 +372,7 @@ def test_list_of_commands(run: Run) -> None:
 
 def test_join_of_nothing(run: Run, tmp_path: Path) -> None:
     """Directories that no side wrote are refused with what to name instead, and no run is made."""
-    said = run("join", "one", "two", "--out", "joined").refused()
+    said = run("join", "one", "two", "--out", "joined").rejected()
     assert "one" in said
     assert "config.yaml" in said
     assert not (tmp_path / "joined").exists()
@@ -413,14 +413,14 @@ def taken() -> Iterator[int]:
 
 def test_relay_port_in_use(taken: int, run: Run) -> None:
     """A relay whose port somebody else has is refused in one sentence."""
-    said = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{taken}").refused()
+    said = run("relay", RELAY, "--set", f"video_listen=127.0.0.1:{taken}").rejected()
     assert f"127.0.0.1:{taken}" in said
 
 
 def test_port_of_the_rendezvous_in_use(taken: int, run: Run) -> None:
     """A rendezvous of whose ports somebody else has one is refused in one sentence, and gives the other one back."""
     changes = ("--set", "bind=127.0.0.1", "--set", "video_port=0", "--set", f"probe_port={taken}")
-    assert f"127.0.0.1:{taken}" in run("rendezvous", RENDEZVOUS, *changes).refused()
+    assert f"127.0.0.1:{taken}" in run("rendezvous", RENDEZVOUS, *changes).rejected()
 
 
 WATCHES = {
@@ -434,33 +434,33 @@ WATCHES = {
 def test_bad_watch(case: str, run: Run) -> None:
     """A host that nobody knows, and an address that is not this machine's, are refused in one sentence."""
     arguments, said = WATCHES[case]
-    assert said in run("watch", *arguments).refused()
+    assert said in run("watch", *arguments).rejected()
 
 
 def test_watched_port_in_use(taken: int, run: Run) -> None:
     """A port that somebody else has is refused in one sentence."""
-    said = run("watch", "--bind", "127.0.0.1", "--port", str(taken)).refused()
+    said = run("watch", "--bind", "127.0.0.1", "--port", str(taken)).rejected()
     assert f"127.0.0.1:{taken}" in said
 
 
 def test_server_of_an_unknown_route(router: str, run: Run, tmp_path: Path) -> None:
     """A server whose road does not exist is refused in one sentence though its links are open, and nothing is made."""
     changes = ("--set", "vehicle.route=nowhere", "--set", "video.port=0", "--set", f"zenoh.router={router}")
-    assert "'nowhere'" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert "'nowhere'" in run("server", SERVER, *changes, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
 def test_server_of_an_unknown_rendezvous(router: str, run: Run, tmp_path: Path) -> None:
     """A server whose rendezvous no one can look up is refused in one sentence, and nothing is made."""
     changes = ("--set", f"rendezvous.host={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "rendezvous.host" in run("server", SERVER, *changes, "--out", "mine").refused()
+    assert "rendezvous.host" in run("server", SERVER, *changes, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
 def test_client_of_an_unknown_server(router: str, run: Run, tmp_path: Path) -> None:
     """A client whose server no one can look up is refused in one sentence, and nothing is made."""
     changes = ("--set", f"video.server={'a' * 64}", "--set", f"zenoh.router={router}")
-    assert "video.server" in run("client", CLIENT, *changes, "--out", "mine").refused()
+    assert "video.server" in run("client", CLIENT, *changes, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
@@ -468,13 +468,13 @@ def test_server_port_in_use(router: str, taken: int, run: Run, tmp_path: Path) -
     """A server whose video port another program uses is refused in one sentence, and nothing is made."""
     changes = (f"video.port={taken}", "video.bind=127.0.0.1", f"zenoh.router={router}")
     sets = [part for change in changes for part in ("--set", change)]
-    assert f"127.0.0.1:{taken}" in run("server", SERVER, "--json", *sets, "--out", "mine").refused()
+    assert f"127.0.0.1:{taken}" in run("server", SERVER, "--json", *sets, "--out", "mine").rejected()
     assert files(tmp_path) == {}
 
 
 def test_client_of_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
     """A client whose router has an endpoint of an unknown protocol is refused in one sentence, and nothing is made."""
-    said = run("client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", "--out", "mine").refused()
+    said = run("client", CLIENT, "--json", "--set", "zenoh.router=foo/127.0.0.1:1", "--out", "mine").rejected()
     assert "zenoh.router" in said
     assert "'foo/127.0.0.1:1'" in said
     assert files(tmp_path) == {}
@@ -482,14 +482,14 @@ def test_client_of_an_unknown_protocol(run: Run, tmp_path: Path) -> None:
 
 def test_stop_without_a_router(run: Run) -> None:
     """A stop that reaches no router is refused in one sentence, which names the command that starts one."""
-    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").refused()
+    assert "`lavt router" in run("stop", CLIENT, "--set", "zenoh.router=tcp/127.0.0.1:1").rejected()
 
 
 def test_a_process_whose_input_is_bad(taken: int) -> None:
     """`python -m lavt` ends by itself with 2 and one sentence; nothing is on its standard output, of Zenoh neither."""
     process = lavt_process("router", ROUTER, "--json", "--set", f"listen.endpoints=[tcp/127.0.0.1:{taken}]")
     out, err = process.communicate(timeout=ENDS_S)
-    assert f"tcp/127.0.0.1:{taken}" in CommandResult(process.returncode, out, err).refused()
+    assert f"tcp/127.0.0.1:{taken}" in CommandResult(process.returncode, out, err).rejected()
 
 
 @pytest.mark.parametrize("command", [["client", CLIENT], ["server", SERVER, "--set", "video.port=0"]])

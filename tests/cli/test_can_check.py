@@ -277,10 +277,10 @@ def test_of_the_reader(run: Run, tmp_path: Path) -> None:
 def test_bad_input(run: Run, tmp_path: Path) -> None:
     """A profile that is none, and a DBC that is missing, are said in one sentence."""
     shutil.copy(shipped_profiles()["dataspeed_gen1"], tmp_path / "alone.yaml")
-    for arguments, because in (
+    for arguments, reason in (
         (["nosuch"], "'nosuch'"),
         ([str(tmp_path / "alone.yaml")], "dataspeed_gen1.dbc"),
         (["dataspeed_gen1", "--dbc", "nosuch.dbc"], "nosuch.dbc"),
         (["dataspeed_gen1:user"], ":user"),
     ):
-        assert because in run(*arguments).refused()
+        assert reason in run(*arguments).rejected()

@@ -112,7 +112,7 @@ def test_any_dbc(run: Run, log: Path, tmp_path: Path) -> None:
     assert "Stranger 0x555  1 times, 0.8 per s  FLAG 0 m" in out
 
 
-REFUSED = [
+REJECTED = [
     (["nosuch"], "'nosuch'"),
     (["nosuch.yaml"], "nosuch.yaml"),
     (["--interface", "nosuch"], "nosuch"),
@@ -124,10 +124,10 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "because"), REFUSED)
-def test_refused(run: Run, arguments: list[str], because: str) -> None:
+@pytest.mark.parametrize(("arguments", "reason"), REJECTED)
+def test_rejected(run: Run, arguments: list[str], reason: str) -> None:
     """What was asked wrongly is said in one sentence."""
-    assert because in run("monitor", *arguments).refused()
+    assert reason in run("monitor", *arguments).rejected()
 
 
 def test_find_dbw(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_proved(run: Run, tmp_path: Path, port: int, profile: str) -> None:
     assert told.pop("file") == "proof.json"
     written = json.loads((tmp_path / "proof.json").read_text())
     assert told == written
-    assert 100 <= written["let_go_ms"] <= written["braked_ms"] <= 500
+    assert 100 <= written["release_ms"] <= written["braked_ms"] <= 500
     assert written["gear"] == "park"
     config = DbwConfig(profile=profile, interface="udp_multicast", channel=GROUP, options={"port": port})
     assert check_proof("proof.json", load_profile(profile), config) == ""
@@ -125,7 +125,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("typed", ["no\n", "", "y\n"])
-def test_asked(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, port: int, typed: str) -> None:
+def test_requested(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, port: int, typed: str) -> None:
     """Without a yes nothing is sent, and an older proof is left alone."""
     (tmp_path / "watchdog_proof.json").write_text("of another day")
     monkeypatch.setattr(sys, "stdin", Terminal(typed))
@@ -136,7 +136,7 @@ def test_asked(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, port: 
     assert (tmp_path / "watchdog_proof.json").exists()
 
 
-def test_asked_and_yes(run: Run, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
+def test_requested_and_yes(run: Run, monkeypatch: pytest.MonkeyPatch, port: int) -> None:
     """With a yes it begins."""
     monkeypatch.setattr(sys, "stdin", Terminal("yes\n"))
     code, _, err = run(*changes("dataspeed_gen2", port))
@@ -144,7 +144,7 @@ def test_asked_and_yes(run: Run, monkeypatch: pytest.MonkeyPatch, port: int) -> 
     assert "the kit is not heard" in err
 
 
-REFUSED: list[tuple[list[str], str]] = [
+REJECTED: list[tuple[list[str], str]] = [
     (["--set", "vehicle.kind=simulator"], "simulator"),
     (changes("dataspeed_gen2", interface="inside"), "inside"),
     (changes("dataspeed_gen2", interface="socketcan", channel="can0"), "socketcan can0"),
@@ -154,11 +154,11 @@ REFUSED: list[tuple[list[str], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "because"), REFUSED, ids=[each[1][:30] for each in REFUSED])
-def test_refused(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], because: str) -> None:
+@pytest.mark.parametrize(("arguments", "reason"), REJECTED, ids=[each[1][:30] for each in REJECTED])
+def test_rejected(run: Run, monkeypatch: pytest.MonkeyPatch, arguments: list[str], reason: str) -> None:
     """What cannot be proved, or must not be tried, is refused in one sentence before anything is sent."""
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n"))
-    assert because in run(*arguments).refused()
+    assert reason in run(*arguments).rejected()
 
 
 CONFIG = DbwConfig(profile="dataspeed_gen2", interface="udp_multicast", channel=GROUP)
@@ -167,7 +167,7 @@ PROFILE = load_profile("dataspeed_gen2")
 
 def proof(tmp_path: Path, **others: Any) -> str:
     """A proof of generation 2, with something changed."""
-    seen = WatchdogObservation(let_go_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, words="")
+    seen = WatchdogObservation(released_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, words="")
     made = proof_of(seen, "park", PROFILE, CONFIG, 0).model_dump() | others
     path = tmp_path / "proof.json"
     path.write_text(json.dumps(made))
@@ -182,16 +182,16 @@ WORTHLESS: list[tuple[dict[str, Any], str]] = [
     ({"is_virtual": False}, "another bus"),
     ({"braked_ms": 501.0}, "501 ms"),
     ({"version": 2}, "is not proved"),
-    ({"let_go_ms": -1}, "is not proved"),
+    ({"release_ms": -1}, "is not proved"),
     ({"surprise": 1}, "is not proved"),
 ]
 
 
-@pytest.mark.parametrize(("others", "because"), WORTHLESS, ids=[next(iter(each[0])) for each in WORTHLESS])
-def test_worthless(tmp_path: Path, others: dict[str, Any], because: str) -> None:
+@pytest.mark.parametrize(("others", "reason"), WORTHLESS, ids=[next(iter(each[0])) for each in WORTHLESS])
+def test_worthless(tmp_path: Path, others: dict[str, Any], reason: str) -> None:
     """A proof of something else, or of too little, does not count, and the sentence says why."""
     assert check_proof(proof(tmp_path), PROFILE, CONFIG) == ""
-    assert because in check_proof(proof(tmp_path, **others), PROFILE, CONFIG)
+    assert reason in check_proof(proof(tmp_path, **others), PROFILE, CONFIG)
 
 
 def test_no_file(tmp_path: Path) -> None:

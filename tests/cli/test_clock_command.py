@@ -45,7 +45,7 @@ def test_a_server_is_probed(port: int, run: Run) -> None:
     assert code == (0 if said["good"] else 1)
 
 
-def test_the_source_is_asked_before_and_after_the_probing(
+def test_the_source_is_requested_before_and_after_the_probing(
     port: int, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What chrony says last counts, and by how much it differs from what it said first is in the bound."""

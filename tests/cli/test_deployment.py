@@ -61,8 +61,8 @@ def test_units_run_as_a_user_of_their_own(path: Path) -> None:
     service = unit(path)["Service"]
     assert (service["User"], service["Group"]) == ("lavt", "lavt")
     assert (service["CapabilityBoundingSet"], service["NoNewPrivileges"]) == ("", "yes")
-    asked = process_priority.OF_THE_CAR if path.name == "lavt-server.service" else process_priority.NICENESS
-    assert service["LimitNICE"] == str(asked)
+    requested = process_priority.OF_THE_CAR if path.name == "lavt-server.service" else process_priority.NICENESS
+    assert service["LimitNICE"] == str(requested)
 
 
 def test_the_directory_of_the_socket() -> None:

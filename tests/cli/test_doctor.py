@@ -34,7 +34,9 @@ from lavt.transport.messages import encode
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES, UdpLink
 from lavt.transport.zenoh_link import Router, Routers, ZenohLink, quiet_logs
 
-STATE = State(1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", holder="operator-1")
+STATE = State(
+    1, 1, 0.0, 0.0, "park", "disarmed", "nobody has armed the vehicle yet", -1, "", active_operator="operator-1"
+)
 NOW = Now(1, 1)
 REQUIREMENTS = ["av>=14", "numpy>=1.26", "cryptography>=42; extra == 'secure'"]
 INSTALLED = {"lavt": "0.1.0", "av": "14.0.1", "numpy": "2.0", "cryptography": None}
@@ -52,12 +54,12 @@ def known(bound_s: float) -> ClockReport:
     return ClockReport(1, 1, "here", "chrony", 0.001, bound_s, follows="192.0.2.1")
 
 
-def check_port(refusal: str, served: bool) -> Check:
-    return checks.check_port("video port", "video.port", "0.0.0.0", 5600, refusal=refusal, served=served)
+def check_port(rejection: str, served: bool) -> Check:
+    return checks.check_port("video port", "video.port", "0.0.0.0", 5600, rejection=rejection, served=served)
 
 
-def check_key_file(refusal: str = "", mode: int = 0o600, private: bool = True) -> Check:
-    return checks.check_key_file("security.key", Path("a.key"), refusal=refusal, mode=mode, private=private)
+def check_key_file(rejection: str = "", mode: int = 0o600, private: bool = True) -> Check:
+    return checks.check_key_file("security.key", Path("a.key"), rejection=rejection, mode=mode, private=private)
 
 
 def check_camera(seen: CameraSample | str) -> Check:
@@ -134,7 +136,11 @@ VERDICTS: list[tuple[Callable[[], Check], str, str]] = [
         "ok",
         "held by op",
     ),
-    (lambda: checks.check_vehicle(StateSample([replace(STATE, holder="")] * 50), "v-1", "1"), "ok", "held by nobody"),
+    (
+        lambda: checks.check_vehicle(StateSample([replace(STATE, active_operator="")] * 50), "v-1", "1"),
+        "ok",
+        "held by nobody",
+    ),
     (lambda: checks.check_vehicle(StateSample([STATE] * 20), "v-1", "1"), "warning", "20 times a second"),
     (lambda: checks.check_vehicle(StateSample(), "v-1", "1"), "problem", "v-1 tells no state"),
     (
@@ -220,7 +226,7 @@ def test_a_person_reads_lines(run: Run, monkeypatch: pytest.MonkeyPatch, verdict
 )
 def test_bad_input(run: Run, arguments: tuple[str, ...], said: str) -> None:
     """A config that cannot be loaded is refused in one sentence, with exit code 2, before anything is looked at."""
-    assert said in run("doctor", *arguments).refused()
+    assert said in run("doctor", *arguments).rejected()
 
 
 @pytest.fixture
@@ -318,7 +324,7 @@ def telling(server: ZenohLink, tell: Callable[[], None]) -> Iterator[None]:
             teller.join()
 
 
-def asked_of_a_client(run: Run, router: str, probe_port: int, vehicle: str, payload: bytes) -> dict[str, Any]:
+def requested_of_a_client(run: Run, router: str, probe_port: int, vehicle: str, payload: bytes) -> dict[str, Any]:
     """Run the doctor with a client's config while a server tells `payload` as its state."""
     server = ZenohLink(
         MachineClock(), lambda *_: None, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
@@ -338,9 +344,9 @@ def test_a_pair(run: Run, router: str, probe_port: int) -> None:
     """For a client's config the router, the vehicle's state, the clocks and the link are looked at, and the video is
     said to be known in a drive alone.
     """
-    found = asked_of_a_client(run, router, probe_port, "vehicle-1", encode(STATE))
-    asked = ["security", "router", "vehicle", "link of routers", "clock probe", "video"]
-    assert [name for name in found if name not in MACHINE] == asked
+    found = requested_of_a_client(run, router, probe_port, "vehicle-1", encode(STATE))
+    requested = ["security", "router", "vehicle", "link of routers", "clock probe", "video"]
+    assert [name for name in found if name not in MACHINE] == requested
     assert "operator-1" in found["vehicle"]["found"]
     assert found["vehicle"]["measured"]["states"] > 0
     assert found["link of routers"]["verdict"] == "ok"
@@ -372,19 +378,21 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("quick")
 def test_a_pair_with_keys(router: str, keys: Path, operator: str, vehicle: str, said: tuple[str, str]) -> None:
     """Signed states are opened with the configured keys, without a session; where these do not fit, it is said why."""
-    from lavt.assembly.security import vehicle_seal
+    from lavt.assembly.security import vehicle_authenticator
     from lavt.transport.security.gateway import ServerGateway
 
     security = {"key": str(keys / "vehicle-3.key"), "operators": {"operator-1": str(keys / "operator-1.pub")}}
-    seal = vehicle_seal(parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test"))
-    door = ServerGateway(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), seal)
+    authenticator = vehicle_authenticator(
+        parse_config(ServerConfig, {"vehicle_id": "vehicle-3", "security": security}, "test")
+    )
+    gateway = ServerGateway(lambda *_: None, lambda *sends: server.send(*sends), lambda: (0, -1), authenticator)
     server = ZenohLink(
-        MachineClock(), door.let_in, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
+        MachineClock(), gateway.receive, side="server", path=shipped("zenoh-configs/session.json5"), router=router,
         vehicle="vehicle-3", who="server",
     )  # fmt: skip
     changes = [f"security.key={keys / operator}.key", f"security.vehicle={keys / vehicle}.pub"]
     where = [f"zenoh.router={router}", "vehicle_id=vehicle-3", "clock.probe_port=1"]
-    with telling(server, lambda: door.send(Send("state", encode(STATE)))):
+    with telling(server, lambda: gateway.send(Send("state", encode(STATE)))):
         found = looked_at(shipped("configs/client.yaml"), *changes, *where)
     assert (found["vehicle"].verdict, said[1] in found["vehicle"].found) == (said[0], True), found["vehicle"]
     assert {found[name].verdict for name in ("security", "security.key", "security.vehicle")} == {"ok"}
@@ -407,7 +415,7 @@ def test_keys_that_are_none(tmp_path: Path) -> None:
 def test_a_peer_of_another_version(run: Run, router: str, probe_port: int) -> None:
     """States of another version of the messages are a problem, which says so and what to do."""
     fields = msgpack.unpackb(encode(STATE))
-    found = asked_of_a_client(run, router, probe_port, "vehicle-2", msgpack.packb([99, *fields[1:]]))
+    found = requested_of_a_client(run, router, probe_port, "vehicle-2", msgpack.packb([99, *fields[1:]]))
     assert found["vehicle"]["verdict"] == "problem"
     assert "another version" in found["vehicle"]["found"]
     assert "version" in found["vehicle"]["do"]
@@ -503,7 +511,7 @@ def test_a_kit_on_its_bus(tmp_path: Path) -> None:
         assert heard > 100
         assert "none.json" in said
         assert "SteerReport1" not in said
-    assert [each for each in car.news if each["kind"] == "enabled"] == []
+    assert [each for each in car.events if each["kind"] == "enabled"] == []
 
 
 @pytest.mark.usefixtures("quick")

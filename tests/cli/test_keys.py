@@ -165,14 +165,14 @@ def test_damaged_authority(run: Run, made: Path) -> None:
     """Half an authority, another's key and what is no certificate are said, and nothing is signed."""
     key = (made / "authority.key").read_bytes()
     (made / "authority.key").unlink()
-    assert "keys/authority.key" in run("keys", "--operator", "two").refused()
+    assert "keys/authority.key" in run("keys", "--operator", "two").rejected()
     shutil.copy(made / "vehicle-1.key", made / "authority.key")
-    assert "certificate" in run("keys", "--operator", "two").refused()
+    assert "certificate" in run("keys", "--operator", "two").rejected()
     (made / "authority.key").write_bytes(b"nonsense")
-    assert "PEM" in run("keys", "--operator", "two").refused()
+    assert "PEM" in run("keys", "--operator", "two").rejected()
     (made / "authority.key").write_bytes(key)
     (made / "authority.pem").write_bytes(b"nonsense")
-    assert "no certificate in PEM" in run("keys", "--operator", "two").refused()
+    assert "no certificate in PEM" in run("keys", "--operator", "two").rejected()
     assert not list(made.glob("two*"))
 
 
@@ -180,8 +180,8 @@ def test_others_may_not_look(run: Run) -> None:
     """A directory that others may look into, or a file in its place, is refused."""
     Path("open").mkdir(mode=0o755)
     Path("file").touch()
-    assert "chmod 700 open" in run("open", "--vehicle", "one").refused()
-    assert "file" in run("file", "--vehicle", "one").refused()
+    assert "chmod 700 open" in run("open", "--vehicle", "one").rejected()
+    assert "file" in run("file", "--vehicle", "one").rejected()
 
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,4 +191,4 @@ def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import lavt.transport
 
     monkeypatch.delattr(lavt.transport, "certificates", raising=False)
-    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").refused()
+    assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").rejected()

@@ -14,13 +14,13 @@ from lavt.transport.netem.tc import Command
 
 
 class Kernel(NetemInterface):
-    """A netem whose tc notes what it is told; whatever `refuses` says is refused, and what is measured is as asked."""
+    """A netem whose tc notes what it is told; whatever `rejects` says is refused, and what is measured is as asked."""
 
     def __init__(self, directory: Path, *, held: bool) -> None:
         super().__init__("eth0", directory=directory, run=self.told, stays=True)
         self.commands = ["tc qdisc add dev eth0 root"] if held else list[str]()
         self.held = held
-        self.refuses: Callable[[str], bool] = lambda _words: False
+        self.rejects: Callable[[str], bool] = lambda _words: False
 
     def told(self, words: Command) -> str:
         """Take a command: the interface has nothing of ours until the root is added."""
@@ -28,8 +28,8 @@ class Kernel(NetemInterface):
         if "show" in words:
             root = {"kind": "prio" if self.held else "noqueue", "handle": "4c56:" if self.held else "0:", "root": True}
             return "" if "filter" in words else json.dumps([root])
-        if self.refuses(line):
-            raise WorkError("refused")
+        if self.rejects(line):
+            raise WorkError("rejected")
         self.held = (self.held or "dev eth0 root handle" in line) and "qdisc del" not in line
         self.commands.append(line)
         return ""
@@ -73,8 +73,8 @@ def test_a_change_that_fails_half_way_is_told(
 ) -> None:
     """Where a delay was there before and a filter of the new one is refused, it is said that something is left."""
     kernel = Kernel(tmp_path, held=True)
-    kernel.refuses = lambda line: "filter add" in line
-    with pytest.raises(LavtError, match="refused"):
+    kernel.rejects = lambda line: "filter add" in line
+    with pytest.raises(LavtError, match="rejected"):
         apply_to(kernel, monkeypatch)
 
     assert kernel.held

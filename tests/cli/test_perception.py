@@ -110,10 +110,10 @@ def test_what_cannot_be_shown_is_told(
     Path("empty.mp4").touch()
     Path("record.mcap").touch()
     cv2.imwrite("small.png", ROAD[::2, ::2])
-    with pytest.raises(UserError) as refused:
+    with pytest.raises(UserError) as rejected:
         show(source, *options)
-    assert says in str(refused.value)
-    assert "Value error" not in str(refused.value)
+    assert says in str(rejected.value)
+    assert "Value error" not in str(rejected.value)
     assert not list(Path().glob("*steps*"))
     kept = cv2.imread("road.png")
     assert kept is not None
@@ -137,7 +137,7 @@ def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: AR
         ({"calibration": "none.yaml"}, "none.yaml"),
     ],
 )
-def test_a_calibration_that_is_contradicted_is_refused(show: Show, camera: dict[str, object], says: str) -> None:  # noqa: ARG001
+def test_a_calibration_that_is_contradicted_is_rejected(show: Show, camera: dict[str, object], says: str) -> None:  # noqa: ARG001
     """What the config says beside its calibration must not say something else."""
     with pytest.raises(UserError, match=says):
         build_client(parse_config(ClientConfig, {"camera": camera}, "test"), MachineClock().now, MachineEntropy())

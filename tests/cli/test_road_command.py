@@ -53,9 +53,9 @@ def test_a_drawing_shows_the_road_to_scale_its_curvature_and_what_the_driver_see
 
 
 @pytest.mark.parametrize(("arguments", "said"), [(["nowhere"], "'nowhere'"), (["a_key", "--out", "x.jpg"], ".png")])
-def test_what_cannot_be_drawn_is_refused(run: Run, arguments: list[str], said: str) -> None:
+def test_what_cannot_be_drawn_is_rejected(run: Run, arguments: list[str], said: str) -> None:
     """A road that does not exist and a picture that is no PNG are the user's errors."""
-    assert said in run("road", "draw", *arguments).refused()
+    assert said in run("road", "draw", *arguments).rejected()
 
 
 def test_a_run_takes_the_path_of_a_road(bend: Path) -> None:

@@ -30,7 +30,7 @@ def test_one_of_several(run: Run) -> None:
     assert "m=video 5006 " in out
 
 
-REFUSED = {
+REJECTED = {
     "none": (["--set", "video.send_to=[]"], "video.send_to"),
     "which": (["--set", TWO], "--receiver"),
     "another": (["--set", ONE, "--receiver", "192.0.2.7:5005"], "192.0.2.7:5005"),
@@ -42,8 +42,8 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_refused(case: str, run: Run) -> None:
+@pytest.mark.parametrize("case", REJECTED)
+def test_rejected(case: str, run: Run) -> None:
     """Without a receiver that is known and can be one, a sentence says what to do, and the exit code is 2."""
-    arguments, said = REFUSED[case]
-    assert said in run("sdp", SERVER, *arguments).refused()
+    arguments, said = REJECTED[case]
+    assert said in run("sdp", SERVER, *arguments).rejected()

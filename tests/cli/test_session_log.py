@@ -18,30 +18,30 @@ from lavt.nodes.client_session import Phase
 
 STATE = State(
     sent_wall_ns=0, state_mono_ns=0, speed_mps=0.0, steering_rad=0.0, gear="drive", safety="disarmed",
-    because="nobody has armed the vehicle yet", applied_sequence=-1, refused="", instance=7,
+    reason="nobody has armed the vehicle yet", applied_sequence=-1, rejected="", instance=7,
 )  # fmt: skip
-HELD = replace(STATE, holder="operator-1")
-DRIVING = replace(HELD, safety="driving", because="armed by the client")
-ASKED = replace(DRIVING, asked_by="operator-2")
+HELD = replace(STATE, active_operator="operator-1")
+DRIVING = replace(HELD, safety="driving", reason="armed by the client")
+REQUESTED = replace(DRIVING, requested_by="operator-2")
 TICK_NS = 20 * NS_PER_MS
 
 CHANGES: dict[str, tuple[State | None, State, str, list[tuple[str, ...]]]] = {
     "nothing": (STATE, STATE, "", []),
     "the first": (None, DRIVING, "", [("operator-1", "holds"), ("driving", "operator-1")]),
     "held": (STATE, HELD, "", [("operator-1", "holds")]),
-    "handed over": (DRIVING, replace(DRIVING, holder="operator-2"), "", [("operator-2", "holds")]),
+    "handed over": (DRIVING, replace(DRIVING, active_operator="operator-2"), "", [("operator-2", "holds")]),
     "armed": (HELD, DRIVING, "", [("driving", "operator-1")]),
     "silence": (
-        DRIVING, replace(DRIVING, safety="degraded", because="no command from a newer picture"), "",
+        DRIVING, replace(DRIVING, safety="degraded", reason="no command from a newer picture"), "",
         [("degraded", "no command from a newer picture")],
     ),
     "released": (
-        DRIVING, replace(STATE, safety="safe_stop", because="the client released the vehicle"), "",
+        DRIVING, replace(STATE, safety="safe_stop", reason="the client released the vehicle"), "",
         [("nobody",), ("safe_stop", "operator-1", "released")],
     ),
-    "asked, for others": (DRIVING, ASKED, "", [("operator-2", "asks operator-1")]),
-    "asked, for the holder": (DRIVING, ASKED, "operator-1", [("operator-2", "SIGUSR2")]),
-    "not asked any more": (ASKED, DRIVING, "operator-1", [("operator-2", "not ask")]),
+    "asked, for others": (DRIVING, REQUESTED, "", [("operator-2", "asks operator-1")]),
+    "asked, for the holder": (DRIVING, REQUESTED, "operator-1", [("operator-2", "SIGUSR2")]),
+    "not asked any more": (REQUESTED, DRIVING, "operator-1", [("operator-2", "not ask")]),
     "another server": (STATE, replace(STATE, instance=8), "", [("server", "anew")]),
 }  # fmt: skip
 
@@ -66,10 +66,10 @@ PHASES: dict[tuple[Phase, str], tuple[str, ...]] = {
 }
 
 
-@pytest.mark.parametrize(("phase", "because"), PHASES)
-def test_the_clients_phase_is_said_in_words(phase: Phase, because: str) -> None:
+@pytest.mark.parametrize(("phase", "reason"), PHASES)
+def test_the_clients_phase_is_said_in_words(phase: Phase, reason: str) -> None:
     """A client says what it waits for, that it arms, and that it is over; of its drive the vehicle tells."""
-    said, parts = phase_words(phase, because), PHASES[phase, because]
+    said, parts = phase_words(phase, reason), PHASES[phase, reason]
     assert bool(said) == bool(parts)
     assert all(part in said for part in parts)
 
@@ -81,8 +81,8 @@ def test_each_change_is_told_once() -> None:
         narrator.state(DRIVING, number * TICK_NS, holds=True)
         narrator.phase("stopped", "why")
         narrator.ending("completed")
-    holder, armed, phase, ending = narrator.take(NS_PER_S)
-    assert "operator-1" in holder
+    active_operator, armed, phase, ending = narrator.take(NS_PER_S)
+    assert "operator-1" in active_operator
     assert armed.startswith("driving: ")
     assert phase.endswith(": why")
     assert ending.endswith(": completed")
@@ -92,12 +92,12 @@ def test_each_change_is_told_once() -> None:
     assert narrator.take(NS_PER_S + TICK_NS) == [ending]
 
 
-def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
+def test_rejections_are_told_at_most_once_a_second_with_their_count() -> None:
     """The first refusal is told at once, those of the second after it together."""
     narrator = SessionLog()
     told = {}
     for number in range(100):
-        narrator.refusal("too old")
+        narrator.rejection("too old")
         if lines := narrator.take(number * TICK_NS):
             told[number] = lines
     assert list(told) == [0, 50]
@@ -105,13 +105,13 @@ def test_refusals_are_told_at_most_once_a_second_with_their_count() -> None:
     assert told[50][0].startswith("50 ")
 
 
-def test_a_client_tells_refusals_of_the_state() -> None:
+def test_a_client_tells_rejections_of_the_state() -> None:
     """A client hears of refusals by the vehicle's state: it tells one when the reason changes."""
     narrator = SessionLog("operator-1")
     narrator.state(STATE, 0)
     narrator.take(0)
     for number in range(10):
-        narrator.state(replace(STATE, refused="too old"), number * TICK_NS)
+        narrator.state(replace(STATE, rejected="too old"), number * TICK_NS)
     (line,) = narrator.take(NS_PER_S)
     assert line.endswith(": too old")
 

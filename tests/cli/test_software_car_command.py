@@ -166,7 +166,7 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
     program.until("done")
     program.hear(is_reported(0))
     program.type("mend the wheel")
-    assert "'the wheel'" in program.until("refused")["text"]
+    assert "'the wheel'" in program.until("rejected")["text"]
 
 
 @pytest.mark.realtime
@@ -185,9 +185,9 @@ def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
         if index == 20:
             program.send(hand.gear(4))
         pause(20 * NS_PER_MS)
-    obeys = program.until("enabled")
-    while obeys["text"] != "obeys: steering, brake, throttle":  # generation 1: one after another
-        obeys = program.until("enabled")
+    accepts = program.until("enabled")
+    while accepts["text"] != "obeys: steering, brake, throttle":  # generation 1: one after another
+        accepts = program.until("enabled")
     assert program.until("gear")["text"] == "gear DRIVE"
     assert program.until("enabled")["text"].startswith("lets go: no command in time")
     assert program.until("watchdog")["text"].startswith("watchdog brakes: no command in time")
@@ -219,7 +219,7 @@ def test_words_may_end(start: Start) -> None:
     program.told()
     assert program.process.stdin is not None
     os.write(program.process.stdin.fileno(), b"\xff\xfe\n" + b"x" * 5000 + b"\nbus_")
-    assert [program.told()["kind"] for _ in range(2)] == ["refused", "refused"]
+    assert [program.told()["kind"] for _ in range(2)] == ["rejected", "rejected"]
     program.process.stdin.close()
     program.process.stdin = None
     program.port.take(0)
@@ -243,10 +243,10 @@ def test_bad_input(case: str, run: Run) -> None:
     """What cannot be is refused in one sentence, with exit code 2 and nothing on standard output."""
     changes, said = BAD[case]
     arguments = [part for change in changes for part in ("--set", f"vehicle.dbw.{change}")]
-    assert said in run("software-car", SERVER, *arguments).refused()
+    assert said in run("software-car", SERVER, *arguments).rejected()
 
 
 @pytest.mark.parametrize(("change", "said"), [("route=nowhere", "'nowhere'"), ("car=bike", "'bike'")])
 def test_a_car_that_is_not_there(change: str, said: str, run: Run) -> None:
     """A road or a car that does not exist is refused, before the bus is opened: there is none."""
-    assert said in run("software-car", SERVER, "--set", f"vehicle.{change}").refused()
+    assert said in run("software-car", SERVER, "--set", f"vehicle.{change}").rejected()

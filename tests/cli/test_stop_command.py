@@ -17,23 +17,23 @@ STOPPED = SessionReply(True, "", 0, b"", 5600, "kernel", 60)
 OLD = SessionReply(False, "the number of this emergency stop is not a new one", 0, b"", 5600, "kernel", 59)
 
 
-def test_a_stop_is_asked_for_until_its_own_number_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_requested_for_until_its_own_number_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost queries, garbage and answers to the number before do not end it; that the vehicle knows the number does."""
     monkeypatch.setattr(stop, "AGAIN_S", 0.0)
     known = replace(OLD, emergency_stop=60)
     for answer in (STOPPED, known):
         answers: list[bytes | None] = [None, b"garbage", encode(OLD), None, encode(answer)]
-        replies, asked = queue.Queue[bytes](), list[Send]()
+        replies, requested = queue.Queue[bytes](), list[Send]()
 
-        def send(*sends: Send, answers: list[bytes | None] = answers, asked: list[Send] = asked,
+        def send(*sends: Send, answers: list[bytes | None] = answers, requested: list[Send] = requested,
                  replies: queue.Queue[bytes] = replies) -> None:  # fmt: skip
-            asked.extend(sends)
-            come = answers[len(asked) - 1]
+            requested.extend(sends)
+            come = answers[len(requested) - 1]
             if come is not None:
                 replies.put(come)
 
         assert stop._ask(send, replies, REQUEST) == answer
-        assert asked == [Send("session", encode(REQUEST))] * 5
+        assert requested == [Send("session", encode(REQUEST))] * 5
         assert stop._stops(answer, 60)
     assert not stop._stops(OLD, 58)
 

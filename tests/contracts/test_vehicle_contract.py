@@ -87,10 +87,12 @@ def test_its_capabilities_are_those_of_a_car(name: str) -> None:
 @each_vehicle
 @settings(max_examples=15)
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.integers(1, 800)), max_size=6))
-def test_whatever_it_is_asked_its_state_is_finite(name: str, asked: list[tuple[float, float, float, int]]) -> None:
+def test_whatever_it_is_requested_its_state_is_finite(
+    name: str, requested: list[tuple[float, float, float, int]]
+) -> None:
     """Any series of actuations within their ranges leaves a finite state, and the wheel within its limits."""
     vehicle, now_ns = VEHICLES[name](), MONO_NS
-    for steering_rad, throttle, brake, ms in asked:
+    for steering_rad, throttle, brake, ms in requested:
         vehicle.apply(Actuation(steering_rad, throttle, brake), now_ns)
         now_ns += ms * NS_PER_MS
         events = vehicle.advance(now_ns)
@@ -101,14 +103,14 @@ def test_whatever_it_is_asked_its_state_is_finite(name: str, asked: list[tuple[f
 
 
 @each_drivable
-def test_it_is_engaged_at_standstill_and_obeys(name: str) -> None:
+def test_it_is_engaged_at_standstill_and_accepts(name: str) -> None:
     """With the brake on it gets engaged in less than 3 s; then throttle drives it, and a left turn turns it left."""
     vehicle = DRIVABLE[name]()
     now_ns = live(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
-    assert vehicle.state().hindrance == ""
+    assert vehicle.state().inhibit_reason == ""
     now_ns = live(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
     state = vehicle.state()
-    assert (state.is_engaged, state.hindrance, state.is_overridden, state.gear) == (True, "", False, "drive")
+    assert (state.is_engaged, state.inhibit_reason, state.is_overridden, state.gear) == (True, "", False, "drive")
     live(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), wanted=True, seconds=2)
     state = vehicle.state()
     assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, less the lags"

@@ -160,14 +160,14 @@ def write_frame(writer: RecordWriter, drive: Drive, number: int) -> None:
     }
     writer.write("frame", frame, now)
     ends = (("capture", -1), ("stamp", 0), ("encode", 4), ("packetize", 5))
-    hops = [[name, now.mono_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+    stages = [[name, now.mono_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
     timeline = {
         "node": "camera",
         "stamp_ns": now.wall_ns,
         "channel": "wake",
         "arrived_mono_ns": now.mono_ns - 3 * NS_PER_MS,
     }
-    writer.write("timeline", {**timeline, "hops": hops}, now)
+    writer.write("timeline", {**timeline, "stages": stages}, now)
 
 
 def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: int, later_ns: int) -> None:
@@ -175,7 +175,7 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
     sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + later_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
-    refused = sequence % 100 == 98  # an even one: a repetition, so that no loop changes
+    rejected = sequence % 100 == 98  # an even one: a repetition, so that no loop changes
     admission: dict[str, Any] = {
         "epoch": 1,
         "sequence": sequence,
@@ -184,9 +184,9 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
         "stamp_received_wall_ns": drive.client(read_ns).wall_ns,
         "received_mono_ns": drive.server(received_ns).mono_ns,
         "received_wall_ns": drive.server(received_ns).wall_ns,
-        "applied_mono_ns": None if refused else drive.server(applied_ns).mono_ns,
-        "verdict": "refused" if refused else "obeyed",
-        "reason": "sequence" if refused else "",
+        "applied_mono_ns": None if rejected else drive.server(applied_ns).mono_ns,
+        "verdict": "rejected" if rejected else "accepted",
+        "reason": "sequence" if rejected else "",
         "limited": "",
         "steering_rad": 0.05 * math.sin(sequence / 20),
         "throttle": 0.2,
@@ -227,9 +227,9 @@ def write_client(drive: Drive, path: Path) -> None:
         writer.write("picture", picture, read)
         arrived_ns = read.mono_ns - 4 * NS_PER_MS
         ends = (("reorder", 1), ("decode", 3), ("read_stamp", 4), ("lane", 6), ("control", 7))
-        hops = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
+        stages = [[name, arrived_ns + milliseconds * NS_PER_MS] for name, milliseconds in ends]
         timeline = {"node": "driver", "stamp_ns": stamp_ns, "channel": "access_unit", "arrived_mono_ns": arrived_ns}
-        writer.write("timeline", {**timeline, "hops": hops}, read)
+        writer.write("timeline", {**timeline, "stages": stages}, read)
     writer.close()
 
 

@@ -51,7 +51,7 @@ def proved(profile: str, work: Path, stalls: Stalls) -> RunConfig:
         command = [sys.executable, "-m", "lavt", "can", "prove", str(config), "--yes"]
         since_ns = CLOCK.now().mono_ns
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        stalls.require(done.returncode == 0, f"{done.stderr}, {car.news}", since_ns, CLOCK.now().mono_ns)
+        stalls.require(done.returncode == 0, f"{done.stderr}, {car.events}", since_ns, CLOCK.now().mono_ns)
     return run
 
 
@@ -96,7 +96,7 @@ class Car:
     process: subprocess.Popen[str]
     stalls: Stalls | None = None
     stall_ms: float = STALL_MS
-    news: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     _lines: queue.SimpleQueue[dict[str, Any] | None] = field(default_factory=queue.SimpleQueue)
     _reader: threading.Thread = field(default_factory=threading.Thread)
 
@@ -124,8 +124,8 @@ class Car:
         while not self._lines.empty():
             line = self._lines.get()
             if line is not None and "kind" in line:
-                self.news.append(line)
-        told = (each for each in self.news if each["kind"] == kind and text in each["text"])
+                self.events.append(line)
+        told = (each for each in self.events if each["kind"] == kind and text in each["text"])
         return next((each["mono_ns"] for each in told if each["mono_ns"] >= since_ns), None)
 
     def wait(self, kind: str, text: str, *, since_ns: int = 0, within_ns: int = LONGEST_NS) -> int:
@@ -141,7 +141,7 @@ class Car:
             if at_ns is not None:
                 return at_ns
             pause(5 * NS_PER_MS)
-        said = f"the car told no {kind!r} with {text!r}: {self.news}"
+        said = f"the car told no {kind!r} with {text!r}: {self.events}"
         raise AssertionError(said) if braked_ns is None else self.let_go_wrongly(braked_ns, said)
 
     def braked_ns(self) -> int | None:
@@ -163,7 +163,7 @@ class Car:
         at_ns = self.wait("watchdog", "watchdog brakes: no command in time", since_ns=since_ns)
         took_ms, limit_ms = ms_since(at_ns, since_ns), KIT_MS + room_ms
         if took_ms >= limit_ms:
-            said = f"the kit brakes only {took_ms:.0f} ms after: {self.news}"
+            said = f"the kit brakes only {took_ms:.0f} ms after: {self.events}"
             raise self.verdict(said, since_ns - KIT_MS * NS_PER_MS, since_ns + round(limit_ms * NS_PER_MS))
         return took_ms
 
@@ -173,7 +173,7 @@ class Car:
         self.wait("enabled", "lets go", since_ns=since_ns)
         braked_ns = self.braked_ns()
         if braked_ns is not None:
-            raise self.let_go_wrongly(braked_ns, f"the watchdog stopped it: {self.news}")
+            raise self.let_go_wrongly(braked_ns, f"the watchdog stopped it: {self.events}")
         return ms_since(at_ns, since_ns)
 
     def end(self) -> None:
@@ -229,7 +229,7 @@ class Driven:
 
     def stopped_wrongly(self) -> Exception:
         """Give what to raise where it stopped though nothing was broken; it must be called soon after the stop."""
-        said, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.news}", self.car.braked_ns()
+        said, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
         if braked_ns is not None:
             return self.car.let_go_wrongly(braked_ns, said)
         now_ns = CLOCK.now().mono_ns
@@ -238,14 +238,14 @@ class Driven:
     def in_time(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
         """Judge how long something took; only stalls until the limit excuse it."""
         until_ns = since_ns + round(limit_ms * NS_PER_MS)
-        said = f"{what} only {took_ms:.0f} ms after: {self.car.news}"
+        said = f"{what} only {took_ms:.0f} ms after: {self.car.events}"
         self.stalls.require(took_ms < limit_ms, said, since_ns, until_ns, stall_ms=STOP_STALL_MS)
 
     def wait(self, what: Callable[[dict[str, Any]], bool], why: str) -> None:
         """Wait until the server's status says something; what never comes is a fault, whatever the host did."""
         end_ns = CLOCK.now().mono_ns + LONGEST_NS
         while not what(self.status()):
-            assert CLOCK.now().mono_ns < end_ns, f"{why}: {self.loop.server.latest}, {self.car.news}"
+            assert CLOCK.now().mono_ns < end_ns, f"{why}: {self.loop.server.latest}, {self.car.events}"
             pause(20 * NS_PER_MS)
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from tests.field.namespaces import kernel_refuses, programs_missing
+from tests.field.namespaces import kernel_rejects, programs_missing
 from tests.require import need
 
 
 @pytest.fixture(scope="session")
 def namespaces() -> None:
     """Have network namespaces, or skip."""
-    if kernel_refuses():
+    if kernel_rejects():
         need("namespaces", "needs root and a kernel that lets it make network namespaces with NAT")
     if programs_missing():
         need("namespaces", "needs ip and nft: apt-get install iproute2 nftables")

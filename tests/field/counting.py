@@ -25,7 +25,7 @@ LONG_AGO_NS = 500 * NS_PER_MS
 STANDSTILL_MPS = 0.05
 FOR_EVER_NS = 2**63 - 1
 HEAD = (
-    "outage", "to degraded", "to safe stop", "to standstill", "to driving again", "commands heard", "stale", "obeyed",
+    "outage", "to degraded", "to safe stop", "to standstill", "to driving again", "commands heard", "stale", "accepted",
     "stale",
 )  # fmt: skip
 Name = tuple[int, int]
@@ -52,7 +52,7 @@ class Came:
 
 
 @dataclass(frozen=True)
-class Obeyed:
+class Accepted:
     """A command that the server obeyed, and whether its picture was newer than those before."""
 
     command: Came
@@ -77,9 +77,9 @@ class Measured:
     heard: int
     """Commands that the process outside heard from the outage's begin to that of the next."""
     stale_heard: int
-    obeyed: int
-    stale_obeyed: int
-    obeyed_unheard: int
+    accepted: int
+    stale_accepted: int
+    accepted_unheard: int
 
 
 def measure(drive: Drive) -> list[Measured]:
@@ -95,7 +95,7 @@ class _Seen:
     def __init__(self, drive: Drive) -> None:
         records = drive.records("server")
         self.transitions = [each for record in records for each in transitions(record)]
-        self.obeyed = [each for record in records for each in _obeyed(record)]
+        self.accepted = [each for record in records for each in _accepted(record)]
         truths = [record.table("truth") for record in records]
         self.truth_ns: IntArray = np.concatenate([truth.ints("mono_ns") for truth in truths])
         self.speed_mps: FloatArray = np.concatenate([truth.floats("speed_mps") for truth in truths])
@@ -111,23 +111,23 @@ class _Seen:
         stop = next((each for each in here if each.after == "safe_stop"), None)
         left = next((each for each in here if each.before == "driving"), None)
         again = next((each for each in here if each.after == "driving"), None)
-        stands_ns = None if stop is None else self._stands_ns(stop.at.mono_ns)
+        stationary_since_ns = None if stop is None else self._stationary_since_ns(stop.at.mono_ns)
         heard = [each for each in self.heard.values() if begin_ns < each.at.mono_ns < until_ns]
-        obeyed = [each.command for each in self.obeyed if begin_ns < each.command.at.mono_ns < until_ns]
+        accepted = [each.command for each in self.accepted if begin_ns < each.command.at.mono_ns < until_ns]
         return Measured(
             outage,
             _since(begin_ns, degraded),
             _since(begin_ns, stop),
-            None if stands_ns is None else (stands_ns - begin_ns) / NS_PER_S,
+            None if stationary_since_ns is None else (stationary_since_ns - begin_ns) / NS_PER_S,
             _since(outage.end.mono_ns, again),
             tuple(self._silence_s(each) for each in (left, stop) if each is not None),
-            None if stop is None or stands_ns is None else (stands_ns - stop.at.mono_ns) / NS_PER_S,
+            None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
             None if stop is None else float(self.speed_mps[np.searchsorted(self.truth_ns, stop.at.mono_ns)]),
             len(heard),
             sum(self._stale(each, each.at.mono_ns) for each in heard),
-            len(obeyed),
-            sum(self._stale(self.heard.get(each.name, each), each.at.mono_ns) for each in obeyed),
-            sum(each.name not in self.heard for each in obeyed),
+            len(accepted),
+            sum(self._stale(self.heard.get(each.name, each), each.at.mono_ns) for each in accepted),
+            sum(each.name not in self.heard for each in accepted),
         )
 
     def _stale(self, command: Came, came_ns: int) -> bool:
@@ -137,10 +137,10 @@ class _Seen:
         return of_before or command.at.wall_ns - command.sent_wall_ns > LONG_AGO_NS
 
     def _silence_s(self, transition: Transition) -> float:
-        fresh_ns = [each.command.at.mono_ns for each in self.obeyed if each.fresh]
+        fresh_ns = [each.command.at.mono_ns for each in self.accepted if each.fresh]
         return (transition.at.mono_ns - max(at_ns for at_ns in fresh_ns if at_ns < transition.at.mono_ns)) / NS_PER_S
 
-    def _stands_ns(self, after_ns: int) -> int | None:
+    def _stationary_since_ns(self, after_ns: int) -> int | None:
         stands = self.truth_ns[(self.truth_ns > after_ns) & (self.speed_mps < STANDSTILL_MPS)]
         return int(stands[0]) if len(stands) else None
 
@@ -155,16 +155,16 @@ def transitions(record: Record) -> Iterator[Transition]:
             yield Transition(Now(int(mono_ns), int(wall_ns)), before, after)
 
 
-def _obeyed(record: Record) -> Iterator[Obeyed]:
+def _accepted(record: Record) -> Iterator[Accepted]:
     admissions = record.table("admission")
-    commands = admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    commands = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     stamps_ns = commands.ints("stamp_ns")
     fresh = np.append(True, stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1])[: len(commands)]
     columns = (commands.ints(f"{name}_ns") for name in ("sent_wall", "stamp", "received_mono", "received_wall"))
     rows = zip(commands.objects("epoch"), commands.ints("sequence"), *columns, fresh, strict=True)
     for epoch, sequence, sent_wall_ns, stamp_ns, mono_ns, wall_ns, newer in rows:
         command = Came((epoch, int(sequence)), int(sent_wall_ns), int(stamp_ns), Now(int(mono_ns), int(wall_ns)))
-        yield Obeyed(command, bool(newer))
+        yield Accepted(command, bool(newer))
 
 
 def _heard(line: Mapping[str, Any]) -> Came:
@@ -186,7 +186,7 @@ def table(rows: Sequence[Measured]) -> str:
     lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for row in rows:
         times = (row.to_degraded_s, row.to_safe_stop_s, row.to_standstill_s, row.to_driving_s)
-        counts = (row.heard, row.stale_heard, row.obeyed, row.stale_obeyed)
+        counts = (row.heard, row.stale_heard, row.accepted, row.stale_accepted)
         cells = [row.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -63,7 +63,7 @@ def programs_missing() -> bool:
     return shutil.which("ip") is None or shutil.which("nft") is None
 
 
-def kernel_refuses() -> bool:
+def kernel_rejects() -> bool:
     """Whether this process may not make network namespaces, or the kernel has no NAT in them; for want of nft: no."""
     if os.geteuid() != 0 or not _works("unshare", "--net", "true"):
         return True

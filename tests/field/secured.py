@@ -95,7 +95,7 @@ class Vehicle:
     def __init__(self, endpoint: str) -> None:
         self.commands: list[bytes] = []
         self.deleted = 0
-        self.asked: list[bytes] = []
+        self.requested: list[bytes] = []
         self.session = open_session(endpoint)
         self._state = self.session.declare_publisher(f"{BASE}/state", **STATE)
         self.session.declare_subscriber(f"{BASE}/control", direct(self._hear))
@@ -114,7 +114,7 @@ class Vehicle:
 
     def _answer(self, query: Any) -> None:
         with query:
-            self.asked.append(b"" if query.payload is None else query.payload.to_bytes())
+            self.requested.append(b"" if query.payload is None else query.payload.to_bytes())
             for key in (f"{BASE}/session", f"{BASE}/netem"):
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, b"answer of " + key.rpartition("/")[2].encode())
@@ -242,7 +242,7 @@ class Intruder(Client):
             "wildcard commands": b"wildcard" in site.vehicle.commands,
             "deletes": site.vehicle.deleted > 0,
             "long commands": any(len(each) >= LONG for each in site.vehicle.commands),
-            "questions": b"intruder" in site.vehicle.asked,
+            "questions": b"intruder" in site.vehicle.requested,
             "session": b"answer of session" in answers,
             "netem": b"answer of netem" in answers,
             "the routers' own state": bool(answers - {b"answer of session", b"answer of netem"}),

@@ -156,7 +156,12 @@ def cloud_site(keys: Path) -> Iterator[Site]:
 def site(request: pytest.FixtureRequest) -> Site:
     """Each kind of site in turn, with nothing left of what was tried before."""
     found: Site = request.getfixturevalue(request.param)
-    for kept in (found.vehicle.commands, found.vehicle.asked, found.operator.answers, *found.operator.heard.values()):
+    for kept in (
+        found.vehicle.commands,
+        found.vehicle.requested,
+        found.operator.answers,
+        *found.operator.heard.values(),
+    ):
         kept.clear()
     found.vehicle.deleted = 0
     return found
@@ -195,7 +200,7 @@ def test_operators_own_router(site: Site) -> None:
     """Through the operator's own router all commands, questions, answers and states of the operator come through."""
     site.drive()
     assert set(site.vehicle.commands) == {b"operator"}
-    assert set(site.vehicle.asked) == {b"operator"}
+    assert set(site.vehicle.requested) == {b"operator"}
 
 
 def test_other_authority(site: Site, keys: Path, others_keys: Path) -> None:
@@ -307,9 +312,9 @@ def during(drive: attacked.Drive, name: str, mono_ns: IntArray) -> Any:
     return (mono_ns > began_ns) & (mono_ns < ended_ns)
 
 
-def obeyed(drive: attacked.Drive) -> Table:
+def accepted(drive: attacked.Drive) -> Table:
     admissions = drive.server.table("admission")
-    return admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
 
 COMMAND_PERIOD_MS = CLIENT_LIMITS.command_period_ns / NS_PER_MS
@@ -320,9 +325,9 @@ def said(table: Table, *names: str) -> list[tuple[Any, ...]]:
     return list(zip(*(table.objects(name) for name in ("epoch", *names)), strict=True))
 
 
-def test_only_what_the_operator_said_is_obeyed(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
+def test_only_what_the_operator_said_is_accepted(attacked_drive: attacked.Drive, stalls: Stalls) -> None:
     """Every command obeyed is one that the client sent, as it sent it, and none is obeyed twice, in any attack."""
-    commands = obeyed(attacked_drive)
+    commands = accepted(attacked_drive)
     by_the_client = set(said(attacked_drive.client.table("control"), *SAID))
     done = said(commands, *SAID)
 
@@ -381,7 +386,7 @@ def test_a_flood_does_not_delay_the_operator(attacked_drive: attacked.Drive, sta
             strict=True,
         )
     )
-    commands = obeyed(attacked_drive)
+    commands = accepted(attacked_drive)
     received_ns = commands.ints("received_mono_ns")
     delays_ms = np.array(
         [(at_ns - sent_ns[key]) / NS_PER_MS for key, at_ns in zip(said(commands, "sequence"), received_ns, strict=True)]

@@ -138,10 +138,10 @@ def test_what_happens_in_the_car_reaches_the_server(words: str, safety: str, tel
     """A driver who takes over has the car at once, and a fault stops it; the server says so in words."""
     with drive("dataspeed_gen1") as driven:
         at_ns = driven.car.act(words)
-        let_go_ns = driven.car.wait("enabled", "lets go", since_ns=at_ns)
+        released_ns = driven.car.wait("enabled", "lets go", since_ns=at_ns)
         driven.wait(lambda status: status.get("safety") == safety, "the server does not say what happened")
         pause(NS_PER_S // 2)
-        tell(f"{words}: first axis let go {ms_since(let_go_ns, at_ns):.0f} ms after; {driven.status()['because']}")
+        tell(f"{words}: first axis let go {ms_since(released_ns, at_ns):.0f} ms after; {driven.status()['reason']}")
         assert driven.car.heard("enabled", "obeys: steering", since_ns=at_ns) is None
 
 
@@ -158,8 +158,8 @@ def test_without_a_proof_that_the_watchdog_brakes_nothing_is_armed(tmp_path: Pat
     """Arming is refused, in words, unless it was proved that this kit on this bus brakes when nothing is sent."""
     run = by_wire.run_config("dataspeed_gen2", tmp_path / "none.json")
     with by_wire.started(run, tmp_path, stalls) as driven:
-        driven.wait(lambda status: "watchdog" in status.get("refused", ""), "the server does not say why")
-        tell(driven.status()["refused"])
+        driven.wait(lambda status: "watchdog" in status.get("rejected", ""), "the server does not say why")
+        tell(driven.status()["rejected"])
         pause(2 * NS_PER_S)
         assert driven.status()["safety"] == "disarmed"
         assert driven.car.heard("enabled", "obeys: ") is None

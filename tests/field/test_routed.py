@@ -179,7 +179,7 @@ def test_everything_passes_two_nats_and_a_cloud(routed: Routed, stalls: Stalls) 
 
     with stalls.judging(routed.changed.later(-WHILE_NS).mono_ns, routed.changed.mono_ns, stall_ms=STALL_MS):
         assert per_second(routed.before(routed.client, "picture")) >= 25
-        assert admissions.texts("verdict").count("obeyed") / WHILE_S >= 45
+        assert admissions.texts("verdict").count("accepted") / WHILE_S >= 45
         assert per_second(routed.before(routed.client, "state")) >= 45
         assert per_second(routed.before(routed.client, "clock_probe")) >= 1.5
     assert len(routed.client.table("session_reply")) > 0
@@ -231,7 +231,7 @@ def test_a_drive_goes_on_after_a_change_of_address(routed: Routed, stalls: Stall
         assert longest_gap_s(routed, "clock_probe") <= AGAIN_S
         assert not changes or changes[-1].after == "driving"
         assert not changes or changes[-1].at.mono_ns - routed.changed.mono_ns <= AGAIN_S * NS_PER_S
-    assert "obeyed" in routed.after(routed.server, "admission").texts("verdict")[-20:]
+    assert "accepted" in routed.after(routed.server, "admission").texts("verdict")[-20:]
 
 
 @pytest.mark.parametrize("way", ["rendezvous"], indirect=True)

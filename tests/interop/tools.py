@@ -43,8 +43,8 @@ def missing() -> tuple[str, ...]:
     python = shutil.which(DEBIANS_PYTHON)
     if python is None or subprocess.run([python, "-c", MODULES], check=False, capture_output=True).returncode:
         return ("GStreamer's modules for Debian's Python",)
-    asked = ["gst-inspect-1.0", "--exists"]
-    return tuple(each for each in ELEMENTS if subprocess.run([*asked, each], check=False).returncode)
+    requested = ["gst-inspect-1.0", "--exists"]
+    return tuple(each for each in ELEMENTS if subprocess.run([*requested, each], check=False).returncode)
 
 
 @contextmanager

@@ -103,7 +103,7 @@ def prove(machine: Machine, changes: tuple[str, ...], stalls: Stalls) -> None:
         try:
             machine.run([machine.python, "-B", "-m", "lavt", "can", "prove", BY_WIRE, *sets(changes), "--yes"])
         except MachineError as failed:
-            said = f"{failed}, {car.news}"
+            said = f"{failed}, {car.events}"
             raise stalls.verdict(said, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None
 
 
@@ -133,17 +133,17 @@ class Driven:
         """Return what to raise where it stopped though nothing was broken."""
         now_ns = CLOCK.now().mono_ns
         since_ns = self.car.heard("enabled", "obeys: ") or now_ns
-        said = f"stopped before it drove: {status}, {self.car.news}"
+        said = f"stopped before it drove: {status}, {self.car.events}"
         if braked_ns is not None:
             failure = self.car.let_go_wrongly(braked_ns, said)
         else:
-            least_ms = least_stop_ms(str(status["because"]))
+            least_ms = least_stop_ms(str(status["reason"]))
             failure = self.stalls.verdict(said, since_ns, now_ns, stall_ms=least_ms)
         return or_too_slow(failure, self.stalls, since_ns, now_ns)
 
-    def because(self) -> str:
+    def reason(self) -> str:
         """Tell why the server stopped."""
-        return str(self.loop.server.latest()["status"]["because"])
+        return str(self.loop.server.latest()["status"]["reason"])
 
     def wait_stopped(self) -> None:
         """Wait until the server says that it has stopped for safety."""
@@ -224,9 +224,9 @@ def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
 
 
 def to_wheel(result: dict[str, Any]) -> dict[str, Any]:
-    hops: list[dict[str, Any]] = result["hops_ms"]
-    (hop,) = [hop for hop in hops if (hop["node"], hop["hop"]) == ("vehicle", "command to wheel")]
-    return hop
+    stages: list[dict[str, Any]] = result["stages_ms"]
+    (stage,) = [stage for stage in stages if (stage["node"], stage["stage"]) == ("vehicle", "command to wheel")]
+    return stage
 
 
 def in_short(result: dict[str, Any]) -> str:
@@ -235,7 +235,7 @@ def in_short(result: dict[str, Any]) -> str:
     wheel, tau_v, tau_c = to_wheel(result), result["tau_v_ms"]["p50"], result["tau_c_ms"]["p50"]
     return (
         f"completed, P95 {result['p95_m']:.3f} m, command to wheel p50 {wheel['p50']:.1f}, p95 {wheel['p95']:.1f} ms "
-        f"of {wheel['n']}, tau_v {tau_v:.1f}, tau_c {tau_c:.1f} ms, {result['invalid_because']}"
+        f"of {wheel['n']}, tau_v {tau_v:.1f}, tau_c {tau_c:.1f} ms, {result['invalid_reasons']}"
     )
 
 
@@ -247,7 +247,7 @@ def test_a_bus_that_goes_leaves_a_braking_car(lab: Lab, tell: Tell) -> None:
         down_ms = ms_since(CLOCK.now().mono_ns, since_ns)
         took_ms = driven.car.held(since_ns, room_ms=down_ms + ROOM_MS)
         driven.wait_stopped()
-        tell(f"down took {down_ms:.0f} ms, the kit brakes {took_ms:.0f} ms after its begin, {driven.because()}")
+        tell(f"down took {down_ms:.0f} ms, the kit brakes {took_ms:.0f} ms after its begin, {driven.reason()}")
         ip("link", "set", "vcan0", "up")
         pause(NS_PER_S)
         assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
@@ -259,7 +259,7 @@ def test_a_kit_that_falls_silent_stops_the_drive(lab: Lab, tell: Tell) -> None:
         since_ns = driven.car.act("bus_off")
         took_ms = driven.car.held(since_ns)
         driven.wait_stopped()
-        tell(f"the kit brakes {took_ms:.0f} ms after, {driven.because()}")
+        tell(f"the kit brakes {took_ms:.0f} ms after, {driven.reason()}")
         driven.car.act("bus_on")
         pause(NS_PER_S)
         assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None

@@ -105,9 +105,9 @@ def test_each_condition_shifts_video_and_control_and_nothing_else(
     for name in L:
         hold(sides, name)
         flown = fly([*HELD, *UNTOUCHED], 40, 20)
-        asked = condition(name)
+        requested = condition(name)
         for flight, arrived in flown.items():
-            wanted_ms = asked.video_ms if flight.startswith("video") else asked.control_ms
+            wanted_ms = requested.video_ms if flight.startswith("video") else requested.control_ms
             wanted_ms = wanted_ms if flight in {each.name for each in HELD} else 0.0
             shifts_ms[name, flight] = median(arrived.delays_ms) - baseline[flight] - wanted_ms
             assert set(arrived.numbers) == set(range(40))
@@ -115,7 +115,9 @@ def test_each_condition_shifts_video_and_control_and_nothing_else(
 
 
 @MEDIANS
-def test_the_state_is_held_where_that_is_asked(baseline: dict[str, float], sides: dict[str, NetemInterface]) -> None:
+def test_the_state_is_held_where_that_is_requested(
+    baseline: dict[str, float], sides: dict[str, NetemInterface]
+) -> None:
     """With state_delay with_video, what the server's router sends is held as long as the video, by tcp as by udp."""
     for protocol in ("udp", "tcp"):
         flows = netem_flows(
@@ -142,7 +144,7 @@ def test_control_by_tcp_is_held(sides: dict[str, NetemInterface]) -> None:
     assert median(flown["udp"].delays_ms) < 1
 
 
-def test_no_packet_is_lost_or_overtaken_by_a_change(sides: dict[str, NetemInterface]) -> None:
+def test_no_packet_is_lost_or_reordered_by_a_change(sides: dict[str, NetemInterface]) -> None:
     """From 0 to 150 to 30 to 225 ms and cleared, at 200 packets a second: all arrive, in the order of sending."""
     hold_video(sides, Impairment())
 
@@ -209,7 +211,7 @@ def test_a_delay_whose_owner_was_killed_is_taken_away_at_the_next_start(
     assert inside("server", sides["server"].check) == []
 
 
-def test_somebody_elses_queue_is_refused_and_left_alone(sides: dict[str, NetemInterface]) -> None:
+def test_somebody_elses_queue_is_rejected_and_left_alone(sides: dict[str, NetemInterface]) -> None:
     """An interface whose root somebody made is refused, and neither applying nor clearing changes it."""
     command("tc -n server qdisc add dev va root handle 1: prio bands 4")
     there = queues("server")
@@ -274,7 +276,7 @@ def runs_of_lost(flown: Flown) -> list[int]:
     return [after - before - 1 for before, after in pairwise(sorted(flown.numbers)) if after - before > 1]
 
 
-def test_loss_is_as_asked(sides: dict[str, NetemInterface]) -> None:
+def test_loss_is_as_requested(sides: dict[str, NetemInterface]) -> None:
     """Of 1000 packets a tenth are lost, within four standard deviations, each by itself."""
     hold_video(sides, Impairment(75, loss=0.1))
     flown = fly([HELD[0]], 1000, 2)["video"]
@@ -284,7 +286,7 @@ def test_loss_is_as_asked(sides: dict[str, NetemInterface]) -> None:
     assert fmean(runs_of_lost(flown)) < 1.5  # 1 / (1 - 0.1) is expected
 
 
-def test_loss_comes_in_bursts_where_asked(sides: dict[str, NetemInterface]) -> None:
+def test_loss_comes_in_bursts_where_requested(sides: dict[str, NetemInterface]) -> None:
     """A tenth lost in bursts of 5: of 3000 packets the mean burst is 3.3 to 7.5 and the loss 5 to 16 %."""
     hold_video(sides, Impairment(10, loss=0.1, loss_burst_packets=5))
     flown = fly([HELD[0]], 3000, 1)["video"]
@@ -308,7 +310,7 @@ def test_rate_spaces_packets(sides: dict[str, NetemInterface]) -> None:
 
 
 @MEDIANS
-def test_reordering_is_as_asked(sides: dict[str, NetemInterface]) -> None:
+def test_reordering_is_as_requested(sides: dict[str, NetemInterface]) -> None:
     """A quarter of 400 packets are not delayed, within four standard deviations, and only these overtake."""
     hold_video(sides, Impairment(75, jitter_ms=5, reorder=0.25))
     flown = fly([HELD[0]], 400, 5)["video"]
@@ -419,21 +421,21 @@ def test_a_held_delay_ends_with_its_command(
     words = ["netem", "apply", name, "--role", "server", "--interface", "lo", "--hold", "--json"]
     with subprocess.Popen(
         [sys.executable, "-B", "-m", "lavt", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
-    ) as holder:
-        assert holder.stdout is not None
-        answer = json.loads(holder.stdout.readline())
+    ) as active_operator:
+        assert active_operator.stdout is not None
+        answer = json.loads(active_operator.stdout.readline())
         measured_ns = CLOCK.now().mono_ns
-        refused = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
+        rejected = lavt("netem", "apply", "L2", "--role", "server", "--interface", "lo")
         held = command("tc -j qdisc show dev lo")
-        os.killpg(holder.pid, number)
-        holder.wait(30)
+        os.killpg(active_operator.pid, number)
+        active_operator.wait(30)
 
     with stalls.judging(since_ns, measured_ns, share=MEDIAN_SHARE):
         assert answer["reasons"] == []
     assert held != before
-    assert refused.code == 2
-    assert f"{name} on lo, of process {holder.pid}" in refused.err
-    assert holder.returncode == 0
+    assert rejected.code == 2
+    assert f"{name} on lo, of process {active_operator.pid}" in rejected.err
+    assert active_operator.returncode == 0
     assert command("tc -j qdisc show dev lo") == before
 
 
@@ -456,7 +458,9 @@ def test_what_holds_a_run_does_as_each_condition_asks(name: str, tmp_path: Path)
     assert command("tc -j qdisc show dev lo") == before
 
 
-def test_a_drive_with_netem_is_measured_as_asked(lavt: Callable[..., Ended], tmp_path: Path, stalls: Stalls) -> None:
+def test_a_drive_with_netem_is_measured_as_requested(
+    lavt: Callable[..., Ended], tmp_path: Path, stalls: Stalls
+) -> None:
     """A short drive under L4 on lo says before and after that 150 and 75 ms were injected, and leaves lo as it was."""
     before = command("tc -j qdisc show dev lo")
     sets = [
@@ -473,11 +477,11 @@ def test_a_drive_with_netem_is_measured_as_asked(lavt: Callable[..., Ended], tmp
     result = json.loads((out / "result.json").read_text())
 
     off_ms = [
-        said[when][flow]["median_ms"] - asked_ms
+        said[when][flow]["median_ms"] - requested_ms
         for when in ("before", "after")
-        for flow, asked_ms in (("video", 150), ("control", 75))
+        for flow, requested_ms in (("video", 150), ("control", 75))
     ]
-    delayed = [reason for reason in result["invalid_because"] if "delayed" in reason]
+    delayed = [reason for reason in result["invalid_reasons"] if "delayed" in reason]
     with stalls.judging(since_ns, share=MEDIAN_SHARE):
         assert max(map(abs, off_ms)) < 1, f"{off_ms}, {delayed}"
         assert not delayed

@@ -97,7 +97,7 @@ def in_short(drive: Drive) -> str:
     return (
         f"{result['route']} under {result['condition']}: {result['ending']}, tau_v {tau_v['p50']:.2f}, tau_c "
         f"{tau_c['p50']:.2f}, loop {loop['p50']:.2f} ms, Delta {delta['ms']:.3f} ms +- {delta['bound_ms']:.3f}, drift "
-        f"{delta['drift_ppm']:.1f} ppm, closure p95 {drive.measured.closure_p95_ms}, {result['invalid_because']}"
+        f"{delta['drift_ppm']:.1f} ppm, closure p95 {drive.measured.closure_p95_ms}, {result['invalid_reasons']}"
     )
 
 
@@ -134,8 +134,8 @@ def test_each_condition_shifts_tau_v_and_tau_c_by_what_it_injects(
     since_ns = CLOCK.now().mono_ns
     base_ms = median_ms("L0")
     for name in PAPER[1:]:
-        asked = conditions()[name]
-        off_ms = median_ms(name) - base_ms - np.array([asked.video_ms, asked.control_ms])
+        requested = conditions()[name]
+        off_ms = median_ms(name) - base_ms - np.array([requested.video_ms, requested.control_ms])
         with stalls.judging(since_ns, share=MEDIAN_SHARE):
             assert np.max(np.abs(off_ms)) <= SHIFT_LIMIT_MS, f"{name} is off by {off_ms} ms"
     after = [machine.run(["tc", "qdisc", "show", "dev", "vec0"]) for machine in (server_machine, client_machine)]

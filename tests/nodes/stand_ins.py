@@ -65,10 +65,10 @@ class NoiseCamera:
     broken: bool = False
     stuck: Picture | None = None
     """The same buffer each time."""
-    asked: list[tuple[int, int, Pose | None]] = field(default_factory=list)
+    requested: list[tuple[int, int, Pose | None]] = field(default_factory=list)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
-        self.asked.append((number, at_ns, pose))
+        self.requested.append((number, at_ns, pose))
         if self.broken:
             return None
         return CapturedFrame(number, at_ns, noise(number, self.model) if self.stuck is None else self.stuck)
@@ -81,7 +81,7 @@ class StandingVehicle:
     speed_mps: float = 0.0
     now_ns: int = MONO_NS
     happens: list[VehicleEvent] = field(default_factory=list)
-    obeyed: list[Actuation] = field(default_factory=list)
+    accepted: list[Actuation] = field(default_factory=list)
     wanted: bool = False
     reached: list[ReachedCommand] = field(default_factory=list)
 
@@ -95,7 +95,7 @@ class StandingVehicle:
         return happened
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
-        self.obeyed.append(actuation)
+        self.accepted.append(actuation)
 
     def engage(self, wanted: bool, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
         self.wanted = wanted

@@ -137,23 +137,23 @@ def test_an_admission_says_all_about_a_command() -> None:
     admission = bench.drive(steering_rad=0.4)
     now = at(bench.mono_ns)
     assert admission == Admission(
-        bench.epoch, bench.sequence, now.wall_ns, 11, 22, now.mono_ns, now.wall_ns, now.mono_ns, "obeyed", "",
+        bench.epoch, bench.sequence, now.wall_ns, 11, 22, now.mono_ns, now.wall_ns, now.mono_ns, "accepted", "",
         "steering rate", "drive", 0.4, 0.5, 0.0,
     )  # fmt: skip
-    assert bench.vehicle.obeyed[-1].throttle == 0.5
+    assert bench.vehicle.accepted[-1].throttle == 0.5
     assert bench.node.counts["commands_limited"] == 1
 
 
-def test_a_refused_command_is_recorded_and_not_applied() -> None:
+def test_a_rejected_command_is_recorded_and_not_applied() -> None:
     """The record of a refused command has its reason and no time of application, and the vehicle is not asked."""
     bench = Bench().armed()
-    asked = len(bench.vehicle.obeyed)
+    requested = len(bench.vehicle.accepted)
     admission = bench.drive(epoch=99)
-    assert (admission.verdict, admission.reason) == ("refused", "not the epoch in force")
+    assert (admission.verdict, admission.reason) == ("rejected", "not the epoch in force")
     assert admission.applied_mono_ns is None
-    assert len(bench.vehicle.obeyed) == asked
+    assert len(bench.vehicle.accepted) == requested
     (state,) = [decode(State, payload) for payload in of(bench.go(TICK_NS), "state")]
-    assert state.refused == "not the epoch in force"
+    assert state.rejected == "not the epoch in force"
 
 
 def test_a_command_is_judged_by_its_arrival() -> None:
@@ -176,7 +176,7 @@ def test_nothing_moves_before_the_first_drive_command_and_silence_stops() -> Non
     assert bench.safety == "degraded"
     bench.go(200 * NS_PER_MS)
     assert bench.safety == "safe_stop"
-    assert all(asked.throttle == 0 and asked.brake > 0 for asked in bench.vehicle.obeyed)
+    assert all(requested.throttle == 0 and requested.brake > 0 for requested in bench.vehicle.accepted)
 
 
 def test_a_drive_begins_and_ends_exactly_once() -> None:
@@ -280,7 +280,7 @@ def test_bytes_from_anybody_are_survived_and_counted(data: bytes) -> None:
     assert bench.take("session", data, peer=3) == []
     counts = bench.node.counts
     assert (counts["commands_unreadable"], counts["session_requests_unreadable"]) == (1, 1)
-    assert bench.vehicle.obeyed == []
+    assert bench.vehicle.accepted == []
 
 
 def states(sends: list[Send]) -> list[State]:
@@ -292,16 +292,16 @@ def test_the_state_tells_who_holds_and_who_asks() -> None:
     bench = Bench().armed()
     bench.take("session", encode(SessionRequest("ask", "bob", 7, 0)), peer="query")
     told = states(bench.go(2 * NS_PER_S))
-    assert {(state.holder, state.asked_by) for state in told} == {("alice", "bob")}
-    assert {state.asked_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}
+    assert {(state.active_operator, state.requested_by) for state in told} == {("alice", "bob")}
+    assert {state.requested_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}
 
 
-def test_a_refusal_is_told_for_a_second() -> None:
+def test_a_rejection_is_told_for_a_second() -> None:
     """The state names why a command was refused, and a second after the last refusal no more."""
     bench = Bench().armed()
     bench.drive(epoch=99)
-    assert {state.refused for state in states(bench.go(NS_PER_S - TICK_NS))} == {"not the epoch in force"}
-    assert {state.refused for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
+    assert {state.rejected for state in states(bench.go(NS_PER_S - TICK_NS))} == {"not the epoch in force"}
+    assert {state.rejected for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
 
 
 def test_a_server_that_ends_stops_the_vehicle() -> None:
@@ -311,8 +311,8 @@ def test_a_server_that_ends_stops_the_vehicle() -> None:
     sends = bench.take("server_ends", None)
     assert of(sends, "video_token") == [None]
     last = states(bench.go(TICK_NS))[-1]
-    assert (last.safety, last.because, last.holder) == ("safe_stop", "the server was told to end", "")
-    assert bench.vehicle.obeyed[-1].brake > 0
+    assert (last.safety, last.reason, last.active_operator) == ("safe_stop", "the server was told to end", "")
+    assert bench.vehicle.accepted[-1].brake > 0
     bench.vehicle.speed_mps = 0.0
     bench.go(TICK_NS)
     assert bench.events("ending") == ["safe_stop"]

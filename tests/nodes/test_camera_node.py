@@ -95,7 +95,7 @@ def test_a_late_wake_skips_frames_and_counts_them() -> None:
     assert node.next_wake_ns() == MONO_NS + 5
     wake(node, 5)
     wake(node, 4 * FRAME_NS + 10 * NS_PER_MS)
-    assert [(number, at_ns) for number, at_ns, _ in camera.asked] == [
+    assert [(number, at_ns) for number, at_ns, _ in camera.requested] == [
         (0, MONO_NS + 5),
         (4, MONO_NS + 5 + round(4 * NS_PER_S / 30)),
     ]
@@ -111,7 +111,7 @@ def test_it_renders_the_newest_pose_at_or_before_the_capture() -> None:
     for pose in poses:
         give(node, "pose", pose, at(10))
     wake(node, 10)
-    assert camera.asked[0][2] is poses[2]
+    assert camera.requested[0][2] is poses[2]
 
 
 def test_without_a_pose_in_time_there_is_none() -> None:
@@ -120,7 +120,7 @@ def test_without_a_pose_in_time_there_is_none() -> None:
     node = node_with(camera)
     give(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
     wake(node, 2)
-    assert camera.asked[0][2] is None
+    assert camera.requested[0][2] is None
 
 
 @pytest.mark.parametrize("walls_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])

@@ -8,7 +8,7 @@ from lavt.domain import NS_PER_S, Now, SafetyState, SessionReply, State
 from lavt.nodes.client_session import ClientSession
 
 GRANTED = SessionReply(True, "", 5, bytes(16), 5600, "kernel", 0)
-REFUSED = SessionReply(False, "held by bob", 0, b"", 5600, "kernel", 70)
+REJECTED = SessionReply(False, "held by bob", 0, b"", 5600, "kernel", 70)
 
 
 def new_session(*, rearm: bool = False) -> ClientSession:
@@ -21,17 +21,17 @@ def test_it_holds_the_vehicle_and_waits_for_the_condition_of_the_network() -> No
     assert session.request_due(100) is not None
     session.note_reply(GRANTED, 200)
     assert (session.phase, session.commanding) == ("arming", False)
-    assert session.because
+    assert session.reason
     session.note_condition("no tc")
-    assert (session.because, session.commanding) == ("no tc", False)
+    assert (session.reason, session.commanding) == ("no tc", False)
     session.note_condition("")
-    assert (session.because, session.commanding) == ("", True)
+    assert (session.reason, session.commanding) == ("", True)
     session.note_condition("later")
-    assert (session.because, session.commanding) == ("", True)
+    assert (session.reason, session.commanding) == ("", True)
 
 
 def state(safety: SafetyState, speed_mps: float = 0.0) -> State:
-    return State(1, 1, speed_mps, 0.0, "drive", safety, "because", -1, "")
+    return State(1, 1, speed_mps, 0.0, "drive", safety, "reason", -1, "")
 
 
 def driving(*, rearm: bool = False) -> ClientSession:
@@ -50,8 +50,8 @@ def test_it_asks_at_once_and_every_second_until_armed() -> None:
     assert request is not None
     assert (request.operation, request.who, request.instance) == ("hold", "alice", 7)
     assert session.request_due(100 + NS_PER_S - 1) is None
-    session.note_reply(REFUSED, 200)
-    assert (session.phase, session.because, session.commanding) == ("seeking", "held by bob", False)
+    session.note_reply(REJECTED, 200)
+    assert (session.phase, session.reason, session.commanding) == ("seeking", "held by bob", False)
     assert session.request_due(100 + NS_PER_S) is not None
     session.note_reply(GRANTED, NS_PER_S)
     assert (session.phase, session.epoch, session.host, session.commanding) == ("arming", 5, "kernel", True)
@@ -85,7 +85,7 @@ def test_a_stopped_vehicle_stays_stopped(safety: SafetyState) -> None:
     session.note_state(state("degraded"), 400)
     assert session.phase == "driving"
     session.note_state(state(safety), 500)
-    assert (session.phase, session.commanding, session.because) == ("stopped", False, "because")
+    assert (session.phase, session.commanding, session.reason) == ("stopped", False, "reason")
     session.note_state(state(safety), 600)
     assert session.request_due(10 * NS_PER_S) is None
 
@@ -128,7 +128,7 @@ def test_with_rearm_it_asks_a_server_that_was_started_again(stopped: bool) -> No
 def test_an_emergency_stop_has_a_number_beyond_all_seen() -> None:
     """The number is the wall clock's or, where that is behind, one more than the highest seen, and it only grows."""
     session = new_session()
-    session.note_reply(REFUSED, 200)
+    session.note_reply(REJECTED, 200)
     request = session.stop_now(Now(0, 60))
     assert (request.operation, request.number, session.emergency_stop) == ("emergency_stop", 71, 71)
     assert session.stop_now(Now(0, 1000)).number == 1000
@@ -139,12 +139,12 @@ def test_an_emergency_stop_taken_for_an_old_one_is_raised_again() -> None:
     """A client whose wall clock is behind learns the higher number from the refusal, and carries a newer one."""
     session = driving()
     assert session.stop_now(Now(0, 60)).number == 60
-    session.note_reply(REFUSED, 300)
+    session.note_reply(REJECTED, 300)
     assert session.emergency_stop == 71
 
 
 @pytest.mark.parametrize("released", [False, True])
-def test_an_emergency_stop_is_asked_again_until_the_vehicle_knows_of_it(released: bool) -> None:
+def test_an_emergency_stop_is_requested_again_until_the_vehicle_knows_of_it(released: bool) -> None:
     """Who waits for the vehicle, or has released it, sends no commands: of the query each second one may be lost."""
     session = new_session()
     if released:
@@ -156,15 +156,15 @@ def test_an_emergency_stop_is_asked_again_until_the_vehicle_knows_of_it(released
     assert session.next_wake_ns() == 400 + NS_PER_S
     assert session.request_due(400 + NS_PER_S) == first
     assert session.request_due(400 + 2 * NS_PER_S) == first
-    session.note_reply(replace(REFUSED, emergency_stop=60), 400 + 2 * NS_PER_S)
+    session.note_reply(replace(REJECTED, emergency_stop=60), 400 + 2 * NS_PER_S)
     assert "emergency_stop" not in {due(session, number * NS_PER_S) for number in range(3, 10)}
 
 
-def test_an_emergency_stop_that_is_seen_to_be_in_force_is_not_asked_again() -> None:
+def test_an_emergency_stop_that_is_seen_to_be_in_force_is_not_requested_again() -> None:
     """Where the vehicle's state tells of the stop its reply may be lost; one with an old number is raised at once."""
     session = driving()
     session.stop_now(Now(0, 60))
-    session.note_reply(REFUSED, 300)
+    session.note_reply(REJECTED, 300)
     request = session.request_due(300)
     assert request is not None
     assert (request.operation, request.number) == ("emergency_stop", 71)
@@ -176,8 +176,8 @@ NOTED = SessionReply(True, "", 0, b"", 5600, "kernel", 0)
 """The answer to an ask, or to a release."""
 
 
-def held_by(holder: str, safety: SafetyState = "driving", instance: int = 7) -> State:
-    return replace(state(safety), holder=holder, holder_instance=instance)
+def held_by(active_operator: str, safety: SafetyState = "driving", instance: int = 7) -> State:
+    return replace(state(safety), active_operator=active_operator, active_operator_instance=instance)
 
 
 def due(session: ClientSession, now_ns: int) -> str:
@@ -185,14 +185,14 @@ def due(session: ClientSession, now_ns: int) -> str:
     return "" if request is None else request.operation
 
 
-def test_a_refused_client_waits_and_asks_nobody() -> None:
+def test_a_rejected_client_waits_and_asks_nobody() -> None:
     """Without `take_over` a client whose hold is refused only asks to hold, and says who holds the vehicle."""
     session = new_session()
     for second in range(3):
         assert due(session, 100 + second * NS_PER_S) == "hold"
-        session.note_reply(REFUSED, 200 + second * NS_PER_S)
+        session.note_reply(REJECTED, 200 + second * NS_PER_S)
         assert due(session, 300 + second * NS_PER_S) == ""
-        assert (session.phase, session.because) == ("seeking", "held by bob")
+        assert (session.phase, session.reason) == ("seeking", "held by bob")
 
 
 def test_with_take_over_it_asks_for_what_somebody_holds() -> None:
@@ -201,35 +201,35 @@ def test_with_take_over_it_asks_for_what_somebody_holds() -> None:
     for second in range(3):
         begin_ns = second * NS_PER_S
         assert due(session, begin_ns) == "hold"
-        session.note_reply(REFUSED, begin_ns)
+        session.note_reply(REJECTED, begin_ns)
         assert due(session, begin_ns) == "ask"
         session.note_reply(NOTED, begin_ns)
-        assert (session.phase, session.because) == ("seeking", "held by bob; asked for it")
+        assert (session.phase, session.reason) == ("seeking", "held by bob; asked for it")
         assert due(session, begin_ns + NS_PER_S - 1) == ""
     assert due(session, 3 * NS_PER_S) == "hold"
     session.note_reply(GRANTED, 3 * NS_PER_S)
-    assert (session.phase, session.because) == ("arming", "")
+    assert (session.phase, session.reason) == ("arming", "")
     assert due(session, 4 * NS_PER_S) == "hold"
 
 
-def test_an_ask_that_is_refused_says_why() -> None:
+def test_an_ask_that_is_rejected_says_why() -> None:
     """Where somebody else asks already, both reasons are known, and stay while hold and ask go on in turn."""
     session = ClientSession("alice", 7, rearm=False, start_ns=0, take_over=True)
     assert due(session, 0) == "hold"
-    session.note_reply(REFUSED, 0)
+    session.note_reply(REJECTED, 0)
     assert due(session, 0) == "ask"
-    session.note_reply(replace(REFUSED, because="carol asks"), 0)
-    assert session.because == f"{REFUSED.because}; carol asks"
+    session.note_reply(replace(REJECTED, reason="carol asks"), 0)
+    assert session.reason == f"{REJECTED.reason}; carol asks"
     assert due(session, NS_PER_S) == "hold"
-    session.note_reply(REFUSED, NS_PER_S)
-    assert session.because == f"{REFUSED.because}; carol asks"
+    session.note_reply(REJECTED, NS_PER_S)
+    assert session.reason == f"{REJECTED.reason}; carol asks"
 
 
 def test_release_is_repeated_until_it_is_answered() -> None:
     """A release ends commanding at once, is asked again each second, and its answer ends the session for good."""
     session = driving()
     session.release(1000)
-    assert (session.phase, session.because, session.commanding, session.holds) == ("watching", "released", False, False)
+    assert (session.phase, session.reason, session.commanding, session.holds) == ("watching", "released", False, False)
     assert due(session, 1000) == "release"
     assert due(session, 1000 + NS_PER_S - 1) == ""
     session.note_reply(GRANTED, 2000)  # to a hold that was on its way
@@ -239,7 +239,7 @@ def test_release_is_repeated_until_it_is_answered() -> None:
     assert (session.released, session.next_wake_ns()) == (True, None)
     session.note_state(held_by("", "safe_stop"), 3 * NS_PER_S)
     session.note_state(held_by("bob"), 4 * NS_PER_S)
-    assert (session.phase, session.because, due(session, 10 * NS_PER_S)) == ("watching", "released", "")
+    assert (session.phase, session.reason, due(session, 10 * NS_PER_S)) == ("watching", "released", "")
 
 
 def test_a_released_vehicle_is_not_taken_again_by_rearm() -> None:
@@ -258,7 +258,7 @@ def test_who_was_taken_over_does_not_take_it_back(safety: SafetyState) -> None:
     session.note_reply(GRANTED, 200)
     session.note_state(held_by("alice", "disarmed"), 300)
     session.note_state(held_by("bob", safety), 400)
-    assert (session.phase, session.because) == ("watching", "bob has taken the vehicle over")
+    assert (session.phase, session.reason) == ("watching", "bob has taken the vehicle over")
     assert (session.holds, due(session, 10 * NS_PER_S)) == (False, "")
 
 
@@ -270,7 +270,7 @@ def test_another_client_of_the_same_name_is_somebody_else() -> None:
     assert session.phase == "arming"
     session.note_state(held_by("alice", "disarmed"), 400)
     session.note_state(held_by("alice", "safe_stop", instance=8), 500)
-    assert (session.phase, session.because) == ("watching", "alice has taken the vehicle over")
+    assert (session.phase, session.reason) == ("watching", "alice has taken the vehicle over")
 
 
 def test_a_state_from_before_the_grant_says_nothing_about_it() -> None:

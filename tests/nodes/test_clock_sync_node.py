@@ -67,12 +67,12 @@ def test_the_server_answers_with_its_times_and_what_its_source_said_last() -> No
     """A reply goes to whoever asked, with the time of arrival, the time of the answer, correction and bound."""
     node = ClockSyncNode(MONO_NS)
     message = Message("probe_request", encode_request(9, 1234), at(0), ("client", 1))
-    (hop,) = node.chains["probe_request"]
-    (send,) = hop[1](message, at(400))
+    (stage,) = node.chains["probe_request"]
+    (send,) = stage[1](message, at(400))
     assert (send.channel, send.peer) == ("probe_reply", ("client", 1))
     assert decode_reply(send.payload) == ProbeReply(9, 1234, at(0).wall_ns, at(400).wall_ns, None, None)
     give(node, "clock_report", REPORT, at(0))
-    (send,) = hop[1](message, at(400))
+    (send,) = stage[1](message, at(400))
     assert decode_reply(send.payload) == ProbeReply(9, 1234, at(0).wall_ns, at(400).wall_ns, 0.25, 0.001)
 
 
@@ -105,11 +105,11 @@ def test_what_is_no_answer_is_counted() -> None:
         assert not give(node, "probe_reply", data, at(1))
     for reply in (ProbeReply(2, at(0).wall_ns, 5, 6, None, None), ProbeReply(1, 77, 5, 6, None, None)):
         assert not give(node, "probe_reply", encode_reply(reply), at(1))
-    assert node.counts["probes_refused"] == 5
+    assert node.counts["probes_rejected"] == 5
     good = ProbeReply(1, at(0).wall_ns, 5, 6, None, None)
     assert give(node, "probe_reply", encode_reply(good), at(1))
     assert not give(node, "probe_reply", encode_reply(good), at(1))
-    assert node.counts["probes_refused"] == 6
+    assert node.counts["probes_rejected"] == 6
 
 
 def test_the_server_counts_garbage() -> None:
@@ -117,7 +117,7 @@ def test_the_server_counts_garbage() -> None:
     node = ClockSyncNode(MONO_NS)
     for data in (b"", b"LC", bytes(48), encode_reply(ProbeReply(1, 2, 3, 4, None, None)), encode_request(1, 2) + b"x"):
         assert not give(node, "probe_request", data, at(0))
-    assert node.counts["probes_refused"] == 5
+    assert node.counts["probes_rejected"] == 5
 
 
 def test_unanswered_probes_are_counted_and_forgotten() -> None:

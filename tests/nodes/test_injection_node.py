@@ -29,15 +29,15 @@ def ask(node: InjectionNode, request: NetemRequest, after_ns: int = 0, peer: Any
     return give(node, "netem", encode(request), at(after_ns), peer)
 
 
-def done(node: InjectionNode | InjectionClient, number: int, because: str = "", after_ns: int = 0) -> list[Send]:
-    measured = () if because else (("video", 150.2),)
-    return give(node, "injected", InjectionResult(number, because, "", measured), at(after_ns))
+def done(node: InjectionNode | InjectionClient, number: int, reason: str = "", after_ns: int = 0) -> list[Send]:
+    measured = () if reason else (("video", 150.2),)
+    return give(node, "injected", InjectionResult(number, reason, "", measured), at(after_ns))
 
 
-def refusals(sends: list[Send]) -> list[str]:
+def rejections(sends: list[Send]) -> list[str]:
     replies = [decode(NetemReply, payload) for payload in of(sends, "netem_reply")]
-    assert all(reply.granted == (reply.because == "") for reply in replies)
-    return [reply.because for reply in replies]
+    assert all(reply.granted == (reply.reason == "") for reply in replies)
+    return [reply.reason for reply in replies]
 
 
 def in_force(request: NetemRequest = L4) -> InjectionNode:
@@ -55,7 +55,7 @@ def test_a_condition_is_granted_when_the_queues_do_it() -> None:
     node = server()
     assert ask(node, L4) == [Send("inject", InjectionOrder(1, "L4", (VIDEO, STATE)))]
     sends = done(node, 1)
-    assert refusals(sends) == [""]
+    assert rejections(sends) == [""]
     assert [send.peer for send in sends if send.channel == "netem_reply"] == [1]
     assert of(sends, "injection") == [
         InjectionSample(at(0).mono_ns, "L4", "video", 150.0, 150.2, ""),
@@ -63,7 +63,7 @@ def test_a_condition_is_granted_when_the_queues_do_it() -> None:
     ]
 
 
-def test_the_state_goes_with_the_video_where_that_is_asked() -> None:
+def test_the_state_goes_with_the_video_where_that_is_requested() -> None:
     """A state delay is that of what the server's router sends, from the port at which it listens."""
     [send] = ask(server(), replace(L4, state_delay_ms=150.0))
     assert send.payload.flows == (VIDEO, replace(STATE, law=Impairment(150.0)))
@@ -73,7 +73,7 @@ def test_asking_again_renews_the_lease_and_changes_nothing() -> None:
     """A condition in force is granted at once when it is asked for again, and its lease begins anew."""
     node = in_force()
     assert node.next_wake_ns() == at(5 * NS_PER_S).mono_ns
-    assert refusals(ask(node, L4, 3 * NS_PER_S)) == [""]
+    assert rejections(ask(node, L4, 3 * NS_PER_S)) == [""]
     give(node, WAKE, None, at(5 * NS_PER_S))
     assert node.counts["netem_leases_ended"] == 0
 
@@ -82,7 +82,7 @@ def test_a_lease_that_is_not_renewed_clears_everything_and_somebody_else_may_ask
     """After the lease the queues are put back, the record says so, and the condition is free for another client."""
     node = in_force()
     bob = replace(L4, who="bob", instance=8)
-    assert refusals(ask(node, bob, NS_PER_S)) == ["alice has the condition in hand until its lease ends"]
+    assert rejections(ask(node, bob, NS_PER_S)) == ["alice has the condition in hand until its lease ends"]
     assert give(node, WAKE, None, at(LEASE_MS * NS_PER_MS)) == [Send("inject", InjectionOrder(2, "", ()))]
     sends = give(node, "injected", InjectionResult(2, "", "", ()), at(LEASE_MS * NS_PER_MS + 1))
     assert of(sends, "injection") == [InjectionSample(at(LEASE_MS * NS_PER_MS + 1).mono_ns, "", "", 0.0, None, "")]
@@ -121,44 +121,44 @@ def test_what_is_in_force_is_measured_again_and_again() -> None:
         ({}, StationaryStatus(True, ("bob", 8)), "bob holds the vehicle"),
     ],
 )
-def test_it_refuses_with_a_reason(settings: dict[str, bool], rest: StationaryStatus, said: str) -> None:
+def test_it_rejects_with_a_reason(settings: dict[str, bool], rest: StationaryStatus, said: str) -> None:
     """No condition is applied unless the config allows it, for a real vehicle that drives, or under another's drive."""
     node = server(**settings)
     give(node, "rest", rest, at(0))
     sends = ask(node, L4)
-    assert refusals(sends) == [said]
+    assert rejections(sends) == [said]
     assert of(sends, "inject") == []
 
 
 def test_a_real_vehicle_that_stands_may_have_its_network_changed_and_keeps_it_while_it_drives() -> None:
     """At standstill and disarmed a condition is applied to a real vehicle; driving it renews, but changes nothing."""
     node = server(simulated=False)
-    assert refusals(ask(node, L4)) == ["a vehicle that is not simulated must stand disarmed for this"]
+    assert rejections(ask(node, L4)) == ["a vehicle that is not simulated must stand disarmed for this"]
     give(node, "rest", StationaryStatus(True, ("alice", 7)), at(0))
     ask(node, L4)
     done(node, 1)
     give(node, "rest", StationaryStatus(False, ("alice", 7)), at(0))
-    assert refusals(ask(node, L4, NS_PER_S)) == [""]
-    assert refusals(ask(node, replace(L4, delay_ms=0.0), NS_PER_S)) == [
+    assert rejections(ask(node, L4, NS_PER_S)) == [""]
+    assert rejections(ask(node, replace(L4, delay_ms=0.0), NS_PER_S)) == [
         "a vehicle that is not simulated must stand disarmed for this"
     ]
 
 
-def test_what_is_measured_otherwise_than_asked_is_written_down_and_changes_nothing() -> None:
+def test_what_is_measured_otherwise_than_requested_is_written_down_and_changes_nothing() -> None:
     """A measurement that is not as asked goes into the record; the condition stays in force."""
     node = in_force()
     sends = give(node, "injected", InjectionResult(1, "", "video was late", (("video", 155.0),)), at(NS_PER_S))
-    assert of(sends, "injection")[0].because == "video was late"
-    assert refusals(ask(node, L4, NS_PER_S)) == [""]
+    assert of(sends, "injection")[0].reason == "video was late"
+    assert rejections(ask(node, L4, NS_PER_S)) == [""]
 
 
 def test_queues_that_fail_are_told_and_put_back_and_the_lease_is_free() -> None:
     """Where the queues cannot do it, whoever asked hears why, what was done is undone, and anybody may ask again."""
     node = server()
     ask(node, L4)
-    sends = done(node, 1, because="there is no tc")
-    assert refusals(sends) == ["there is no tc"]
-    assert {sample.because for sample in of(sends, "injection")} == {"there is no tc"}
+    sends = done(node, 1, reason="there is no tc")
+    assert rejections(sends) == ["there is no tc"]
+    assert {sample.reason for sample in of(sends, "injection")} == {"there is no tc"}
     assert of(sends, "inject") == [InjectionOrder(2, "", ())]
     assert of(ask(node, L4), "inject") == [InjectionOrder(3, "L4", (VIDEO, STATE))]
     assert of(ask(server(), replace(L4, who="bob")), "netem_reply") == []
@@ -168,7 +168,7 @@ def test_what_cannot_be_put_back_is_tried_again_every_second() -> None:
     """A queue that could not be cleared at the lease's end is told again until it is."""
     node = in_force()
     give(node, WAKE, None, at(5 * NS_PER_S))
-    assert done(node, 2, because="tc hangs", after_ns=6 * NS_PER_S)
+    assert done(node, 2, reason="tc hangs", after_ns=6 * NS_PER_S)
     assert node.next_wake_ns() == at(7 * NS_PER_S).mono_ns
     assert give(node, WAKE, None, at(7 * NS_PER_S)) == [Send("inject", InjectionOrder(3, "", ()))]
     give(node, "injected", InjectionResult(3, "", "", ()), at(8 * NS_PER_S))
@@ -183,13 +183,13 @@ def test_who_comes_to_hold_the_vehicle_drives_without_anothers_condition() -> No
     assert give(node, "rest", StationaryStatus(True, ("bob", 8)), at(0)) == [Send("inject", InjectionOrder(2, "", ()))]
 
 
-def test_a_law_that_netem_cannot_do_is_refused_before_anything_is_touched() -> None:
+def test_a_law_that_netem_cannot_do_is_rejected_before_anything_is_touched() -> None:
     """What no queue could do is refused with the reason, and the condition in force stays."""
     node = in_force()
-    [because] = refusals(ask(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
-    assert because.startswith("video: ")
-    assert "20 ms" in because
-    assert refusals(ask(node, L4, NS_PER_S)) == [""]
+    [reason] = rejections(ask(node, replace(L4, condition="wild", delay_ms=10.0, jitter_ms=20.0)))
+    assert reason.startswith("video: ")
+    assert "20 ms" in reason
+    assert rejections(ask(node, L4, NS_PER_S)) == [""]
 
 
 def test_what_the_queues_say_of_an_older_order_is_not_taken_for_the_newer() -> None:
@@ -198,7 +198,7 @@ def test_what_the_queues_say_of_an_older_order_is_not_taken_for_the_newer() -> N
     ask(node, L4)
     ask(node, replace(L4, condition="L5", delay_ms=225.0))
     assert done(node, 1) == []
-    assert refusals(done(node, 2)) == ["", ""]
+    assert rejections(done(node, 2)) == ["", ""]
 
 
 def test_a_flood_of_questions_is_not_kept() -> None:
@@ -252,16 +252,16 @@ def test_a_client_whose_own_queue_fails_says_so_and_tries_again() -> None:
     assert of(give(client, WAKE, None, at(NS_PER_S)), "inject") == [InjectionOrder(2, "L4", (CONTROL,))]
 
 
-def test_a_refusal_is_told_to_the_driver() -> None:
+def test_a_rejection_is_told_to_the_driver() -> None:
     """Where the server refuses, the driver is told why, and the server is asked again."""
     client = asking()
     give(client, WAKE, None, at(0))
     give(client, "injected", InjectionResult(1, "", "", ()), at(0))
-    refused = give(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
-    assert refused == [Send("condition_in_force", "the server does not delay the video: no")]
+    rejected = give(client, "netem_reply", encode(NetemReply(False, "no")), at(0))
+    assert rejected == [Send("condition_in_force", "the server does not delay the video: no")]
 
 
-def test_without_a_condition_nothing_is_asked() -> None:
+def test_without_a_condition_nothing_is_requested() -> None:
     """A client without a condition never wakes for it."""
     client = InjectionClient(
         "alice", 7, condition="", control=CONTROL, video=Impairment(), state_delay_ms=0.0, start_ns=0

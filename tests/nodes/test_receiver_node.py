@@ -195,7 +195,7 @@ def test_each_second_is_written_down() -> None:
     assert [sample.lost_after_repair for sample in samples] == [0, 1, 0, 0]
 
 
-def test_a_bit_rate_is_asked_for_with_each_report() -> None:
+def test_a_bit_rate_is_requested_for_with_each_report() -> None:
     """The highest bit rate that is configured goes out with every report."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)
     give(node, "path_token", PathToken(TOKEN, PORT), at(0))

@@ -72,7 +72,7 @@ def test_without_a_stamp_its_corner_is_road_too() -> None:
 @pytest.mark.parametrize(
     "model", [CameraModel(pitch_rad=-0.8), CameraModel(pitch_rad=1.4), CameraModel(64, 64), CameraModel(x_m=25.0)]
 )
-def test_a_camera_that_does_not_see_the_road_is_refused(model: CameraModel) -> None:
+def test_a_camera_that_does_not_see_the_road_is_rejected(model: CameraModel) -> None:
     """A camera that looks elsewhere is the user's mistake, told with what to correct."""
     with pytest.raises(UserError, match="correct its place"):
         bird_eye(calibrated(model), GroundGrid())

@@ -11,19 +11,19 @@ from tests.support.stalls import LONG_STALL_MS, Stalls
 
 RUN_KEYS = {
     "run", "time", "injection", "inherent", "route", "condition", "controller", "preset", "driver", "participant",
-    "block", "order", "repetition", "seed", "digest", "ending", "valid", "invalid_because", "distance_m", "duration_s",
+    "block", "order", "repetition", "seed", "digest", "ending", "valid", "invalid_reasons", "distance_m", "duration_s",
     "mae_m", "rms_m", "p95_m", "max_m", "heading_rms_rad", "steering_rms_rad", "steering_reversals_per_s", "collisions",
     "lane_invasions", "loop_ms", "picture_age_ms", "tau_v_ms", "tau_c_ms", "frames_sent", "frames_decoded",
     "frames_unreadable", "route_length_m", "heading_mae_rad", "heading_p95_rad", "steering_rate_rms_radps",
     "steering_reversals_per_km", "oscillation_hz", "collisions_per_km", "lane_invasions_per_km", "p95_by_10m",
-    "age_at_actuation_ms", "hops_ms",
+    "age_at_actuation_ms", "stages_ms",
 }  # fmt: skip
 CONDITION_KEYS = {
     "runs", "completed", "completion_rate", "completion_interval", "collisions_per_run", "lane_invasions_per_run",
     "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms", "completion_such_roads", "endings",
     "routes", "p95_common_m", "p95_common_interval", "p95_worst_rank_m", "collisions_per_km", "lane_invasions_per_km",
     "mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz", "picture_age_ms",
-    "age_at_actuation_ms", "hops_ms", "survival",
+    "age_at_actuation_ms", "stages_ms", "survival",
 }  # fmt: skip
 VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
 

@@ -173,9 +173,9 @@ def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace, stalls: Stalls)
     At least half of the pictures give a command: room for a machine that others use too.
     """
     admissions = attacked.server.table("admission")
-    obeyed = admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
-    at_ns = obeyed.ints("received_mono_ns")
-    meanwhile = obeyed.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
+    accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
+    at_ns = accepted.ints("received_mono_ns")
+    meanwhile = accepted.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
     age_ms = (meanwhile.ints("received_wall_ns") - meanwhile.ints("stamp_ns")) / NS_PER_MS
 
     with stalls.judging(attacked.began_ns, attacked.ended_ns, stall_ms=LONG_STALL_MS):
@@ -186,16 +186,16 @@ def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace, stalls: Stalls)
         assert len(np.unique(meanwhile.ints("stamp_ns"))) > 0.5 * pictures
 
 
-def test_nothing_of_a_stranger_is_obeyed(attacked: SimpleNamespace) -> None:
+def test_nothing_of_a_stranger_is_accepted(attacked: SimpleNamespace) -> None:
     """No command of another epoch and no command a second time is obeyed, and no stranger gets the vehicle."""
     admissions = attacked.server.table("admission")
-    obeyed = admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     sessions = [detail for detail in attacked.server.table("event").texts("detail") if "stranger" in detail]
 
-    assert len(set(obeyed.objects("epoch"))) == 1
-    assert np.all(np.diff(obeyed.ints("sequence")) > 0)
+    assert len(set(accepted.objects("epoch"))) == 1
+    assert np.all(np.diff(accepted.ints("sequence")) > 0)
     assert sessions
-    assert all("refused" in detail for detail in sessions)
+    assert all("rejected" in detail for detail in sessions)
 
 
 def test_pictures_are_not_spoilt_by_strangers(attacked: SimpleNamespace, stalls: Stalls) -> None:
@@ -220,7 +220,7 @@ def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace,
     with stalls.judging(attacked.began_ns, attacked.ended_ns):  # the sockets of a side that is stalled overflow
         assert at_the_server > 0.9 * DATAGRAMS
         assert counted(client, "datagrams_from_strangers") > 0.9 * 2 * DATAGRAMS
-        assert counted(server, "probes_refused") > 0.9 * DATAGRAMS
+        assert counted(server, "probes_rejected") > 0.9 * DATAGRAMS
         assert counted(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
         assert counted(server, "session_requests_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
         assert netem > 0.9 * ROUNDS * GARBAGE_PER_ROUND

@@ -9,7 +9,7 @@ VIDEO_MS, CONTROL_MS = 225.0, 100.0
 """What L5 injects (netem/conditions.yaml); L0 injects nothing."""
 
 
-def test_the_injected_delay_is_measured_as_it_was_asked(demo: Demo, stalls: Stalls) -> None:
+def test_the_injected_delay_is_measured_as_it_was_requested(demo: Demo, stalls: Stalls) -> None:
     """From L0 to L5 the median tau_v grows by 225 ms and the median tau_c by 100 ms, each within 2 ms.
 
     The loop latency has the client's own time in it, too, which other work on the machine moves by some milliseconds.
@@ -23,7 +23,7 @@ def test_the_injected_delay_is_measured_as_it_was_asked(demo: Demo, stalls: Stal
         assert abs(grown_ms["loop_ms"] - VIDEO_MS - CONTROL_MS) < 10
 
 
-def test_the_relay_tells_that_it_did_as_asked(demo: Demo, stalls: Stalls) -> None:
+def test_the_relay_tells_that_it_did_as_requested(demo: Demo, stalls: Stalls) -> None:
     """The relay held video and control for as long as was asked, within 1 ms in the median of what it timed itself."""
     with stalls.judging(demo.since_ns, demo.until_ns, share=BUSY_SHARE):
         assert [drive.relay_says for drive in demo.injected.values()] == [[], []]

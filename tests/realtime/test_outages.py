@@ -43,7 +43,7 @@ MARGIN_S = 0.5
 LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
 LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
 """The client hears 75 ms late that the vehicle has stopped: until then it commands on under the old epoch."""
-OBEYS_EVERYTHING = Path(__file__).with_name("server_that_obeys_everything.py")
+ACCEPTS_EVERYTHING = Path(__file__).with_name("server_that_accepts_everything.py")
 
 
 @dataclass
@@ -163,7 +163,7 @@ def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planne
     """The same outages of the network, with a server that obeys whatever it can read."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
-        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(OBEYS_EVERYTHING),))
+        drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(ACCEPTS_EVERYTHING),))
         drive.start()
         what_the_network_does(drive)
         drive.reach(AT_ALL_MPS)
@@ -181,9 +181,9 @@ def unguarded_server(unguarded: Drive) -> Record:
     return unguarded.record
 
 
-def obeyed(record: Record) -> Table:
+def accepted(record: Record) -> Table:
     admissions = record.table("admission")
-    return admissions.where(np.array(admissions.texts("verdict")) == "obeyed")
+    return admissions.where(np.array(admissions.texts("verdict")) == "accepted")
 
 
 def transition(record: Record, into: str, after_ns: int) -> Now:
@@ -199,7 +199,7 @@ def transition(record: Record, into: str, after_ns: int) -> Now:
 
 def last_fresh_ns(record: Record, before_ns: int) -> int:
     """When the last command came that was made from a picture newer than those of all before it."""
-    commands = obeyed(record)
+    commands = accepted(record)
     commands = commands.where(commands.ints("received_mono_ns") < before_ns)
     stamps_ns = commands.ints("stamp_ns")
     fresh = np.append(True, stamps_ns[1:] > np.maximum.accumulate(stamps_ns)[:-1])
@@ -208,7 +208,7 @@ def last_fresh_ns(record: Record, before_ns: int) -> int:
 
 def stale(record: Record, stop: Now) -> int:
     """How many commands were obeyed after `stop` that belong before it: by epoch, by send time or by picture."""
-    commands = obeyed(record)
+    commands = accepted(record)
     before = commands.ints("received_mono_ns") <= stop.mono_ns
     old_epochs = set(commands.where(before).objects("epoch"))
     after = commands.where(~before)
@@ -228,14 +228,14 @@ def test_the_vehicle_stands_within_the_limits_of_the_design(
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     truth = server.table("truth")
     at_ns, speed_mps = truth.ints("mono_ns"), truth.floats("speed_mps")
-    silence_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
+    since_command_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
     speed_at_stop_mps = speed_mps[np.searchsorted(at_ns, stop.mono_ns)]
     stands = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
     stopping_s = (at_ns[stands][0] - stop.mono_ns) / NS_PER_S
 
-    assert silence_ns >= STOP_AFTER_NS
-    with stalls.judging(stop.mono_ns - silence_ns, stop.mono_ns):
-        assert silence_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
+    assert since_command_ns >= STOP_AFTER_NS
+    with stalls.judging(stop.mono_ns - since_command_ns, stop.mono_ns):
+        assert since_command_ns <= STOP_AFTER_NS + 100 * NS_PER_MS
     assert stopping_s <= speed_at_stop_mps / STOP_MPS2 + MARGIN_S
 
 
@@ -253,17 +253,17 @@ def test_the_vehicle_stays_where_it_stopped_until_it_is_armed_anew(drive: Drive,
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
-def test_nothing_from_before_a_stop_is_obeyed_after_it(drive: Drive, server: Record, outage: str) -> None:
+def test_nothing_from_before_a_stop_is_accepted_after_it(drive: Drive, server: Record, outage: str) -> None:
     """After a safe stop no command of an old epoch is obeyed, none sent before it, none made from an older picture."""
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     armed = transition(server, "driving", stop.mono_ns)
 
     assert stale(server, stop) == 0
-    assert np.sum(obeyed(server).ints("received_mono_ns") > armed.mono_ns) > 20
+    assert np.sum(accepted(server).ints("received_mono_ns") > armed.mono_ns) > 20
 
 
 @pytest.mark.parametrize("outage", ["router killed", "network stalled"])
-def test_a_server_that_obeys_everything_would_obey_what_is_stale(
+def test_a_server_that_accepts_everything_would_accept_what_is_stale(
     unguarded: Drive, unguarded_server: Record, outage: str
 ) -> None:
     """Without the server's checks an outage of the network ends with stale commands obeyed: the tests above can fail.

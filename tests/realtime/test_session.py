@@ -131,14 +131,14 @@ def sessions(
 
             second = drive.client("second", "operator-2", "--take-over")
             wait_until("the holder is told", lambda: says(first, ASKS), BEGINS_S)
-            wait_until("the server tells it", lambda: status(server).get("asked_by") == "operator-2", BEGINS_S)
-            drive.seen["asked"] = status(server)
+            wait_until("the server tells it", lambda: status(server).get("requested_by") == "operator-2", BEGINS_S)
+            drive.seen["requested"] = status(server)
             first.popen.send_signal(signal.SIGUSR2)
             drive.reach(server, second, 1.0)
             drive.seen["handed over"], drive.seen["first, then"] = status(server), status(first)
 
             drive.end(second)
-            wait_until("nobody holds it", lambda: status(server).get("holder") == "", BEGINS_S)
+            wait_until("nobody holds it", lambda: status(server).get("active_operator") == "", BEGINS_S)
             drive.end(server)
             drive.end(first)
         return drive
@@ -173,16 +173,19 @@ def test_a_client_started_before_its_router_and_its_server_gets_to_drive(session
 def test_a_second_client_is_told_who_holds_the_vehicle(session: Session) -> None:
     """Without take-over it waits, knows who holds the vehicle, asks nobody for it, and ends with 0."""
     assert session.seen["waiting"]["phase"] == "seeking"
-    assert session.seen["waiting"]["holder"] == "operator-1"
+    assert session.seen["waiting"]["active_operator"] == "operator-1"
     told = session.seen["server while it waits"]
-    assert (told["safety"], told["holder"], told["asked_by"]) == ("driving", "operator-1", "")
+    assert (told["safety"], told["active_operator"], told["requested_by"]) == ("driving", "operator-1", "")
     assert session.codes["waiting"] == 0
 
 
-def test_the_holder_hands_over_to_who_asks(session: Session, server: Record, stalls: Stalls) -> None:
+def test_the_active_operator_hands_over_to_who_asks(session: Session, server: Record, stalls: Stalls) -> None:
     """Asked and then told by SIGUSR2, the holder releases; the vehicle stops, and who asked arms and drives it."""
-    assert (session.seen["asked"]["holder"], session.seen["asked"]["asked_by"]) == ("operator-1", "operator-2")
-    assert session.seen["handed over"]["holder"] == "operator-2"
+    assert (session.seen["requested"]["active_operator"], session.seen["requested"]["requested_by"]) == (
+        "operator-1",
+        "operator-2",
+    )
+    assert session.seen["handed over"]["active_operator"] == "operator-2"
     assert (session.seen["first, then"]["phase"], session.seen["first, then"]["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release by operator-1 granted")
     assert event_ns(server, "driving -> safe_stop: the client released the vehicle") >= released_ns
@@ -192,7 +195,7 @@ def test_the_holder_hands_over_to_who_asks(session: Session, server: Record, sta
         assert held_ns - released_ns < 2 * NS_PER_S
 
 
-def test_ctrl_c_of_the_holder_frees_the_vehicle(session: Session, server: Record, stalls: Stalls) -> None:
+def test_ctrl_c_of_the_active_operator_frees_the_vehicle(session: Session, server: Record, stalls: Stalls) -> None:
     """Within a second after Ctrl-C the vehicle is released and stopping; the client says so and has ended with 0."""
     released_ns = event_ns(server, "release by operator-2 granted")
     told_ns = session.at_ns["second told to end"]

@@ -71,7 +71,7 @@ class Echo:
         self.heard.append(message)
         if message.payload == b"break":
             raise RuntimeError("broken on purpose")
-        return [Send("rest", StationaryStatus(at_rest=True, holder=None)), Send("event", "heard")]
+        return [Send("rest", StationaryStatus(at_rest=True, active_operator=None)), Send("event", "heard")]
 
     def _answer(self, message: Message, _now: Now) -> list[Send]:
         return [Send("session_reply", message.payload, message.peer)]
@@ -135,12 +135,12 @@ def test_a_node_elsewhere_hears_and_is_heard() -> None:
         both.main.deliver("control", b"drive", arrived)
         wait_until(lambda: bool(both.neighbour.heard))
         assert [(each.payload, each.arrived) for each in both.node.heard] == [(b"drive", arrived)]
-        assert both.neighbour.heard == [StationaryStatus(at_rest=True, holder=None)]
+        assert both.neighbour.heard == [StationaryStatus(at_rest=True, active_operator=None)]
         assert both.notes.of("control") == [b"drive"], "written down once, where the links are"
         wait_until(lambda: both.notes.of("event") == ["heard"])
 
 
-def test_an_answer_finds_who_asked() -> None:
+def test_an_answer_finds_who_requested() -> None:
     """A peer, which nothing but its link understands, stays in its process; the answer is for it."""
     with rig() as both:
         alice, bob = object(), object()

@@ -76,11 +76,11 @@ class Stamped:
     stamp_ns: int
 
 
-def test_each_hop_gets_the_time_after_the_one_before() -> None:
+def test_each_stage_gets_the_time_after_the_one_before() -> None:
     """Hop after hop is called with the value and the end of the hop before, and the timeline lists all ends."""
     seen = []
 
-    def hop(result: object) -> Callable[[Any, Now], object]:
+    def stage(result: object) -> Callable[[Any, Now], object]:
         def call(value: object, now: Now) -> object:
             seen.append((value, now.mono_ns))
             return result
@@ -89,20 +89,20 @@ def test_each_hop_gets_the_time_after_the_one_before() -> None:
 
     first = message("control")
     sends = [Send("event", 1)]
-    hops = [("a", hop(Stamped(42))), ("b", hop("bare")), ("c", hop(sends))]
-    walked = walk("node", hops, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
+    stages = [("a", stage(Stamped(42))), ("b", stage("bare")), ("c", stage(sends))]
+    outcome = walk("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
     assert seen == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
-    assert (walked.sends, walked.end) == (sends, Now(1031, 5031))
-    assert walked.timeline is not None
-    assert (walked.timeline.stamp_ns, walked.timeline.arrived_mono_ns) == (42, 1000)
-    assert walked.timeline.hops == (("wait", 1010), ("a", 1017), ("b", 1024), ("c", 1031))
+    assert (outcome.sends, outcome.end) == (sends, Now(1031, 5031))
+    assert outcome.timeline is not None
+    assert (outcome.timeline.stamp_ns, outcome.timeline.arrived_mono_ns) == (42, 1000)
+    assert outcome.timeline.stages == (("wait", 1010), ("a", 1017), ("b", 1024), ("c", 1031))
 
 
 def test_none_ends_a_chain() -> None:
     """A hop that returns None is the last one called; nothing is sent, and without a stamp there is no timeline."""
-    hops = [("a", lambda _value, _now: None), ("b", lambda _value, _now: pytest.fail("called"))]
-    walked = walk("node", hops, message("control"), NOW, repeat(NOW.later(1)))
-    assert (walked.sends, walked.end.mono_ns, walked.timeline) == ([], 1001, None)
+    stages = [("a", lambda _value, _now: None), ("b", lambda _value, _now: pytest.fail("called"))]
+    outcome = walk("node", stages, message("control"), NOW, repeat(NOW.later(1)))
+    assert (outcome.sends, outcome.end.mono_ns, outcome.timeline) == ([], 1001, None)
 
 
 def test_the_token_is_never_recorded() -> None:

@@ -72,7 +72,7 @@ def test_a_hosts_clock_is_inverted_exactly(start_ns: int, mono_ns: int, drift_pp
     assert clock.at(true_ns - 1).mono_ns < start_ns + mono_ns
 
 
-def test_offset_drift_and_steps_are_those_asked_for() -> None:
+def test_offset_drift_and_steps_are_those_requested_for() -> None:
     """The wall clock has its offset, both clocks drift, and a step moves the wall clock alone, at its time."""
     clock = HostClock(7, 100, offset_ns=50, drift_ppb=1000, steps=[(2 * NS_PER_S, -30)])
     assert clock.at(0) == Now(7, 150)

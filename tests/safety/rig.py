@@ -114,7 +114,7 @@ class Rig:
         """Arm it and have one drive command obeyed, now."""
         self.armed()
         self.picture()
-        assert self.drive(**changes).obeyed
+        assert self.drive(**changes).accepted
         return self
 
     def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:

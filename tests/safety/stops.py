@@ -125,10 +125,10 @@ def _drive_to(loop: VirtualLoop, car: Simulator, metre: int) -> None:
     gate = actuator_of(loop).gate
     before = gate.applied_sequence
 
-    def obeyed_there() -> bool:
+    def accepted_there() -> bool:
         return gate.applied_sequence != before and car.ground_truth().progress_m >= metre
 
-    assert loop.runtime.run(loop.runtime.true_ns + 20 * NS_PER_S, obeyed_there)
+    assert loop.runtime.run(loop.runtime.true_ns + 20 * NS_PER_S, accepted_there)
 
 
 def _copied(node: ActuatorNode) -> ActuatorNode:

@@ -43,9 +43,9 @@ def test_a_stamp_written_twice_counts_as_the_newer_frame() -> None:
 def test_a_picture_was_taken_when_the_camera_says_so() -> None:
     """The time of taking is the camera's, or that of writing where it has none, or that of the first of equal ones."""
     written = IssuedStamps(MEMORY_NS, 5)
-    for stamp_ns, mono_ns, crc, taken_ns in ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390)):
-        written.note(stamp_ns, stamp_ns, mono_ns, crc, taken_ns)
-    assert [written.taken_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4)] == [90, 200, 200, 390]
+    for stamp_ns, mono_ns, crc, captured_ns in ((1, 100, 7, 90), (2, 200, 8, None), (3, 300, 8, 290), (4, 400, 9, 390)):
+        written.note(stamp_ns, stamp_ns, mono_ns, crc, captured_ns)
+    assert [written.captured_ns(stamp_ns) for stamp_ns in (1, 2, 3, 4)] == [90, 200, 200, 390]
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(0, NS_PER_S)), max_size=60))

@@ -18,7 +18,7 @@ from lavt.config_file import parse_config
 from lavt.domain import PATH_POINTS, PATH_STEP_M
 from lavt.experiment.runs.monitored_run import watch_drive
 from lavt.experiment.runs.plan import plan_run
-from lavt.safety.limiter import sight_limit_mps
+from lavt.safety.limiter import stopping_speed_limit_mps
 from lavt.safety.limits import LIMITS
 from lavt.vehicle.sim.road.road import load_road
 
@@ -86,7 +86,7 @@ def test_with_old_pictures_the_car_is_slower() -> None:
     }
     seen = watch_drive(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
     speeds_mps = seen.speed_mps[seen.time_s > 10]
-    allowed_mps = sight_limit_mps(seen.total_delay_ms / 1000, LIMITS)
+    allowed_mps = stopping_speed_limit_mps(seen.total_delay_ms / 1000, LIMITS)
     assert allowed_mps < SPEED_MPS - 0.2
     assert max(abs(speeds_mps - allowed_mps)) < 0.1
     assert len(seen.limited_s[seen.limited_s > 10]) > 100

@@ -111,7 +111,7 @@ def test_arming_begins_at_the_bounds_of_its_conditions(changes: dict[str, Any]) 
     """The lightest brake, the largest steering input to either side and the first sequence number are enough."""
     rig = Rig().hold()
     rig.picture()
-    assert rig.send(**changes).obeyed
+    assert rig.send(**changes).accepted
     assert rig.state == "arming"
 
 
@@ -131,7 +131,7 @@ def test_arming_does_not_begin_with_a_picture_already_used() -> None:
     rig.send()
     rig.go(300 * NS_PER_MS)
     assert rig.state == "disarmed"
-    assert rig.send().obeyed
+    assert rig.send().accepted
     assert rig.state == "disarmed"
 
 
@@ -174,7 +174,7 @@ def test_the_first_steering_target_is_where_the_wheel_is() -> None:
     rig.armed()
     rig.go(10 * NS_PER_MS)
     rig.picture()
-    assert rig.drive(steering_rad=-0.3).obeyed
+    assert rig.drive(steering_rad=-0.3).accepted
     assert rig.actuation().steering_rad == pytest.approx(0.2 - 0.01 * LIMITS.steering_rate_radps)
 
 
@@ -206,7 +206,7 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
 def test_the_flag_in_a_command_counts_whatever_the_command(changes: dict[str, Any]) -> None:
     """An emergency stop in a command is honoured whatever its epoch, sequence and picture; the command is refused."""
     rig = Rig().driving()
-    assert not rig.drive(emergency_stop=1, **changes).obeyed
+    assert not rig.drive(emergency_stop=1, **changes).accepted
     assert rig.state == "emergency_stop"
 
 
@@ -230,8 +230,8 @@ def test_the_number_of_an_emergency_stop_only_grows() -> None:
     assert rig.state == "driving"
     for number in (40, 39, 1, 0):
         reply = rig.ask("emergency_stop", "bob", 2, number=number)
-        assert isinstance(reply.because, str)
-        assert reply.because != ""
+        assert isinstance(reply.reason, str)
+        assert reply.reason != ""
         assert (reply.granted, reply.emergency_stop) == (False, 40)
     rig.picture()
     assert rig.drive(emergency_stop=40).reason == "it carries an emergency stop"
@@ -263,7 +263,7 @@ def test_a_command_that_carries_an_emergency_stop_never_moves_the_vehicle() -> N
     for _ in range(100):
         rig.go(TICK_NS)
         rig.picture()
-        assert not rig.send(emergency_stop=3).obeyed
+        assert not rig.send(emergency_stop=3).accepted
     assert rig.state == "disarmed"
 
 
@@ -275,23 +275,23 @@ def test_the_flag_that_every_command_repeats_is_no_replay() -> None:
     assert rig.gate.counts["emergency stop with an old number"] == 0
 
 
-def test_only_the_holder_clears_at_standstill_and_by_number() -> None:
+def test_only_the_active_operator_clears_at_standstill_and_by_number() -> None:
     """Clearing is refused to others, to a moving vehicle, and to a request that names another emergency stop."""
     rig = Rig().driving()
     rig.ask("emergency_stop", "bob", 2, number=8)
     rig.vehicle = vehicle_at(1.0)
-    assert rig.clear().because == "the vehicle does not stand yet"
+    assert rig.clear().reason == "the vehicle does not stand yet"
     rig.vehicle = vehicle_at()
     assert not rig.ask("clear_emergency_stop", "bob", 2, number=8).granted
     rig.ask("emergency_stop", "bob", 2, number=9)
     late = rig.clear(number=8)
-    assert (late.granted, late.because) == (False, "this is not the number of the last emergency stop")
+    assert (late.granted, late.reason) == (False, "this is not the number of the last emergency stop")
     assert rig.state == "emergency_stop"
     assert rig.clear(number=9).granted
     assert rig.state == "disarmed"
 
 
-def test_arming_is_refused_before_clearing_and_needed_after_it() -> None:
+def test_arming_is_rejected_before_clearing_and_needed_after_it() -> None:
     """Until it is cleared the emergency stop refuses arming; cleared, the vehicle is disarmed and needs its second."""
     rig = Rig().driving()
     rig.ask("emergency_stop", number=8)
@@ -315,5 +315,5 @@ def test_transitions_are_told_with_their_reasons() -> None:
         ("driving", "degraded"),
         ("degraded", "safe_stop"),
     ]
-    assert all(because for _, _, because in told)
+    assert all(reason for _, _, reason in told)
     assert rig.gate.take_transitions() == []

@@ -17,18 +17,18 @@ def reasons(rig: Rig) -> dict[str, int]:
     return {key.removeprefix("refused: "): n for key, n in rig.gate.counts.items() if key.startswith("refused: ")}
 
 
-def test_a_sound_command_is_obeyed_as_it_is() -> None:
+def test_a_sound_command_is_accepted_as_it_is() -> None:
     """A command within all rules and limits reaches the vehicle unchanged, and its sequence is told."""
     rig = Rig().armed()
     rig.go(TICK_NS)
     rig.picture()
-    assert rig.drive(steering_rad=0.001, throttle=0.4).obeyed
+    assert rig.drive(steering_rad=0.001, throttle=0.4).accepted
     assert rig.actuation() == Actuation(0.001, 0.4, 0.0)
     assert rig.gate.applied_sequence == rig.sequence
-    assert rig.gate.refused == ""
+    assert rig.gate.rejected == ""
 
 
-def test_each_reason_to_refuse_is_named_and_counted() -> None:
+def test_each_reason_to_reject_is_named_and_counted() -> None:
     """Each refusal names its reason, is counted under it, and leaves the command in force as it was."""
     rig = Rig().driving(throttle=0.25)
     now_ns = rig.now_ns
@@ -43,14 +43,14 @@ def test_each_reason_to_refuse_is_named_and_counted() -> None:
     ):
         before = reasons(rig).get(reason, 0)
         verdict = rig.drive(**changes)
-        assert (verdict.obeyed, verdict.reason) == (False, reason)
-        assert rig.gate.refused == reason
+        assert (verdict.accepted, verdict.reason) == (False, reason)
+        assert rig.gate.rejected == reason
         assert reasons(rig)[reason] == before + 1
     assert rig.now_ns == now_ns
     assert rig.actuation().throttle == 0.25
 
 
-def test_a_drive_command_is_refused_until_the_vehicle_is_armed() -> None:
+def test_a_drive_command_is_rejected_until_the_vehicle_is_armed() -> None:
     """Disarmed and stopped, a drive command is refused and nothing moves."""
     rig = Rig().hold()
     rig.picture()
@@ -58,15 +58,15 @@ def test_a_drive_command_is_refused_until_the_vehicle_is_armed() -> None:
     assert rig.actuation() == Actuation(0.0, 0.0, 1.0)
 
 
-@pytest.mark.parametrize(("late_ns", "obeyed"), [(0, True), (1, False)])
-def test_a_picture_may_be_500_ms_old_and_no_more(late_ns: int, *, obeyed: bool) -> None:
+@pytest.mark.parametrize(("late_ns", "accepted"), [(0, True), (1, False)])
+def test_a_picture_may_be_500_ms_old_and_no_more(late_ns: int, *, accepted: bool) -> None:
     """A command from a picture of 500 ms is obeyed, from one a nanosecond older refused."""
     rig = Rig().hold()
     stamp_ns = rig.picture()
     rig.go(LIMITS.picture_age_limit_ns + late_ns)
     verdict = rig.send(stamp_ns=stamp_ns)
-    assert verdict.obeyed is obeyed
-    assert obeyed or verdict.reason == "made from a picture that is too old"
+    assert verdict.accepted is accepted
+    assert accepted or verdict.reason == "made from a picture that is too old"
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_simulated_vehicle_may_take_pictures_of_2_s() -> None:
     rig = Rig(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S)).hold()
     stamp_ns = rig.picture()
     rig.go(2 * NS_PER_S)
-    assert rig.send(stamp_ns=stamp_ns).obeyed
+    assert rig.send(stamp_ns=stamp_ns).accepted
     rig.go(1)
     assert rig.send(stamp_ns=stamp_ns).reason == "made from a picture that is too old"
     rig = Rig(replace(LIMITS, picture_age_limit_ns=2 * NS_PER_S)).driving()
@@ -97,23 +97,23 @@ def test_a_simulated_vehicle_may_take_pictures_of_2_s() -> None:
 
 
 @pytest.mark.parametrize(
-    ("silence_ns", "state"),
+    ("since_command_ns", "state"),
     [(DEGRADED_NS - 1, "driving"), (DEGRADED_NS, "degraded"), (STOP_NS - 1, "degraded"), (STOP_NS, "safe_stop")],
 )
-def test_silence_degrades_at_300_ms_and_stops_at_500_ms(silence_ns: int, state: str) -> None:
+def test_silence_degrades_at_300_ms_and_stops_at_500_ms(since_command_ns: int, state: str) -> None:
     """Exactly 300 ms after the last command from a newer picture it is degraded, exactly after 500 ms it stops."""
     rig = Rig().driving()
-    rig.go(silence_ns)
+    rig.go(since_command_ns)
     assert rig.state == state
 
 
 def test_the_watchdog_needs_no_wake() -> None:
     """A command that comes 500 ms after the last one finds a stopped vehicle, also when nobody has looked meanwhile."""
-    for silence_ns, state in ((DEGRADED_NS - 1, "driving"), (STOP_NS, "safe_stop")):
+    for since_command_ns, state in ((DEGRADED_NS - 1, "driving"), (STOP_NS, "safe_stop")):
         rig = Rig().driving()
         rig.picture()
-        rig.now_ns += silence_ns
-        assert rig.drive().obeyed == (state == "driving")
+        rig.now_ns += since_command_ns
+        assert rig.drive().accepted == (state == "driving")
         assert rig.state == state
 
 
@@ -136,7 +136,7 @@ def test_an_older_picture_does_not_keep_the_vehicle_alive() -> None:
     for _ in range(5):
         rig.go(TICK_NS)
         stamps.append(rig.picture())
-    assert rig.drive(stamp_ns=stamps[-1]).obeyed
+    assert rig.drive(stamp_ns=stamps[-1]).accepted
     for number in range(STOP_NS // TICK_NS):
         rig.go(TICK_NS)
         rig.drive(stamp_ns=stamps[number % 5])
@@ -151,7 +151,7 @@ def test_a_step_of_the_wall_clock_changes_nothing(step_ns: int) -> None:
     for _ in range(100):
         rig.go(TICK_NS)
         rig.picture()
-        assert rig.drive().obeyed
+        assert rig.drive().accepted
         assert rig.state == "driving"
     rig.go(STOP_NS)
     assert rig.state == "safe_stop"
@@ -165,7 +165,7 @@ def test_degraded_takes_the_throttle_away_and_brakes_gently() -> None:
     assert rig.actuation().throttle == 0.0
     assert rig.actuation().brake == pytest.approx(1.0 / MAX_BRAKING_MPS2)
     rig.picture()
-    assert rig.drive(throttle=0.75).obeyed
+    assert rig.drive(throttle=0.75).accepted
     assert rig.state == "driving"
     assert rig.actuation().throttle == 0.75
 
@@ -186,7 +186,7 @@ def test_silence_never_eases_a_brake() -> None:
     assert rig.actuation().brake == 0.9
 
 
-def test_degraded_obeys_no_command_from_a_picture_already_used() -> None:
+def test_degraded_accepts_no_command_from_a_picture_already_used() -> None:
     """300 ms without a newer picture there is no command at all: what comes from an old one does not even steer."""
     rig = Rig().driving(steering_rad=0.02)
     rig.go(TICK_NS)
@@ -223,7 +223,7 @@ def test_safe_stop_is_latched_under_a_new_epoch() -> None:
     assert rig.state == "driving"
 
 
-def test_nothing_queued_in_an_outage_is_obeyed_after_it() -> None:
+def test_nothing_queued_in_an_outage_is_accepted_after_it() -> None:
     """Three seconds of commands that arrive in one burst after the outage are all refused."""
     rig = Rig().driving()
     queued = []
@@ -232,16 +232,16 @@ def test_nothing_queued_in_an_outage_is_obeyed_after_it() -> None:
         rig.picture()
         queued.append(rig.command(mode="drive", throttle=1.0, brake=0.0))
     verdicts = [rig.gate.admit(command, rig.vehicle, rig.now_ns) for command in queued]
-    assert not any(verdict.obeyed for verdict in verdicts)
+    assert not any(verdict.accepted for verdict in verdicts)
     assert rig.state == "safe_stop"
 
 
 def test_the_client_can_ask_for_a_stop() -> None:
     """A command of mode stop leads from driving and from degraded to the safe stop."""
-    for silence_ns in (0, DEGRADED_NS):
+    for since_command_ns in (0, DEGRADED_NS):
         rig = Rig().driving()
-        rig.go(silence_ns)
-        assert rig.send(mode="stop").obeyed
+        rig.go(since_command_ns)
+        assert rig.send(mode="stop").accepted
         assert rig.state == "safe_stop"
 
 
@@ -257,8 +257,8 @@ def test_of_two_commands_in_one_nanosecond_the_later_sequence_holds() -> None:
     rig = Rig().armed()
     rig.picture()
     first, second = (rig.command(mode="drive", throttle=throttle, brake=0.0) for throttle in (0.2, 0.6))
-    assert rig.gate.admit(second, rig.vehicle, rig.now_ns).obeyed
-    assert not rig.gate.admit(first, rig.vehicle, rig.now_ns).obeyed
+    assert rig.gate.admit(second, rig.vehicle, rig.now_ns).accepted
+    assert not rig.gate.admit(first, rig.vehicle, rig.now_ns).accepted
     assert rig.actuation().throttle == 0.6
 
 
@@ -272,7 +272,7 @@ def test_five_equal_pictures_are_a_camera_fault(start: str) -> None:
         rig.picture(crc=-1)
         rig.go(NS_PER_MS)
         assert (rig.state == "safe_stop") == (number == 5)
-    assert "same picture" in rig.gate.because
+    assert "same picture" in rig.gate.reason
 
 
 def test_nothing_wakes_the_gate_while_nobody_drives() -> None:

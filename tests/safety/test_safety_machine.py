@@ -52,13 +52,13 @@ class GateMachine(RuleBasedStateMachine):
         command = rig.command(**changes)
         lawful = command.epoch == rig.gate._epoch and not command.emergency_stop
         verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns)
-        if verdict.obeyed and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
+        if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
             self.newest_used, self.used_ns = rig.frame, rig.now_ns
         fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
         neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
         good = lawful and command.mode == "arm" and neutral and fresh and command.brake >= LIMITS.arming_brake
-        kept = good and verdict.obeyed and abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
-        if not kept and (verdict.obeyed or verdict.reason in BREAKS_ARMING):
+        kept = good and verdict.accepted and abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
+        if not kept and (verdict.accepted or verdict.reason in BREAKS_ARMING):
             self.held_since_ns = None
         self.only_the_table_leads_anywhere()
         if kept and self.held_since_ns is None:
@@ -123,15 +123,17 @@ class GateMachine(RuleBasedStateMachine):
         if operation == "release" and reply.granted:
             self.held_since_ns = None
         if reply.epoch:
-            assert self.rig.gate.holder == (who, 1)
+            assert self.rig.gate.active_operator == (who, 1)
 
     @rule(speed_mps=SPEEDS, steering_rad=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD))
     def vehicle_is(self, speed_mps: float, steering_rad: float) -> None:
         self.rig.vehicle = replace(vehicle_at(speed_mps, steering_rad), mono_ns=self.rig.now_ns)
 
-    @rule(hindrance=st.sampled_from(["", "fault"]), engaged=st.booleans(), overridden=st.booleans())
-    def vehicle_obeys_or_not(self, hindrance: str, *, engaged: bool, overridden: bool) -> None:
-        self.rig.vehicle = replace(self.rig.vehicle, hindrance=hindrance, is_engaged=engaged, is_overridden=overridden)
+    @rule(inhibit_reason=st.sampled_from(["", "fault"]), engaged=st.booleans(), overridden=st.booleans())
+    def vehicle_accepts_or_not(self, inhibit_reason: str, *, engaged: bool, overridden: bool) -> None:
+        self.rig.vehicle = replace(
+            self.rig.vehicle, inhibit_reason=inhibit_reason, is_engaged=engaged, is_overridden=overridden
+        )
 
     @precondition(lambda self: self.rig.state == "driving")
     @rule()

@@ -34,7 +34,7 @@ def test_a_changed_table_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "| cleared | driving | arming | the emergency stop was cleared |\n" in changed
 
 
-def test_every_transition_limit_and_refusal_is_drawn() -> None:
+def test_every_transition_limit_and_rejection_is_drawn() -> None:
     """Each row of the table is an arrow, each limit has its reason, and each reason that the gate gives is listed."""
     arrows = re.findall(r"(\w+) --> \w+: (.+)", DRAWINGS["states"]())
     assert {(before, trigger) for before, triggers in arrows for trigger in triggers.split(", ")} == set(
@@ -43,10 +43,10 @@ def test_every_transition_limit_and_refusal_is_drawn() -> None:
     rows = DRAWINGS["limits of the vehicle"]().splitlines()[2:]
     assert len(rows) == len(LIMITS.__slots__)
     assert all(len(row.split(" | ")[2]) > 10 for row in rows)
-    refusals = DRAWINGS["refusals"]().splitlines()
-    assert refusals[0] == "1. not the epoch in force"
-    assert {gate.NOT_ARMED, gate.NOT_STANDING} <= {line.partition(". ")[2] for line in refusals}
-    assert len(refusals) >= 10
+    rejections = DRAWINGS["rejections"]().splitlines()
+    assert rejections[0] == "1. not the epoch in force"
+    assert {gate.NOT_ARMED, gate.NOT_STATIONARY} <= {line.partition(". ")[2] for line in rejections}
+    assert len(rejections) >= 10
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_every_transition_limit_and_refusal_is_drawn() -> None:
         ("lateral_acceleration_mps2", 3.0, "3 m/s2"),
         ("steering_rate_radps", 0.8, "0.8 rad/s"),
         ("arming_steering_rad", 0.1, "0.1 rad"),
-        ("sight_m", 20.0, "20 m"),
+        ("stopping_distance_limit_m", 20.0, "20 m"),
         ("frozen_frames", 5, "5 frames"),
         ("arming_brake", 0.3, "0.3 of the pedal"),
     ],
@@ -68,7 +68,7 @@ def test_a_limit_is_told_with_its_unit(name: str, value: float, said: str) -> No
     assert value_with_unit(name, value) == said
 
 
-def test_a_block_that_nobody_can_draw_is_refused() -> None:
+def test_a_block_that_nobody_can_draw_is_rejected() -> None:
     """A block of another name is an error that names those there are."""
     with pytest.raises(UserError, match="'cats': choose one of states, transitions"):
         drawn("<!-- drawn: cats -->\n<!-- drawn until here -->")

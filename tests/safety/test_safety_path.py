@@ -25,11 +25,11 @@ class Moving(Rig):
 
     def roll(self, duration_ns: int, speed_mps: float = 8.0) -> Actuation:
         """Let so much time pass, looked at every tick; tell the last actuation."""
-        asked = self.see(speed_mps)
+        requested = self.see(speed_mps)
         for _ in range(duration_ns // TICK_NS):
             self.go(TICK_NS)
-            asked = self.see(speed_mps)
-        return asked
+            requested = self.see(speed_mps)
+        return requested
 
     def see(self, speed_mps: float) -> Actuation:
         angle_rad = self.gate.limiter.target_rad(self.vehicle)
@@ -41,7 +41,7 @@ class Moving(Rig):
         self.armed()
         self.roll(TICK_NS)
         self.picture()
-        assert self.drive(steering_rad=angle_rad, path_curvature_per_m=path).obeyed
+        assert self.drive(steering_rad=angle_rad, path_curvature_per_m=path).accepted
         return self
 
 
@@ -50,13 +50,13 @@ def test_while_commanded_the_command_steers() -> None:
     assert Moving().on(LEFT, 0.01).roll(280 * NS_PER_MS).steering_rad == 0.01
 
 
-@pytest.mark.parametrize(("silence_ns", "state"), [(400 * NS_PER_MS, "degraded"), (600 * NS_PER_MS, "safe_stop")])
-def test_silence_steers_along_the_path(silence_ns: int, state: str) -> None:
+@pytest.mark.parametrize(("since_command_ns", "state"), [(400 * NS_PER_MS, "degraded"), (600 * NS_PER_MS, "safe_stop")])
+def test_silence_steers_along_the_path(since_command_ns: int, state: str) -> None:
     """Degraded and safe stop steer to where the last command's path bends: more than it does, being beside it."""
     rig = Moving().on(LEFT)
-    asked = rig.roll(silence_ns)
+    requested = rig.roll(since_command_ns)
     assert rig.state == state
-    assert LEFT_RAD < asked.steering_rad < 3 * LEFT_RAD
+    assert LEFT_RAD < requested.steering_rad < 3 * LEFT_RAD
 
 
 def test_the_wheel_turns_where_the_path_does() -> None:
@@ -72,10 +72,10 @@ def test_an_emergency_stop_follows_the_path_at_full_brake() -> None:
     rig = Moving().on(LEFT)
     rig.roll(TICK_NS)
     assert rig.ask("emergency_stop", who="bob", number=1).granted
-    asked = rig.roll(500 * NS_PER_MS)
+    requested = rig.roll(500 * NS_PER_MS)
     assert rig.state == "emergency_stop"
-    assert (asked.throttle, asked.brake) == (0.0, 1.0)
-    assert asked.steering_rad == pytest.approx(LEFT_RAD, rel=0.1)
+    assert (requested.throttle, requested.brake) == (0.0, 1.0)
+    assert requested.steering_rad == pytest.approx(LEFT_RAD, rel=0.1)
 
 
 @pytest.mark.parametrize("stop", ["stop", "release", "end_drive"])
@@ -129,9 +129,9 @@ def test_the_path_lies_where_its_picture_was_taken() -> None:
         rig.roll(TICK_NS)
         stamp_ns = rig.picture()
         rig.roll(age_ns)
-        assert rig.drive(stamp_ns=stamp_ns, steering_rad=0.0, path_curvature_per_m=LATER_LEFT).obeyed
+        assert rig.drive(stamp_ns=stamp_ns, steering_rad=0.0, path_curvature_per_m=LATER_LEFT).accepted
         rig.picture()
-        assert rig.send(mode="stop").obeyed
+        assert rig.send(mode="stop").accepted
         said_rad.append(rig.roll(200 * NS_PER_MS).steering_rad)
     assert abs(said_rad[0]) < 0.002
     assert said_rad[1] > 0.01
@@ -141,7 +141,7 @@ def test_the_older_the_picture_the_slower() -> None:
     """At 10 m/s a command keeps its throttle until its picture is 0.25 s old, and is braked after that."""
     rig = Moving().on((0.0,) * 10)
     assert rig.roll(240 * NS_PER_MS, 10.0).throttle == 0.5
-    asked = rig.roll(40 * NS_PER_MS, 10.0)
+    requested = rig.roll(40 * NS_PER_MS, 10.0)
     assert (rig.state, rig.gate.limiter.changed) == ("driving", ("sight",))
-    assert asked.throttle == 0.0
-    assert asked.brake > 0.0
+    assert requested.throttle == 0.0
+    assert requested.brake > 0.0

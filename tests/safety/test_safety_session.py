@@ -9,13 +9,13 @@ from lavt.domain import NS_PER_MS, NS_PER_S, Operation, SessionRequest
 from lavt.safety.limits import LIMITS
 
 
-def test_nobody_is_obeyed_before_somebody_holds_the_vehicle() -> None:
+def test_nobody_is_accepted_before_somebody_holds_the_vehicle() -> None:
     """Without a holder no command is obeyed, not even one that guessed the epoch in force."""
     rig = Rig()
     rig.picture()
     for epoch in range(999, 1003):
         verdict = rig.send(epoch=epoch)
-        assert (verdict.obeyed, verdict.reason) == (False, "not the epoch in force")
+        assert (verdict.accepted, verdict.reason) == (False, "not the epoch in force")
     assert rig.state == "disarmed"
 
 
@@ -28,17 +28,17 @@ def test_what_is_in_force_is_known_from_the_start() -> None:
     assert rig.gate.in_force == (rig.epoch, -1)
     assert rig.epoch != before
     rig.picture()
-    assert rig.send().obeyed
+    assert rig.send().accepted
     assert rig.gate.in_force == (rig.epoch, rig.sequence)
     rig.ask("release")
     assert rig.gate.in_force[0] not in (before, rig.epoch)
     assert rig.gate.in_force[1] == -1
 
 
-def test_the_holder_gets_an_epoch_and_a_token() -> None:
+def test_the_active_operator_gets_an_epoch_and_a_token() -> None:
     """Holding hands out the epoch to command under and the token that opens the path of the video."""
     reply = Rig().ask("hold")
-    assert (reply.granted, reply.because) == (True, "")
+    assert (reply.granted, reply.reason) == (True, "")
     assert reply.epoch != 0
     assert len(reply.token) == 16
     assert (reply.video_port, reply.host, reply.emergency_stop) == (5600, "bench", 0)
@@ -53,36 +53,36 @@ def test_asking_again_changes_nothing() -> None:
     assert rig.ask("hold") == first
     assert rig.state == "driving"
     rig.picture()
-    assert rig.drive().obeyed
+    assert rig.drive().accepted
 
 
 @pytest.mark.parametrize("other", [("bob", 1), ("alice", 2)])
-def test_a_second_client_is_refused_while_the_vehicle_is_armed_or_moves(other: tuple[str, int]) -> None:
+def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: tuple[str, int]) -> None:
     """While arming, driving, degraded, or still rolling in a stop, nobody else gets the vehicle, an epoch or a token.
 
     A client that was started anew is somebody else.
     """
     rig = Rig().hold()
 
-    def refused() -> bool:
+    def rejected() -> bool:
         reply = rig.gate.answer(SessionRequest("hold", *other, 0), rig.vehicle, rig.now_ns)
         return (reply.granted, reply.epoch, reply.token) == (False, 0, b"")
 
     rig.arm_for(NS_PER_S // 2)
     assert rig.state == "arming"
-    assert refused()
+    assert rejected()
     rig.arm_for(NS_PER_S // 2)
     assert rig.state == "driving"
-    assert refused()
+    assert rejected()
     rig.vehicle = vehicle_at(8.0)
     rig.go(300 * NS_PER_MS)
     assert rig.state == "degraded"
-    assert refused()
+    assert rejected()
     rig.go(200 * NS_PER_MS)
     assert rig.state == "safe_stop"
-    assert refused()
+    assert rejected()
     rig.vehicle = vehicle_at(0.0)
-    assert not refused()
+    assert not rejected()
 
 
 def test_take_over_at_standstill_ends_the_first_ones_epoch() -> None:
@@ -95,7 +95,7 @@ def test_take_over_at_standstill_ends_the_first_ones_epoch() -> None:
     assert second.token != first.token
     rig.picture()
     assert rig.send().reason == "not the epoch in force"
-    assert rig.send(epoch=second.epoch).obeyed
+    assert rig.send(epoch=second.epoch).accepted
     assert not rig.ask("release").granted
 
 
@@ -116,19 +116,19 @@ def test_release_hands_out_nothing() -> None:
     reply = rig.ask("release")
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
     rig.picture()
-    assert not rig.send().obeyed
+    assert not rig.send().accepted
     assert not rig.ask("release").granted
 
 
 @pytest.mark.parametrize("operation", ["release", "clear_emergency_stop"])
-def test_only_the_holder_changes_the_session(operation: Operation) -> None:
+def test_only_the_active_operator_changes_the_session(operation: Operation) -> None:
     """Release and clearing are refused to others, and to the holder's name under another instance."""
     rig = Rig().armed()
     for who, instance in (("bob", 1), ("alice", 2)):
         reply = rig.ask(operation, who, instance)
         assert not reply.granted
-        assert isinstance(reply.because, str)
-        assert reply.because != ""
+        assert isinstance(reply.reason, str)
+        assert reply.reason != ""
         assert reply.epoch == 0
     assert rig.state == "driving"
 
@@ -141,7 +141,7 @@ def test_whoever_stops_the_vehicle_does_not_get_to_drive_it() -> None:
     assert (reply.epoch, reply.token) == (0, b"")
 
 
-def test_what_was_asked_is_counted() -> None:
+def test_what_was_requested_is_counted() -> None:
     """Each operation is counted, granted and refused apart."""
     rig = Rig().armed()
     rig.ask("hold", "bob", 1)
@@ -149,19 +149,19 @@ def test_what_was_asked_is_counted() -> None:
     assert (counts["session hold granted"], counts["session hold refused"]) == (1, 1)
 
 
-def asked_by(rig: Rig) -> str:
-    return rig.gate.claims.asked_by(rig.now_ns)
+def requested_by(rig: Rig) -> str:
+    return rig.gate.claims.requested_by(rig.now_ns)
 
 
-def test_who_asks_is_told_to_the_holder_and_changes_nothing_else() -> None:
+def test_who_asks_is_told_to_the_active_operator_and_changes_nothing_else() -> None:
     """An ask is granted without epoch or token, named for whoever holds the vehicle, and the drive goes on."""
     rig = Rig().driving()
     reply = rig.ask("ask", "bob", 7)
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
-    assert asked_by(rig) == "bob"
+    assert requested_by(rig) == "bob"
     rig.picture()
-    assert rig.drive().obeyed
-    assert rig.gate.holder == ("alice", 1)
+    assert rig.drive().accepted
+    assert rig.gate.active_operator == ("alice", 1)
 
 
 def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
@@ -170,31 +170,31 @@ def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
     for _ in range(5):
         rig.ask("ask", "bob", 7)
         reply = rig.ask("hold", "bob", 7)
-        assert (reply.granted, reply.because) == (
+        assert (reply.granted, reply.reason) == (
             False, "held by alice, and the vehicle is not disarmed at standstill",
         )  # fmt: skip
         for _ in range(50):
             rig.go(TICK_NS)
             rig.picture()
-            assert rig.drive().obeyed
+            assert rig.drive().accepted
 
 
-def test_with_consent_the_vehicle_stops_and_goes_to_who_asked() -> None:
+def test_with_consent_the_vehicle_stops_and_goes_to_who_requested() -> None:
     """A release while somebody asks stops the vehicle, keeps it from all others, and who asked gets it at once."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
     rig.ask("ask", "bob", 7)
     assert rig.ask("release").granted
-    assert (rig.state, rig.gate.holder, asked_by(rig)) == ("safe_stop", None, "")
+    assert (rig.state, rig.gate.active_operator, requested_by(rig)) == ("safe_stop", None, "")
     for who, instance in (("carol", 1), ("alice", 1), ("bob", 8)):
         reply = rig.ask("hold", who, instance)
-        assert (reply.granted, reply.because) == (False, "handed over to bob, who has not taken it yet")
+        assert (reply.granted, reply.reason) == (False, "handed over to bob, who has not taken it yet")
     assert rig.ask("hold", "bob", 7).epoch != 0
     rig.vehicle = vehicle_at(0.0)
     assert rig.ask("hold", "carol").granted
 
 
-def test_a_new_holder_arms_at_standstill() -> None:
+def test_a_new_active_operator_arms_at_standstill() -> None:
     """Who took over a rolling vehicle arms it like anybody: not before it stands, and then for a second."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
@@ -210,7 +210,7 @@ def test_a_new_holder_arms_at_standstill() -> None:
     assert rig.state == "driving"
 
 
-def test_what_is_kept_for_who_asked_becomes_free() -> None:
+def test_what_is_kept_for_who_requested_becomes_free() -> None:
     """Who asked and then does not come has the vehicle kept for 5 s, and no longer."""
     rig = Rig().driving()
     rig.ask("ask", "bob", 7)
@@ -226,16 +226,16 @@ def test_an_ask_lapses() -> None:
     """Who has not asked for 3 s does not ask any more, and a release then keeps the vehicle for nobody."""
     rig = Rig().driving()
     rig.ask("ask", "bob", 7)
-    rig.go(LIMITS.ask_lapses_ns - 1)
-    assert asked_by(rig) == "bob"
+    rig.go(LIMITS.handover_request_timeout_ns - 1)
+    assert requested_by(rig) == "bob"
     rig.ask("ask", "bob", 7)
-    rig.go(LIMITS.ask_lapses_ns - 1)
-    assert asked_by(rig) == "bob"
+    rig.go(LIMITS.handover_request_timeout_ns - 1)
+    assert requested_by(rig) == "bob"
     rig.go(1)
-    assert asked_by(rig) == ""
+    assert requested_by(rig) == ""
     rig.ask("release")
     assert rig.ask("hold", "carol").granted
-    assert LIMITS.ask_lapses_ns == 3 * NS_PER_S
+    assert LIMITS.handover_request_timeout_ns == 3 * NS_PER_S
 
 
 def test_the_first_who_asks_comes_first() -> None:
@@ -244,21 +244,21 @@ def test_the_first_who_asks_comes_first() -> None:
     rig.ask("ask", "bob", 7)
     for who, instance in (("carol", 1), ("bob", 8)):
         reply = rig.ask("ask", who, instance)
-        assert (reply.granted, reply.because) == (False, "bob asks for it already")
-    rig.go(LIMITS.ask_lapses_ns)
+        assert (reply.granted, reply.reason) == (False, "bob asks for it already")
+    rig.go(LIMITS.handover_request_timeout_ns)
     assert rig.ask("ask", "carol").granted
-    assert asked_by(rig) == "carol"
+    assert requested_by(rig) == "carol"
 
 
 def test_asking_is_for_what_somebody_else_holds() -> None:
     """The holder, and anybody while nobody holds the vehicle, is refused with the reason."""
     rig = Rig()
-    assert rig.ask("ask").because == "nobody holds the vehicle"
+    assert rig.ask("ask").reason == "nobody holds the vehicle"
     rig.hold()
-    refused = rig.ask("ask")
-    assert refused.because == "you hold the vehicle"
-    assert (refused.granted, refused.epoch, refused.token) == (False, 0, b"")
-    assert asked_by(rig) == ""
+    rejected = rig.ask("ask")
+    assert rejected.reason == "you hold the vehicle"
+    assert (rejected.granted, rejected.epoch, rejected.token) == (False, 0, b"")
+    assert requested_by(rig) == ""
 
 
 def test_at_rest_no_consent_is_needed() -> None:
@@ -266,7 +266,7 @@ def test_at_rest_no_consent_is_needed() -> None:
     rig = Rig().hold()
     rig.ask("ask", "bob", 7)
     assert rig.ask("hold", "carol").granted
-    assert asked_by(rig) == ""
+    assert requested_by(rig) == ""
 
 
 def test_an_emergency_stop_by_another_is_named_and_leaves_the_session_as_it_is() -> None:
@@ -274,10 +274,10 @@ def test_an_emergency_stop_by_another_is_named_and_leaves_the_session_as_it_is()
     rig = Rig().driving()
     rig.ask("ask", "bob", 7)
     assert rig.ask("emergency_stop", "bob", 7, number=5).granted
-    assert (rig.state, rig.gate.because) == ("emergency_stop", "emergency stop by bob")
-    assert (rig.gate.holder, asked_by(rig)) == (("alice", 1), "bob")
+    assert (rig.state, rig.gate.reason) == ("emergency_stop", "emergency stop by bob")
+    assert (rig.gate.active_operator, requested_by(rig)) == (("alice", 1), "bob")
     rig.ask("emergency_stop", "carol", 1, number=5)
-    assert rig.gate.because == "emergency stop by bob"
+    assert rig.gate.reason == "emergency stop by bob"
 
 
 def test_a_server_that_ends_stops_the_vehicle_for_good() -> None:
@@ -285,8 +285,8 @@ def test_a_server_that_ends_stops_the_vehicle_for_good() -> None:
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
     rig.gate.end()
-    assert (rig.state, rig.gate.because, rig.gate.holder) == ("safe_stop", "the server was told to end", None)
+    assert (rig.state, rig.gate.reason, rig.gate.active_operator) == ("safe_stop", "the server was told to end", None)
     rig.picture()
     assert rig.drive().reason == "not the epoch in force"
     rig.vehicle = vehicle_at(0.0)
-    assert rig.ask("hold", "bob").because == "the server is about to end"
+    assert rig.ask("hold", "bob").reason == "the server is about to end"

@@ -10,19 +10,19 @@ from tests.safety.rig import Rig, vehicle_at
 
 from lavt.domain import NS_PER_S
 
-FAULT: dict[str, Any] = {"hindrance": "brake: fault", "is_engaged": False}
-OVERRIDE: dict[str, Any] = {"hindrance": "the driver steers", "is_engaged": False, "is_overridden": True}
+FAULT: dict[str, Any] = {"inhibit_reason": "brake: fault", "is_engaged": False}
+OVERRIDE: dict[str, Any] = {"inhibit_reason": "the driver steers", "is_engaged": False, "is_overridden": True}
 
 
 def test_a_vehicle_that_cannot_be_driven_is_not_armed() -> None:
     """While the vehicle says why it cannot be driven, arming is refused in its words; without them it begins."""
     rig = Rig().hold()
-    rig.vehicle = replace(vehicle_at(), hindrance="no report of the speed for 100 ms", is_engaged=False)
+    rig.vehicle = replace(vehicle_at(), inhibit_reason="no report of the speed for 100 ms", is_engaged=False)
     rig.picture()
     assert rig.send().reason.endswith(": no report of the speed for 100 ms")
     assert rig.state == "disarmed"
     rig.vehicle = vehicle_at()
-    assert rig.send().obeyed
+    assert rig.send().accepted
     assert rig.state == "arming"
 
 
@@ -50,16 +50,16 @@ def test_a_vehicle_that_gets_engaged_does_not_turn_its_wheel() -> None:
 
 
 @pytest.mark.parametrize("state", ["driving", "degraded"])
-def test_a_vehicle_that_ceases_to_obey_is_stopped(state: str) -> None:
+def test_a_vehicle_that_ceases_to_accept_is_stopped(state: str) -> None:
     """A fault in the drive is a safe stop, told in the vehicle's words; what still obeys is braked."""
     rig = Rig().driving()
     if state == "degraded":
         rig.go(400_000_000)
     assert rig.state == state
     rig.vehicle = replace(vehicle_at(8.0), **FAULT)
-    asked = rig.actuation()
-    assert (rig.state, rig.gate.because) == ("safe_stop", "the vehicle does not obey: brake: fault")
-    assert (asked.throttle, asked.brake) == (0.0, 4.0 / 6.0)
+    requested = rig.actuation()
+    assert (rig.state, rig.gate.reason) == ("safe_stop", "the vehicle does not obey: brake: fault")
+    assert (requested.throttle, requested.brake) == (0.0, 4.0 / 6.0)
 
 
 def test_a_vehicle_that_lets_go_without_a_word_is_stopped() -> None:
@@ -83,7 +83,7 @@ def test_who_drives_the_car_by_hand_has_it(state: str) -> None:
     rig.vehicle = replace(vehicle_at(8.0), **OVERRIDE)
     epoch = rig.epoch
     rig.actuation()
-    assert (rig.state, rig.gate.because) == ("disarmed", "the driver in the car has taken over")
+    assert (rig.state, rig.gate.reason) == ("disarmed", "the driver in the car has taken over")
     rig.picture()
     assert rig.drive(epoch=epoch).reason == "not the epoch in force"
 
@@ -102,7 +102,7 @@ def test_a_fault_counts_before_a_command() -> None:
     rig = Rig().driving()
     rig.vehicle = replace(vehicle_at(8.0), **FAULT)
     rig.picture()
-    assert not rig.drive().obeyed
+    assert not rig.drive().accepted
     assert rig.state == "safe_stop"
 
 

@@ -13,7 +13,7 @@ class CommandResult(NamedTuple):
     out: str
     err: str
 
-    def refused(self) -> str:
+    def rejected(self) -> str:
         """Check that the input was refused as it must be, and return the sentence."""
         assert self.code == 2, self
         assert self.out == ""

@@ -109,7 +109,7 @@ class RunningLane:
             os.killpg(group, signal.SIGKILL)
         self._process.wait()
 
-    def news(self) -> str:
+    def events(self) -> str:
         """Return the output since the last call."""
         with self._output.open("rb") as output:
             output.seek(self._told)
@@ -152,12 +152,12 @@ def _run_together(running: Sequence[RunningLane], tell: Tell) -> None:
             each.go_on()
         told = next((each for each in running if each.running), None)
         for each in running:  # those before it have ended, and are told whole
-            tell(each.news())
+            tell(each.events())
             if each is told:
                 break
         pause(POLL_NS)
     for each in running:
-        tell(each.news())
+        tell(each.events())
 
 
 def table(outcomes: Sequence[Outcome]) -> str:

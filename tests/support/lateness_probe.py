@@ -58,11 +58,11 @@ def main() -> None:
     answer(go_first())
     late_ns = LATE_NS + 2 * round(time.clock_getres(time.CLOCK_MONOTONIC) * 1e9)
     late: list[tuple[int, int]] = []
-    asked = select.poll()
-    asked.register(0, select.POLLIN)
+    requested = select.poll()
+    requested.register(0, select.POLLIN)
     due_ns = time.monotonic_ns() + PERIOD_MS * 1_000_000
     while True:
-        ready = asked.poll(PERIOD_MS)
+        ready = requested.poll(PERIOD_MS)
         now_ns = time.monotonic_ns()
         if now_ns - due_ns > late_ns:
             late.append((due_ns, now_ns))

@@ -36,14 +36,12 @@ STATE = State(
     steering_rad=-0.1,
     gear="drive",
     safety="driving",
-    because="armed",
+    reason="armed",
     applied_sequence=-1,
-    refused="",
+    rejected="",
 )
 REQUEST = SessionRequest(operation="hold", who="operator-1", instance=2**64 - 1, number=0)
-REPLY = SessionReply(
-    granted=True, because="", epoch=3, token=bytes(16), video_port=5600, host="a-b-c", emergency_stop=0
-)
+REPLY = SessionReply(granted=True, reason="", epoch=3, token=bytes(16), video_port=5600, host="a-b-c", emergency_stop=0)
 NETEM = NetemRequest(
     who="operator-1",
     instance=5,
@@ -59,7 +57,7 @@ NETEM = NetemRequest(
     reorder=0.0,
     state_delay_ms=150.0,
 )
-NETEM_REPLY = NetemReply(granted=False, because="no")
+NETEM_REPLY = NetemReply(granted=False, reason="no")
 MESSAGES: dict[type, AnyMessage] = {type(each): each for each in (COMMAND, STATE, REQUEST, REPLY, NETEM, NETEM_REPLY)}
 
 U64 = st.integers(0, 2**64 - 1)
@@ -95,13 +93,13 @@ STATES = st.builds(
     steering_rad=ROAD_WHEEL,
     gear=st.sampled_from(["park", "reverse", "neutral", "drive"]),
     safety=st.sampled_from(["disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"]),
-    because=text(200),
+    reason=text(200),
     applied_sequence=st.integers(-1, 2**63 - 1),
-    refused=text(200),
+    rejected=text(200),
     limited=text(100),
-    holder=st.one_of(st.just(""), NAMES),
-    holder_instance=U64,
-    asked_by=st.one_of(st.just(""), NAMES),
+    active_operator=st.one_of(st.just(""), NAMES),
+    active_operator_instance=U64,
+    requested_by=st.one_of(st.just(""), NAMES),
     instance=U64,
 )
 REQUESTS = st.builds(
@@ -114,7 +112,7 @@ REQUESTS = st.builds(
 REPLIES = st.builds(
     SessionReply,
     granted=st.booleans(),
-    because=text(200),
+    reason=text(200),
     epoch=U64,
     token=st.one_of(st.just(b""), st.binary(min_size=16, max_size=16)),
     video_port=st.integers(0, 65535),
@@ -134,10 +132,10 @@ def test_round_trip(message: AnyMessage) -> None:
 def test_longest_texts_fit(letter: str) -> None:
     """Texts as long as they may be, of letters of any size, still make a message that is read."""
     longest = letter * (200 // len(letter.encode()))
-    message = replace(STATE, because=longest, refused=longest, sent_wall_ns=2**63 - 1, applied_sequence=2**63 - 1)
+    message = replace(STATE, reason=longest, rejected=longest, sent_wall_ns=2**63 - 1, applied_sequence=2**63 - 1)
     assert decode(State, encode(message)) == message
-    with pytest.raises(BadMessage, match="because"):
-        decode(State, encode(replace(message, because=longest + letter)))
+    with pytest.raises(BadMessage, match="reason"):
+        decode(State, encode(replace(message, reason=longest + letter)))
 
 
 def test_version_comes_first() -> None:
@@ -160,15 +158,15 @@ def test_damaged_messages(kind: type[Any]) -> None:
     """A message in which a byte was changed, or of which a part is missing, is a message in range or a BadMessage."""
     whole = encode(MESSAGES[kind])
     generator = stream(2, f"damaged {kind.__name__}")
-    refused = 0
+    rejected = 0
     for _ in range(2_000):
         damaged = bytearray(whole)
         damaged[int(generator.integers(len(whole)))] = int(generator.integers(256))
         try:
             assert isinstance(decode(kind, bytes(damaged)), kind)
         except BadMessage:
-            refused += 1
-    assert refused > 500
+            rejected += 1
+    assert rejected > 500
     for length in range(len(whole)):
         with pytest.raises(BadMessage):
             decode(kind, whole[:length])
@@ -206,13 +204,13 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "steering_rad": [*NOT_A_NUMBER, 1.0001, -1.0001],
         "gear": [*NOT_A_TEXT, "", "sideways"],
         "safety": [*NOT_A_TEXT, "", "safe"],
-        "because": [*NOT_A_TEXT, "x" * 201],
+        "reason": [*NOT_A_TEXT, "x" * 201],
         "applied_sequence": [*NOT_AN_INTEGER, -2, 2**63],
-        "refused": [*NOT_A_TEXT, "x" * 201],
+        "rejected": [*NOT_A_TEXT, "x" * 201],
         "limited": [*NOT_A_TEXT, "x" * 101],
-        "holder": NOT_A_NAME_OR_NONE,
-        "holder_instance": [*NOT_AN_INTEGER, -1],
-        "asked_by": NOT_A_NAME_OR_NONE,
+        "active_operator": NOT_A_NAME_OR_NONE,
+        "active_operator_instance": [*NOT_AN_INTEGER, -1],
+        "requested_by": NOT_A_NAME_OR_NONE,
         "instance": [*NOT_AN_INTEGER, -1],
     },
     SessionRequest: {
@@ -223,7 +221,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     },
     SessionReply: {
         "granted": [0, 1, 1.0, "true", None, []],
-        "because": [*NOT_A_TEXT, "x" * 201],
+        "reason": [*NOT_A_TEXT, "x" * 201],
         "epoch": [*NOT_AN_INTEGER, -1],
         "token": ["", "x" * 16, None, 0, bytes(15), bytes(17), [0] * 16],
         "video_port": [*NOT_AN_INTEGER, -1, 65536],
@@ -245,7 +243,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "reorder": [*NOT_A_NUMBER, -0.1, 1.1],
         "state_delay_ms": [*NOT_A_NUMBER, -0.1, 10_000.1],
     },
-    NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "because": [*NOT_A_TEXT, "x" * 401]},
+    NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "reason": [*NOT_A_TEXT, "x" * 401]},
 }  # fmt: skip
 
 

@@ -80,14 +80,14 @@ def test_a_picture_that_is_late_by_a_little_is_waited_for(tmp_path: Path, opens:
     camera = opens(write_video(tmp_path / "slow.avi", rate_hz=2.0), rate_hz=2.0)
 
     assert number_of(next_frame(camera).picture) == 0
-    asked = [camera.capture(number, now_ns(), None) for number in range(7)]
-    frames = [frame for frame in asked if frame is not None]
+    requested = [camera.capture(number, now_ns(), None) for number in range(7)]
+    frames = [frame for frame in requested if frame is not None]
     assert [number_of(frame.picture) for frame in frames] in ([1], [1, 2])
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times(share=0.05)
-def test_pictures_that_come_just_when_they_are_asked_for_are_not_missed(tmp_path: Path, opens: Opens) -> None:
+def test_pictures_that_come_just_when_they_are_requested_for_are_not_missed(tmp_path: Path, opens: Opens) -> None:
     """Asked at its own rate, at the very moment when its pictures come, a camera gives one for nearly each question."""
     camera = opens(write_video(tmp_path / "fast.avi", rate_hz=50.0), rate_hz=50.0)
 
@@ -144,7 +144,7 @@ def test_a_file_whose_pictures_have_a_position_has_no_capture_time(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("position_ms", "taken_ns"),
+    ("position_ms", "captured_ns"),
     [
         (5000.0, 5_000_000_000),
         (4999.123, 4_999_123_000),
@@ -158,16 +158,16 @@ def test_a_file_whose_pictures_have_a_position_has_no_capture_time(tmp_path: Pat
         (float("inf"), None),
     ],
 )
-def test_a_buffers_time_counts_within_the_second_before_it_came(position_ms: float, taken_ns: int | None) -> None:
+def test_a_buffers_time_counts_within_the_second_before_it_came(position_ms: float, captured_ns: int | None) -> None:
     """A V4L2 buffer's time that is of another clock, ahead of the picture, or over a second old is not known."""
-    assert buffer_time_ns(position_ms, 5 * NS_PER_S) == taken_ns
+    assert buffer_time_ns(position_ms, 5 * NS_PER_S) == captured_ns
 
 
 def test_a_buffers_time_keeps_its_microseconds_after_years() -> None:
     """OpenCV gives the time as a number of milliseconds: after ten years of running it is good to a microsecond."""
-    taken_ns = 10 * 365 * 86_400 * NS_PER_S + 123_456_000
-    assert buffer_time_ns(taken_ns / NS_PER_MS, taken_ns + 5) is not None
-    assert abs((buffer_time_ns(taken_ns / NS_PER_MS, taken_ns + 500) or 0) - taken_ns) <= 500
+    captured_ns = 10 * 365 * 86_400 * NS_PER_S + 123_456_000
+    assert buffer_time_ns(captured_ns / NS_PER_MS, captured_ns + 5) is not None
+    assert abs((buffer_time_ns(captured_ns / NS_PER_MS, captured_ns + 500) or 0) - captured_ns) <= 500
 
 
 def test_a_picture_that_waited_too_long_is_not_given(tmp_path: Path, opens: Opens) -> None:
@@ -190,17 +190,17 @@ def test_what_is_given_away_is_not_written_again(tmp_path: Path, opens: Opens) -
 
 
 @pytest.mark.parametrize(
-    ("asked", "rate_hz"),
+    ("requested", "rate_hz"),
     [(CameraModel(640, 480), 30.0), (MODEL, 25.0), (CameraModel(240, 320), 30.0)],
 )
-def test_another_size_or_rate_is_refused(tmp_path: Path, opens: Opens, asked: CameraModel, rate_hz: float) -> None:
+def test_another_size_or_rate_is_rejected(tmp_path: Path, opens: Opens, requested: CameraModel, rate_hz: float) -> None:
     """What does not give the size and rate that it is asked for is refused, with what it gives."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
-    with pytest.raises(UserError, match=f"320x240 at 30 Hz.*{asked.width_px}x{asked.height_px}"):
-        opens(path, model=asked, rate_hz=rate_hz)
+    with pytest.raises(UserError, match=f"320x240 at 30 Hz.*{requested.width_px}x{requested.height_px}"):
+        opens(path, model=requested, rate_hz=rate_hz)
 
 
-def test_another_format_is_refused(tmp_path: Path, opens: Opens) -> None:
+def test_another_format_is_rejected(tmp_path: Path, opens: Opens) -> None:
     """A format that was asked for and is not in force is refused; the one that is in force is taken."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     assert opens(path, pixel_format="MJPG").wait(LONG_S)
@@ -214,19 +214,19 @@ def test_a_rate_a_thousandth_off_is_the_same(tmp_path: Path, opens: Opens) -> No
 
 
 @pytest.mark.parametrize("device", ["/dev/video97", "97", "/dev/null", "nowhere.avi", "no_video.avi"])
-def test_what_cannot_be_opened_is_refused(
+def test_what_cannot_be_opened_is_rejected(
     tmp_path: Path, opens: Opens, device: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A device that is not there, or is none, is one sentence, and OpenCV adds nothing to it."""
     (tmp_path / "no_video.avi").write_bytes(bytes(5000))
     given = str(tmp_path / device) if device.endswith(".avi") else device
-    with pytest.raises(UserError, match="cannot be opened as a camera") as refused:
+    with pytest.raises(UserError, match="cannot be opened as a camera") as rejected:
         opens(given)
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(rejected.value)
     assert capfd.readouterr().err == ""
 
 
-def test_an_address_where_nobody_answers_is_refused(opens: Opens) -> None:
+def test_an_address_where_nobody_answers_is_rejected(opens: Opens) -> None:
     """A camera in the network that does not answer is one sentence too."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
@@ -234,7 +234,7 @@ def test_an_address_where_nobody_answers_is_refused(opens: Opens) -> None:
         opens(address)
 
 
-def test_a_video_without_pictures_is_refused(tmp_path: Path, opens: Opens) -> None:
+def test_a_video_without_pictures_is_rejected(tmp_path: Path, opens: Opens) -> None:
     """A file that begins like a video and has no picture is no camera."""
     whole = write_video(tmp_path / "whole.avi", rate_hz=30.0).read_bytes()
     path = tmp_path / "cut.avi"

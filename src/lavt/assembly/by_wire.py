@@ -38,17 +38,17 @@ def inside(config: ServerConfig, road: Road, start: Now) -> DbwVehicle:
 
 def open_by_wire(config: VehicleConfig, clock: Clock) -> DbwVehicle:
     """Open the bus of the configured kit, which other processes may be on; raises `UserError`."""
-    asked = config.dbw
-    profile = profile_of(asked)
-    truth = TruthSocket(resolved_address("vehicle.dbw.truth", asked.truth)) if asked.truth else None
-    port = CanPort(asked.interface, asked.channel, asked.options, clock=clock)
+    requested = config.dbw
+    profile = profile_of(requested)
+    truth = TruthSocket(resolved_address("vehicle.dbw.truth", requested.truth)) if requested.truth else None
+    port = CanPort(requested.interface, requested.channel, requested.options, clock=clock)
     return _vehicle(
         profile,
         port,
-        capabilities_of(profile, simulated=is_simulated(asked), truth=truth is not None),
+        capabilities_of(profile, simulated=is_simulated(requested), truth=truth is not None),
         clock.now(),
         truth=None if truth is None else truth.take,
-        hindrance=hindrance_of(asked, profile),
+        inhibit_reason=inhibit_reason_of(requested, profile),
     )
 
 
@@ -57,10 +57,10 @@ def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, 
 
     Raises `UserError` for a profile that is none and a bus that cannot be opened.
     """
-    asked = config.dbw
-    profile = profile_of(asked)
-    port = CanPort(asked.interface, asked.channel, asked.options, clock=clock)
-    adapter = ByWireAdapter(profile, start_ns=clock.now().mono_ns, hindrance=hindrance_of(asked, profile))
+    requested = config.dbw
+    profile = profile_of(requested)
+    port = CanPort(requested.interface, requested.channel, requested.options, clock=clock)
+    adapter = ByWireAdapter(profile, start_ns=clock.now().mono_ns, inhibit_reason=inhibit_reason_of(requested, profile))
     heard, end_ns = 0, clock.now().mono_ns + duration_ns
     try:
         while (now_ns := clock.now().mono_ns) < end_ns:
@@ -73,7 +73,7 @@ def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, 
     finally:
         port.close()
     adapter.engage(wanted=False, now_ns=end_ns)
-    return heard, adapter.state().hindrance
+    return heard, adapter.state().inhibit_reason
 
 
 def is_simulated(config: DbwConfig) -> bool:
@@ -97,7 +97,7 @@ def capabilities_of(profile: Profile, *, simulated: bool, truth: bool) -> Capabi
     )
 
 
-def hindrance_of(config: DbwConfig, profile: Profile) -> str:
+def inhibit_reason_of(config: DbwConfig, profile: Profile) -> str:
     """Say why a vehicle must not be armed as it is configured; empty: it may."""
     if profile.car.steering_sign is None:
         return "which sign steers left is not known: try it with the wheels up, and set vehicle.dbw.steering_sign"
@@ -116,9 +116,15 @@ def hindrance_of(config: DbwConfig, profile: Profile) -> str:
 
 
 def _vehicle(
-    profile: Profile, port: BusPort, capabilities: Capabilities, start: Now, *, truth: Truth | None, hindrance: str = ""
+    profile: Profile,
+    port: BusPort,
+    capabilities: Capabilities,
+    start: Now,
+    *,
+    truth: Truth | None,
+    inhibit_reason: str = "",
 ) -> DbwVehicle:
-    adapter = ByWireAdapter(profile, start_ns=start.mono_ns, hindrance=hindrance)
+    adapter = ByWireAdapter(profile, start_ns=start.mono_ns, inhibit_reason=inhibit_reason)
     return DbwVehicle(adapter, port, capabilities, start_ns=start.mono_ns, truth=truth)
 
 

@@ -31,7 +31,7 @@ def proof_of(seen: WatchdogObservation, gear: str, profile: Profile, config: Dbw
         is_virtual=is_virtual(config.interface, config.channel),
         gear=gear,
         brake=BRAKE,
-        let_go_ms=round(seen.let_go_ns / NS_PER_MS, 1),
+        release_ms=round(seen.released_ns / NS_PER_MS, 1),
         braked_ms=round(seen.braked_ns / NS_PER_MS, 1),
         reports=seen.reports,
         said=seen.words,

@@ -27,7 +27,7 @@ SENT_BY: Final[dict[Role, tuple[str, ...]]] = {
 
 
 def netem_flows(
-    asked: Condition,
+    requested: Condition,
     role: Role,
     *,
     video_port: int,
@@ -41,11 +41,11 @@ def netem_flows(
     happen to is among them, so that another condition can follow without a packet being lost.
     """
     flows = [
-        ImpairedFlow("video", "udp", video_port, "source", law(asked.video_ms, asked.video)),
-        ImpairedFlow("control", protocol, control_port, "destination", law(asked.control_ms, asked.control)),
+        ImpairedFlow("video", "udp", video_port, "source", law(requested.video_ms, requested.video)),
+        ImpairedFlow("control", protocol, control_port, "destination", law(requested.control_ms, requested.control)),
     ]
     if state_delay == "with_video":
-        flows.append(ImpairedFlow("state", protocol, control_port, "source", Impairment(delay_ms=asked.video_ms)))
+        flows.append(ImpairedFlow("state", protocol, control_port, "source", Impairment(delay_ms=requested.video_ms)))
     return [flow for flow in flows if flow.name in SENT_BY[role]]
 
 
@@ -82,9 +82,9 @@ def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port
 
 def injection_client(config: ClientInjectionConfig, who: str, instance: int, start_ns: int) -> InjectionClient:
     """Make the client's node; raises `UserError` for a condition that does not exist."""
-    asked = condition(config.condition) if config.condition else NO_CONDITION
+    requested = condition(config.condition) if config.condition else NO_CONDITION
     [control] = netem_flows(
-        asked, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
+        requested, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )
     if not (config.interface or control.law.is_nothing):
         raise UserError(
@@ -96,8 +96,8 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
         instance,
         condition=config.condition,
         control=control,
-        video=law(asked.video_ms, asked.video),
-        state_delay_ms=asked.video_ms if config.state_delay == "with_video" else 0.0,
+        video=law(requested.video_ms, requested.video),
+        state_delay_ms=requested.video_ms if config.state_delay == "with_video" else 0.0,
         start_ns=start_ns,
     )
     try:

@@ -25,9 +25,9 @@ def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int
     if impairment == ImpairmentConfig():
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
-    asked = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
-    check_injected(asked)
-    return asked
+    requested = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
+    check_injected(requested)
+    return requested
 
 
 def trace_path(name: str) -> Path:
@@ -45,9 +45,9 @@ def trace_path(name: str) -> Path:
     return path
 
 
-def trace_digests(asked: Condition) -> dict[str, str]:
+def trace_digests(requested: Condition) -> dict[str, str]:
     """Give the SHA-256 of each trace that a condition names, by name: a file can be changed after a run."""
-    names = [flow.trace for flow in (asked.video, asked.control) if flow.trace]
+    names = [flow.trace for flow in (requested.video, requested.control) if flow.trace]
     return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 
 

@@ -88,17 +88,17 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
         LIMITS,
         lateral_acceleration_mps2=config.lateral_acceleration_mps2,
         picture_age_limit_ns=round(config.picture_age_limit_ms * NS_PER_MS),
-        sight_m=config.sight_m,
+        stopping_distance_limit_m=config.stopping_distance_limit_m,
     )
     wider = (
         limits.lateral_acceleration_mps2 > LIMITS.lateral_acceleration_mps2
         or limits.picture_age_limit_ns > LIMITS.picture_age_limit_ns
-        or limits.sight_m > LIMITS.sight_m
+        or limits.stopping_distance_limit_m > LIMITS.stopping_distance_limit_m
     )
     if wider and not simulated:
         raise UserError(
             f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
-            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.sight_m:.0f} m: lower "
+            f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.stopping_distance_limit_m:.0f} m: lower "
             "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and safety.sight_m"
         )
     return limits

@@ -22,7 +22,7 @@ def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
     return lambda token, challenge: SrtpCipher(end, token, challenge)
 
 
-def door_of(
+def gateway_of(
     config: ServerConfig | ClientConfig,
     deliver: Deliver,
     carry: Carry,
@@ -30,12 +30,12 @@ def door_of(
 ) -> ServerGateway | ClientGateway | OpenClientGateway:
     """Make a side's door; raises `UserError` for a key that cannot be read. Only the server asks what is `in_force`."""
     if isinstance(config, ServerConfig):
-        return ServerGateway(deliver, carry, in_force, vehicle_seal(config))
-    seal = operator_seal(config)
-    return OpenClientGateway(deliver, carry) if seal is None else ClientGateway(deliver, carry, seal)
+        return ServerGateway(deliver, carry, in_force, vehicle_authenticator(config))
+    authenticator = operator_authenticator(config)
+    return OpenClientGateway(deliver, carry) if authenticator is None else ClientGateway(deliver, carry, authenticator)
 
 
-def vehicle_seal(config: ServerConfig) -> NoVehicleAuthenticator:
+def vehicle_authenticator(config: ServerConfig) -> NoVehicleAuthenticator:
     """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
     security = config.security
     if not security.key:
@@ -44,7 +44,7 @@ def vehicle_seal(config: ServerConfig) -> NoVehicleAuthenticator:
     return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
 
 
-def operator_seal(config: ClientConfig) -> OperatorAuthenticator | None:
+def operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
     """Make the operator's end; raises `UserError` for a key that cannot be read. None where nothing is signed."""
     security = config.security
     if not security.key:

@@ -56,13 +56,13 @@ def build_simulator(config: ServerConfig) -> VehicleSetup:
 def build_dbw(config: ServerConfig) -> VehicleSetup:
     """Make a by-wire vehicle and its camera: the simulator's, where a software car tells where it is."""
     check_vehicle(config.vehicle)
-    asked = config.vehicle.dbw
-    if asked.is_inside:
+    requested = config.vehicle.dbw
+    if requested.is_inside:
         return build_simulator(config)
-    if asked.truth:
+    if requested.truth:
         check_own_camera(config)
         return VehicleSetup(
-            _sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(asked)
+            _sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(requested)
         )
     camera = build_camera(config)
     if camera is None:

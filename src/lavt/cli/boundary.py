@@ -34,12 +34,12 @@ def boundary(
     from lavt.experiment.boundary.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.boundary.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    asked = load_config(BoundaryConfig, config, changes or [])
-    searches = plan_boundary(asked)
+    requested = load_config(BoundaryConfig, config, changes or [])
+    searches = plan_boundary(requested)
     out = out or Path("out") / "boundary"
     prepare_directory(out)
     with console.interruptible(), progress(f"boundary into {out}", len(searches)) as tell:
-        found, done = search_boundary(asked, searches, out, jobs=jobs, tell=tell)
+        found, done = search_boundary(requested, searches, out, jobs=jobs, tell=tell)
     for failure in found["failed"]:
         console.say(f"failed: {failure['name']}: {failure['why']}")
     if not done:

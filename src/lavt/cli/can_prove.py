@@ -70,7 +70,7 @@ def prove(
         console.show_json({"file": str(file), **proof.model_dump()})
         return
     console.show(
-        f"the kit let go {proof.let_go_ms:g} ms after the last frame and braked after {proof.braked_ms:g} ms, within "
+        f"the kit let go {proof.release_ms:g} ms after the last frame and braked after {proof.braked_ms:g} ms, within "
         f"{BRAKE_WITHIN_NS // 1_000_000} ms, in gear {proof.gear} ({proof.said}); proof: {file}"
     )
     console.show("the kit brakes until somebody takes over: press the brake pedal")

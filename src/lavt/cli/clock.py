@@ -52,12 +52,12 @@ def clock(
 
     Example: lavt clock --server 192.0.2.7
     """
-    asked = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
-    config = parse_config(ClockConfig, asked, "lavt clock")
+    requested = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
+    config = parse_config(ClockConfig, requested, "lavt clock")
     address = None if server is None else look_up("--server", server)
     machine = MachineClock()
-    with closing(interpreter(config)) as asked_by:
-        ask = clock_source(config, machine, asked_by.run)
+    with closing(interpreter(config)) as requested_by:
+        ask = clock_source(config, machine, requested_by.run)
         report = _answer(ask, source)
         if address is None:
             finding = check_host(report)

@@ -79,12 +79,12 @@ def _show(summary: dict[str, Any]) -> None:
     units = ("", "", "", "video + control, ms", "ms", "ms", "ms", "cross-track, m")
     table = Table(*("\n".join(each) for each in zip(columns, units, strict=True)))
     for run in summary["runs"]:
-        asked = run["injected_ms"]
+        requested = run["injected_ms"]
         table.add_row(
             run["time"],
             run["condition"],
             run["ending"] + ("" if run["valid"] else ", not valid"),
-            f"{asked['video']:g} + {asked['control']:g}",
+            f"{requested['video']:g} + {requested['control']:g}",
             _ms(run["tau_v_ms"]),
             _ms(run["tau_c_ms"]),
             _ms(run["loop_ms"]),

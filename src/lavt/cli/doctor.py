@@ -96,7 +96,7 @@ def _checks(settings: Settings | None, clock: MachineClock) -> Iterator[Check]:
     yield from _machine(config, "" if settings is None else _side(settings), clock)
     report = probes.clock_report(config.clock, clock)
     yield checks.check_clock(report)
-    yield checks.check_netem(probes.netem_refusal(config.injection.interface), config.injection.interface)
+    yield checks.check_netem(probes.netem_rejection(config.injection.interface), config.injection.interface)
     if settings is None:
         return
     yield from _security(settings, clock)
@@ -151,10 +151,10 @@ def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
 def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
     bus = f"{settings.vehicle.dbw.interface} {settings.vehicle.dbw.channel}"
     try:
-        heard, hindrance = listen(settings.vehicle, clock, LISTEN_NS)
+        heard, inhibit_reason = listen(settings.vehicle, clock, LISTEN_NS)
     except UserError as error:
-        heard, hindrance = 0, str(error)
-    return checks.check_by_wire(heard, hindrance, name=bus)
+        heard, inhibit_reason = 0, str(error)
+    return checks.check_by_wire(heard, inhibit_reason, name=bus)
 
 
 def _as_sent(config: ClientConfig) -> ServerConfig:
@@ -168,11 +168,11 @@ def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     files = probes.key_files(settings.security)
     yield checks.check_plain(bool(files))
     for key, path, private in files:
-        refusal, mode = probes.file_state(path)
-        yield checks.check_key_file(key, path, refusal=refusal, mode=mode, private=private)
-    refusal = probes.keys_refusal(settings)
-    if refusal:
-        yield Check("keys", "problem", refusal, "copy what `lavt keys` made for this machine (docs/deployment.md)")
+        rejection, mode = probes.file_state(path)
+        yield checks.check_key_file(key, path, rejection=rejection, mode=mode, private=private)
+    rejection = probes.keys_rejection(settings)
+    if rejection:
+        yield Check("keys", "problem", rejection, "copy what `lavt keys` made for this machine (docs/deployment.md)")
     for folder in sorted({path.parent for _, path, _ in files}):
         for path, days_left in probes.certificates(folder, clock.now().wall_ns):
             yield checks.check_certificate(path, days_left)
@@ -181,24 +181,24 @@ def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
 def _ports(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
     host, probe_port = settings.video.bind, settings.clock.probe_port
     ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
-    refusals = {key: probes.bind_refusal(host, port) for _, key, port in ports}
+    rejections = {key: probes.bind_rejection(host, port) for _, key, port in ports}
     served = False
-    if any(refusals.values()) and probe_port:
+    if any(rejections.values()) and probe_port:
         served = bool(probe(clock, "127.0.0.1" if host == EVERYWHERE else host, probe_port, PROBING_NS // 10)[0])
     for name, key, port in ports:
-        yield checks.check_port(name, key, host, port, refusal=refusals[key], served=served)
+        yield checks.check_port(name, key, host, port, rejection=rejections[key], served=served)
 
 
 def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
-    if probes.keys_refusal(settings):
+    if probes.keys_rejection(settings):
         yield Check("router", "not checked", "the keys must be put right before")
         return
     listener = probes.Listener(settings)
     try:
         link = ZenohLink(
             clock,
-            listener.let_in,
+            listener.receive,
             side="client",
             path=find(Path(settings.zenoh.session)),
             router=settings.zenoh.router,

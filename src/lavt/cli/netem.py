@@ -186,7 +186,7 @@ def _words(measured: ProbeResult) -> str:
     parts = ["no delay measured"]
     if measured.median_ms is not None:
         parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
-    counts = {"lost": measured.lost, "overtaken": measured.reordered, "early": measured.early}
+    counts = {"lost": measured.lost, "reordered": measured.reordered, "early": measured.early}
     return ", ".join(parts + [f"{count} of {measured.sent} {name}" for name, count in counts.items() if count])
 
 

@@ -64,7 +64,7 @@ def sentence(result: dict[str, Any]) -> str:
         f"tau_v {_latency(result['tau_v_ms'])}, tau_c {_latency(result['tau_c_ms'])}",
     ]
     if not result["valid"]:
-        lines.append("this run is not valid: " + "; ".join(result["invalid_because"]))
+        lines.append("this run is not valid: " + "; ".join(result["invalid_reasons"]))
     return "\n".join(lines)
 
 

@@ -51,10 +51,10 @@ def _chosen(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
         if len(known) > 1:
             raise UserError(f"the video is sent to {', '.join(send_to)}: choose one of them with --receiver")
         return known[0]
-    asked = resolved_address("--receiver", receiver)
-    if asked not in known:
+    requested = resolved_address("--receiver", receiver)
+    if requested not in known:
         raise UserError(f"no video is sent to {receiver}: add it to video.send_to, or choose {', '.join(send_to)}")
-    return asked
+    return requested
 
 
 def _profile_level_id(settings: ServerConfig) -> str:

@@ -30,11 +30,11 @@ PHASES: dict[Phase, str] = {
 """The client's own phases; of driving the vehicle's state tells."""
 
 
-def phase_words(phase: Phase, because: str) -> str:
+def phase_words(phase: Phase, reason: str) -> str:
     """Say the client's phase; empty where there is nothing to say."""
-    if phase == "seeking" and not because:
+    if phase == "seeking" and not reason:
         return ""
-    return PHASES[phase].format(because=because, waits=f", but {because}" if because else "")
+    return PHASES[phase].format(reason=reason, waits=f", but {reason}" if reason else "")
 
 
 def state_words(before: State | None, after: State, *, this_client: str) -> list[str]:
@@ -44,23 +44,27 @@ def state_words(before: State | None, after: State, *, this_client: str) -> list
     """
     words = []
     if before is None:
-        before = replace(after, safety="disarmed", because="", holder="", asked_by="")
+        before = replace(after, safety="disarmed", reason="", active_operator="", requested_by="")
     elif after.instance != before.instance:
         words.append("the server was started anew")
-    if after.holder != before.holder:
-        words.append(f"{after.holder} holds the vehicle" if after.holder else "nobody holds the vehicle any more")
-    if (after.safety, after.because) != (before.safety, before.because):
-        who = after.holder or before.holder or "the client"
-        words.append(f"{after.safety}: {after.because.replace('the client', who)}")
-    if after.asked_by and after.asked_by != before.asked_by:
-        hands_over = after.holder == this_client
+    if after.active_operator != before.active_operator:
         words.append(
-            f"{after.asked_by} asks for the vehicle; SIGUSR2 hands it over"
-            if hands_over
-            else f"{after.asked_by} asks {after.holder} for the vehicle"
+            f"{after.active_operator} holds the vehicle"
+            if after.active_operator
+            else "nobody holds the vehicle any more"
         )
-    if before.asked_by and not after.asked_by and after.holder == before.holder:
-        words.append(f"{before.asked_by} does not ask for the vehicle any more")
+    if (after.safety, after.reason) != (before.safety, before.reason):
+        who = after.active_operator or before.active_operator or "the client"
+        words.append(f"{after.safety}: {after.reason.replace('the client', who)}")
+    if after.requested_by and after.requested_by != before.requested_by:
+        hands_over = after.active_operator == this_client
+        words.append(
+            f"{after.requested_by} asks for the vehicle; SIGUSR2 hands it over"
+            if hands_over
+            else f"{after.requested_by} asks {after.active_operator} for the vehicle"
+        )
+    if before.requested_by and not after.requested_by and after.active_operator == before.active_operator:
+        words.append(f"{before.requested_by} does not ask for the vehicle any more")
     return words
 
 
@@ -93,8 +97,8 @@ class SessionLog:
         self._start_ns: int | None = None
         self._state_ns: int | None = None
         self._quiet = False
-        self._refused: Counter[str] = Counter()
-        self._told_refusals_ns: int | None = None
+        self._rejected: Counter[str] = Counter()
+        self._told_rejections_ns: int | None = None
         self._limited_ns: dict[str, int] = {}
 
     def state(self, state: State, now_ns: int, *, holds: bool = False) -> None:
@@ -108,16 +112,16 @@ class SessionLog:
             if now_ns - self._limited_ns.get(limit, now_ns - OFTEN_NS) >= OFTEN_NS:
                 self._lines.append(f"limited: {limit}")
             self._limited_ns[limit] = now_ns
-        if self._client and state.refused and (before is None or state.refused != before.refused):
-            self.refusal(state.refused)
+        if self._client and state.rejected and (before is None or state.rejected != before.rejected):
+            self.rejection(state.rejected)
 
-    def refusal(self, reason: str) -> None:
+    def rejection(self, reason: str) -> None:
         """A command was refused."""
-        self._refused[reason] += 1
+        self._rejected[reason] += 1
 
-    def phase(self, phase: Phase, because: str) -> None:
+    def phase(self, phase: Phase, reason: str) -> None:
         """The client's phase is this."""
-        words = phase_words(phase, because)
+        words = phase_words(phase, reason)
         if words and words != self._told_phase:
             self._lines.append(words)
         self._told_phase = words
@@ -135,12 +139,12 @@ class SessionLog:
         return lines
 
     def _look_at_the_clock(self, now_ns: int) -> None:
-        if self._refused and (self._told_refusals_ns is None or now_ns - self._told_refusals_ns >= OFTEN_NS):
-            self._told_refusals_ns = now_ns
-            for reason, count in self._refused.items():
+        if self._rejected and (self._told_rejections_ns is None or now_ns - self._told_rejections_ns >= OFTEN_NS):
+            self._told_rejections_ns = now_ns
+            for reason, count in self._rejected.items():
                 many = "a command was" if count == 1 else f"{count} commands were"
                 self._lines.append(f"{many} refused: {reason}")
-            self._refused.clear()
+            self._rejected.clear()
         if self._start_ns is None:
             self._start_ns = now_ns
         if self._quiet or not self._client:

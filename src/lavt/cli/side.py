@@ -12,7 +12,7 @@ import yaml
 from lavt.assembly.actuator_process import ActuatorProcess
 from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.assembly.rendezvous import open_flow
-from lavt.assembly.security import door_of
+from lavt.assembly.security import gateway_of
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.cli.session_log import SessionLog, end_words, release_words
@@ -79,10 +79,12 @@ class Side:
         quiet_logs()
         self.in_force: Callable[[], tuple[int, int]] = lambda: (0, -1)
         """The server's: epoch in force, and sequence of the command last obeyed."""
-        self._door = door_of(config, self._deliver, lambda *sends: self._zenoh.send(*sends), lambda: self.in_force())
+        self._gateway = gateway_of(
+            config, self._deliver, lambda *sends: self._zenoh.send(*sends), lambda: self.in_force()
+        )
         self._zenoh = ZenohLink(
             clock,
-            self._door.let_in,
+            self._gateway.receive,
             side=self._name,
             path=find(Path(config.zenoh.session)),
             router=config.zenoh.router,
@@ -118,7 +120,7 @@ class Side:
         away = {} if self.elsewhere is None else {self.elsewhere.name: self.elsewhere}
         self.runtime = RealRuntime(self.clock, nodes, self._queue, source, away)
         self._zenoh.start()
-        self.runtime.start({**self._udp, "zenoh": self._door, "netem": self._injector})
+        self.runtime.start({**self._udp, "zenoh": self._gateway, "netem": self._injector})
         if self.elsewhere is not None:
             self.elsewhere.start(self.runtime)
         for link in self._udp.values():
@@ -160,7 +162,7 @@ class Side:
         if self._queue is not None:
             counts = {
                 **{name: link.counts for name, link in self._udp.items()},
-                "zenoh": {**self._zenoh.counts, **self._door.counts},
+                "zenoh": {**self._zenoh.counts, **self._gateway.counts},
             }
             for name, counted in counts.items():
                 self._queue.write("counts", {"link": name, **counted}, self.clock.now())
@@ -220,13 +222,13 @@ def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as
         if isinstance(heard, State):
             narrator.state(heard, at.mono_ns, holds=session is not None and session.holds)
         else:
-            narrator.refusal(heard)
+            narrator.rejection(heard)
     narrator.ending(side.tap.ending)
     status = side.tap.status()
     if session is not None:
         if not last:
-            narrator.phase(session.phase, session.because)
-        status |= {"phase": session.phase, "session": session.because}
+            narrator.phase(session.phase, session.reason)
+        status |= {"phase": session.phase, "session": session.reason}
     lines = narrator.take(side.clock.now().mono_ns) + [last] * bool(last)
     if as_json:
         console.show_json({"status": status, "ending": side.tap.ending, "said": lines})

@@ -96,8 +96,8 @@ def _live(
         datagram = runner.truth()
         if datagram is not None:
             send(datagram)
-        for news in runner.take_news():
-            tell(news)
+        for events in runner.take_events():
+            tell(events)
         pause_ns = max(runner.next_wake_ns() - clock.now().mono_ns, 0)
         for line in lines.wait(told, pause_ns / NS_PER_S):
             runner.act(line, clock.now().mono_ns)
@@ -151,15 +151,15 @@ def _show_ready(profile: Profile, dbw: DbwConfig, *, as_json: bool) -> None:
     )
 
 
-def _tell_json(news: KitEvent) -> None:
-    console.show_json({"mono_ns": news.mono_ns, "kind": news.kind, "text": news.text})
+def _tell_json(events: KitEvent) -> None:
+    console.show_json({"mono_ns": events.mono_ns, "kind": events.kind, "text": events.text})
 
 
 def _tell_in_words(start_ns: int) -> Callable[[KitEvent], None]:
     """Tell news with the time since the start."""
 
-    def tell(news: KitEvent) -> None:
-        at = "" if news.kind == "help" else f"{(news.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
-        console.show(f"{at}{news.text}")
+    def tell(events: KitEvent) -> None:
+        at = "" if events.kind == "help" else f"{(events.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
+        console.show(f"{at}{events.text}")
 
     return tell

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from lavt.assembly.entropy import MachineEntropy
-from lavt.assembly.security import door_of
+from lavt.assembly.security import gateway_of
 from lavt.cli import console
 from lavt.cli.router import find
 from lavt.clock import MachineClock
@@ -53,10 +53,10 @@ def stop(
         if channel == "session_reply":
             replies.put(payload)
 
-    door = door_of(settings, deliver, lambda *sends: link.send(*sends))
+    gateway = gateway_of(settings, deliver, lambda *sends: link.send(*sends))
     link = ZenohLink(
         clock,
-        door.let_in,
+        gateway.receive,
         side="client",
         path=find(Path(settings.zenoh.session)),
         router=settings.zenoh.router,
@@ -65,12 +65,12 @@ def stop(
     )
     try:
         instance, number = MachineEntropy().number(64), clock.now().wall_ns
-        reply = _ask(door.send, replies, SessionRequest("emergency_stop", settings.who, instance, number))
+        reply = _ask(gateway.send, replies, SessionRequest("emergency_stop", settings.who, instance, number))
         if not _stops(reply, number):  # numbers only grow, and this machine's clock is behind the last one
             number = reply.emergency_stop + 1
-            reply = _ask(door.send, replies, SessionRequest("emergency_stop", settings.who, instance, number))
+            reply = _ask(gateway.send, replies, SessionRequest("emergency_stop", settings.who, instance, number))
         if not _stops(reply, number):
-            raise WorkError(f"the vehicle refused the emergency stop: {reply.because}")
+            raise WorkError(f"the vehicle refused the emergency stop: {reply.reason}")
         console.show(f"{settings.vehicle_id} was told to stop")
     finally:
         link.close()

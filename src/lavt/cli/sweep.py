@@ -41,8 +41,8 @@ def sweep(
     from lavt.experiment.sweep.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
     from lavt.experiment.sweep.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    asked = load_config(SweepConfig, config, changes or [])
-    planned = plan_sweep(asked)
+    requested = load_config(SweepConfig, config, changes or [])
+    planned = plan_sweep(requested)
     if cluster and any(each.config.time == "real" for each in planned):
         raise UserError("--cluster is for virtual time: real time is driven on this machine, set time: virtual")
     out = out or Path("out") / "sweep"
@@ -51,7 +51,7 @@ def sweep(
     open_sweep(out, resume=resume)
     missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
     with console.interruptible(), progress(f"sweep into {out}", missing) as tell:
-        page, driven = drive_sweep(asked, planned, out, jobs=jobs, tell=tell, cluster_at=cluster)
+        page, driven = drive_sweep(requested, planned, out, jobs=jobs, tell=tell, cluster_at=cluster)
     for name, why in driven.failed:
         console.say(f"failed: {name}: {why}")
     if as_json:

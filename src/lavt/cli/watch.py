@@ -119,7 +119,7 @@ def _show(kind: str, line: Mapping[str, Any], as_json: bool) -> None:
     if as_json:
         console.show_json({kind: line})
         return
-    because = f" (the last: {line['last_unreadable_because']})" if line["stamps_unreadable"] else ""
+    reason = f" (the last: {line['last_unreadable_reason']})" if line["stamps_unreadable"] else ""
     latency = (
         f"latency median {line['latency_median_ms']:.1f} ms, p95 {line['latency_p95_ms']:.1f} ms"
         if line["stamps_accepted"]
@@ -127,7 +127,7 @@ def _show(kind: str, line: Mapping[str, Any], as_json: bool) -> None:
     )
     console.show(
         f"{'' if kind == 'second' else 'in all: '}{line['pictures']} pictures; {line['stamps_accepted']} stamps "
-        f"accepted, {line['stamps_unreadable']} not{because}; {latency}; {line['packets']} packets, "
+        f"accepted, {line['stamps_unreadable']} not{reason}; {latency}; {line['packets']} packets, "
         f"{line['lost']} lost, {line['reordered']} reordered, jitter {line['jitter_ms']:.1f} ms"
     )
     if "check" in line:

@@ -34,7 +34,7 @@ class WatchNodes:
         self.nodes = (self._receiver, WatcherNode(self._reader))
         self._latencies_ms = array("d")
         self._jitter_us = 0
-        self._because = ""
+        self._reason = ""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
         """Keep the latency of a picture, or why it has none, and the jitter of a second."""
@@ -46,7 +46,7 @@ class WatchNodes:
 
     def _note(self, picture: PictureRead) -> None:
         if picture.stamp_ns is None:
-            self._because = picture.reason
+            self._reason = picture.reason
         else:
             self._latencies_ms.append((picture.read_wall_ns - picture.stamp_ns) / NS_PER_MS)
 
@@ -69,7 +69,7 @@ class WatchNodes:
         median_ms, p95_ms = np.percentile(latencies_ms, (50, 95)).tolist() if latencies_ms else (None, None)
         return {
             **{name: count - before[name] for name, count in after.items()},
-            "last_unreadable_because": self._because,
+            "last_unreadable_reason": self._reason,
             "latency_median_ms": median_ms,
             "latency_p95_ms": p95_ms,
             "jitter_ms": self._jitter_us / 1000,

@@ -85,7 +85,7 @@ class NetworkConfig(Section):
     """Instead of the condition's, value by value, so that a sweep can vary them one by one."""
     control: FlowChanges = FlowChanges()
 
-    def asked(self, condition: Condition) -> Condition:
+    def requested(self, condition: Condition) -> Condition:
         """Give what is asked of the network: `condition`, the one named here, with the changes."""
         video_ms, video = self.video.of(condition.video_ms, condition.video)
         control_ms, control = self.control.of(condition.control_ms, condition.control)
@@ -104,7 +104,7 @@ class SafetyConfig(Section):
 
     lateral_acceleration_mps2: float = Field(3.0, gt=0, le=6.0)
     picture_age_limit_ms: float = Field(500.0, gt=0, le=2000)
-    sight_m: float = Field(20.0, gt=0, le=200)
+    stopping_distance_limit_m: float = Field(20.0, gt=0, le=200)
     """On so much of its path the car must be able to stop; beyond 20 m it goes faster than was shown to it."""
 
 
@@ -359,5 +359,5 @@ class Costs(Section):
     """What the loop costs where the virtual runtime does not wait for it: see `configs/costs.yaml`."""
 
     measured_on: str
-    hops_us: dict[str, dict[str, float]]
+    stages_us: dict[str, dict[str, float]]
     links_us: dict[str, float]

@@ -193,7 +193,7 @@ class WatchdogProof(Section):
     gear: str
     brake: float
     """What was asked before the silence."""
-    let_go_ms: float = Field(ge=0)
+    release_ms: float = Field(ge=0)
     """From the last frame until the brake was reported not enabled."""
     braked_ms: float = Field(ge=0)
     """From the last frame until the kit was reported to brake by itself."""

@@ -27,7 +27,7 @@ class LaneWatch:
         """
         if self._seen_ns is None or confidence >= LANE_CONFIDENCE:
             self._seen_ns = now_ns
-        blind_ns = now_ns - self._seen_ns
-        if blind_ns >= STOP_AFTER_NS:
+        frame_age_ns = now_ns - self._seen_ns
+        if frame_age_ns >= STOP_AFTER_NS:
             return "stop"
-        return "brake" if blind_ns >= BRAKE_AFTER_NS else "ok"
+        return "brake" if frame_age_ns >= BRAKE_AFTER_NS else "ok"

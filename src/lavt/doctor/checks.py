@@ -121,12 +121,12 @@ def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, core
     return Check("processor", "ok", words, measured=measured)
 
 
-def check_by_wire(heard: int, hindrance: str, *, name: str) -> Check:
+def check_by_wire(heard: int, inhibit_reason: str, *, name: str) -> Check:
     """Judge what a by-wire kit said on its bus while nothing was sent, and why it could not be driven."""
     found = f"{heard} frames were heard on {name}"
-    if hindrance:
+    if inhibit_reason:
         do = "put that right: until then the vehicle is not armed (docs/vehicles.md)"
-        return Check("by wire", "problem", f"{found}; {hindrance}", do, {"frames": heard})
+        return Check("by wire", "problem", f"{found}; {inhibit_reason}", do, {"frames": heard})
     return Check("by wire", "ok", f"{found}, every report of the profile among them", measured={"frames": heard})
 
 
@@ -149,7 +149,7 @@ def check_camera(seen: CameraSample | str, *, name: str, size: str, rate_hz: flo
 def check_buffer(granted_bytes: int) -> Check:
     """Compare the receive buffer that the system gives a socket with what LAVT asks for."""
     words = f"a socket may keep {granted_bytes} bytes that wait to be read, {RECEIVE_BUFFER_BYTES} are asked for"
-    measured = {"granted_bytes": granted_bytes, "asked_bytes": RECEIVE_BUFFER_BYTES}
+    measured = {"granted_bytes": granted_bytes, "requested_bytes": RECEIVE_BUFFER_BYTES}
     if granted_bytes >= RECEIVE_BUFFER_BYTES:
         return Check("receive buffer", "ok", words, measured=measured)
     do = f"as root: sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES} (and into /etc/sysctl.d/ to keep it)"
@@ -223,36 +223,36 @@ def check_clock(report: ClockReport | None) -> Check:
     return Check("clock", "warning", found, do, measured)
 
 
-def check_netem(refusal: str, interface: str) -> Check:
+def check_netem(rejection: str, interface: str) -> Check:
     """Judge whether the kernel can delay packets here; it must only where the config names an interface."""
-    if not refusal:
+    if not rejection:
         return Check("netem", "ok", "this kernel can delay packets, and this user may have it do so")
     if interface:
         do = "put that right, or set injection.interface to nothing: the side does not start like this"
-        return Check("netem", "problem", refusal, do, {"interface": interface})
-    found = f"not needed unless a delay is to be injected on this machine, where it would be refused: {refusal}"
+        return Check("netem", "problem", rejection, do, {"interface": interface})
+    found = f"not needed unless a delay is to be injected on this machine, where it would be refused: {rejection}"
     return Check("netem", "ok", found)
 
 
-def check_port(name: str, key: str, host: str, port: int, *, refusal: str, served: bool) -> Check:
+def check_port(name: str, key: str, host: str, port: int, *, rejection: str, served: bool) -> Check:
     """Judge whether a UDP port can be opened; `served`: a `lavt server` answers there already."""
     where = f"UDP {host}:{port}"
     measured = {"host": host, "port": port}
-    if not refusal:
+    if not rejection:
         return Check(name, "ok", f"{where} can be opened", measured=measured)
     if served:
         return Check(name, "ok", f"{where} is in use by a `lavt server` that runs here already", measured=measured)
     do = f"end what has it (`ss -lunp 'sport = :{port}'` names it), or set {key} to another"
-    return Check(name, "problem", f"{where} cannot be opened: {refusal}", do, measured)
+    return Check(name, "problem", f"{where} cannot be opened: {rejection}", do, measured)
 
 
-def check_router(endpoint: str, refusal: str) -> Check:
+def check_router(endpoint: str, rejection: str) -> Check:
     """Judge whether a router answers on this machine."""
     measured = {"endpoint": endpoint}
-    if not refusal:
+    if not rejection:
         return Check("router", "ok", f"a router answers at {endpoint}", measured=measured)
     return Check(
-        "router", "problem", refusal, "start `lavt router FILE.json5` here, or put zenoh.router right", measured
+        "router", "problem", rejection, "start `lavt router FILE.json5` here, or put zenoh.router right", measured
     )
 
 
@@ -291,9 +291,9 @@ def check_vehicle(heard: StateSample, vehicle: str, version: str) -> Check:
         do = "see that `lavt server` runs there, that vehicle_id is the same on both, and that the routers are linked"
         return Check("vehicle", "problem", f"{vehicle} tells no state", do, measured)
     latest = heard.states[-1]
-    holder = f"held by {latest.holder}" if latest.holder else "held by nobody"
-    found = f"{vehicle} tells its state {rate_hz:.0f} times a second: {latest.safety}, {holder}"
-    measured |= {"safety": latest.safety, "holder": latest.holder}
+    active_operator = f"held by {latest.active_operator}" if latest.active_operator else "held by nobody"
+    found = f"{vehicle} tells its state {rate_hz:.0f} times a second: {latest.safety}, {active_operator}"
+    measured |= {"safety": latest.safety, "active_operator": latest.active_operator}
     if rate_hz < STATE_RATE_HZ / 2:
         do = f"{STATE_RATE_HZ:.0f} are sent: look for loss on the way (`ping`), or a busy machine"
         return Check("vehicle", "warning", found, do, measured)
@@ -331,10 +331,10 @@ def check_plain(secured: bool) -> Check:
     return Check("security", "warning", "plain: whoever reaches the vehicle's router can drive; for a lab or a VPN", do)
 
 
-def check_key_file(key: str, path: Path, *, refusal: str, mode: int, private: bool) -> Check:
+def check_key_file(key: str, path: Path, *, rejection: str, mode: int, private: bool) -> Check:
     """Judge a file with a key: readable, and a private one by its owner alone."""
-    if refusal:
-        return Check(key, "problem", f"{path} cannot be read: {refusal}", "copy it here, or put the config right")
+    if rejection:
+        return Check(key, "problem", f"{path} cannot be read: {rejection}", "copy it here, or put the config right")
     if private and mode & 0o077:
         found = f"{path} is a private key that others may read (mode {mode & 0o777:o})"
         return Check(key, "problem", found, f"chmod 600 {path}; make new keys if others had access")

@@ -20,7 +20,7 @@ import numpy as np
 from lavt.assembly.cameras import build_device
 from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.assembly.fidelity import VIDEO
-from lavt.assembly.security import cipher_of, door_of
+from lavt.assembly.security import cipher_of, gateway_of
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
 from lavt.doctor.checks import SHOWN, CameraSample, CodecTimes, StateSample
@@ -160,11 +160,11 @@ def governors() -> list[str]:
 
 def clock_report(config: ClockConfig, clock: MachineClock) -> ClockReport | None:
     """Ask this machine's source of time; None where it did not answer in time."""
-    with closing(interpreter(config)) as asked:
-        return clock_source(config, clock, asked.run)()
+    with closing(interpreter(config)) as requested:
+        return clock_source(config, clock, requested.run)()
 
 
-def netem_refusal(interface: str) -> str:
+def netem_rejection(interface: str) -> str:
     """Tell why no delay could be injected here; empty where it could.
 
     The kernel is tried in a network of its own, which goes when the command ends: nothing that is there is touched.
@@ -180,7 +180,7 @@ def netem_refusal(interface: str) -> str:
     return ""
 
 
-def bind_refusal(host: str, port: int) -> str:
+def bind_rejection(host: str, port: int) -> str:
     """Tell why a UDP port cannot be opened; empty where it can."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         try:
@@ -197,12 +197,12 @@ class Listener:
         self._behind: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._outside = 0
         self._carry: Carry = lambda *_: None
-        self._door = door_of(settings, self._keep, lambda *sends: self._carry(*sends))
+        self._gateway = gateway_of(settings, self._keep, lambda *sends: self._carry(*sends))
 
-    def let_in(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+    def receive(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         """Take what the link delivers."""
         self._outside += channel == "state"
-        self._door.let_in(channel, payload, arrived, peer)
+        self._gateway.receive(channel, payload, arrived, peer)
 
     def _keep(self, channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         if channel == "state":
@@ -227,7 +227,7 @@ class Listener:
             except BadMessage as error:
                 unreadable[str(error)] += 1
         if self._outside and not states and not unreadable:
-            unreadable.update(self._door.counts or {"nothing of it gets through": self._outside})
+            unreadable.update(self._gateway.counts or {"nothing of it gets through": self._outside})
         return StateSample(states, dict(unreadable), STATES_NS / NS_PER_S)
 
 
@@ -271,11 +271,11 @@ def certificates(folder: Path, now_wall_ns: int) -> list[tuple[Path, float]]:
     return found
 
 
-def keys_refusal(settings: ServerConfig | ClientConfig) -> str:
+def keys_rejection(settings: ServerConfig | ClientConfig) -> str:
     """Tell why the keys that a config names cannot be used; empty where they can."""
     try:
         cipher_of(settings)
-        door_of(settings, lambda *_: None, lambda *_: None)
+        gateway_of(settings, lambda *_: None, lambda *_: None)
     except (UserError, ImportError) as error:
         return str(error)
     return ""

@@ -19,7 +19,7 @@ from lavt.vehicle.vehicle import CountingVehicle, Vehicle
 STATE_PERIOD_NS = 20 * NS_PER_MS
 LATE_NS = 50 * NS_PER_MS
 """Physics that is this late is counted: the vehicle stood still in the world for so long."""
-REFUSED_FOR_NS = NS_PER_S
+REJECTED_FOR_NS = NS_PER_S
 """So long the state tells of a refused command."""
 REMEMBERED = 64
 """Commands of more than a second: what has not reached the wheels by then never will."""
@@ -93,7 +93,7 @@ class ActuatorNode:
         self._rest: StationaryStatus | None = None
         self._driving = False
         self._limited: tuple[str, ...] = ()
-        self._refused_ns = start_ns
+        self._rejected_ns = start_ns
         self._applied: deque[tuple[int, int, int]] = deque(maxlen=REMEMBERED)
         """When commands were obeyed, their sequences and stamps: until they are seen to have reached the wheels."""
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -133,12 +133,12 @@ class ActuatorNode:
 
     def _admit(self, received: ReceivedCommand, _now: Now) -> JudgedCommand:
         verdict = self.gate.admit(received.command, self.vehicle.state(), received.arrived.mono_ns)
-        if not verdict.obeyed:
-            self._refused_ns = received.arrived.mono_ns
+        if not verdict.accepted:
+            self._rejected_ns = received.arrived.mono_ns
         return JudgedCommand(received, received.stamp_ns, verdict)
 
     def _apply(self, judged: JudgedCommand, now: Now) -> JudgedCommand:
-        if not judged.verdict.obeyed:
+        if not judged.verdict.accepted:
             return judged
         self._act(now.mono_ns)
         self._applied.append((now.mono_ns, judged.received.command.sequence, judged.stamp_ns))
@@ -147,7 +147,7 @@ class ActuatorNode:
 
     def _report(self, judged: JudgedCommand, now: Now) -> list[Send]:
         command, arrived = judged.received.command, judged.received.arrived
-        obeyed = judged.verdict.obeyed
+        accepted = judged.verdict.accepted
         self._counts["commands_limited"] += bool(judged.limited)
         admission = Admission(
             epoch=command.epoch,
@@ -157,8 +157,8 @@ class ActuatorNode:
             stamp_received_wall_ns=command.stamp_received_wall_ns,
             received_mono_ns=arrived.mono_ns,
             received_wall_ns=arrived.wall_ns,
-            applied_mono_ns=now.mono_ns if obeyed else None,
-            verdict="obeyed" if obeyed else "refused",
+            applied_mono_ns=now.mono_ns if accepted else None,
+            verdict="accepted" if accepted else "rejected",
             reason=judged.verdict.reason,
             limited=", ".join(judged.limited),
             mode=command.mode,
@@ -181,7 +181,7 @@ class ActuatorNode:
         sends = [*self._changes(now), Send("session_reply", encode(reply), message.peer)]
         if self.gate.token != token:
             sends.append(Send("video_token", self.gate.token or None))
-        said = "granted" if reply.granted else f"refused: {reply.because}"
+        said = "granted" if reply.granted else f"refused: {reply.reason}"
         sends.append(Send("event", Event(now.mono_ns, "session", f"{request.operation} by {request.who} {said}")))
         return sends
 
@@ -233,7 +233,7 @@ class ActuatorNode:
         if told:
             self._publish_ns += STATE_PERIOD_NS * (1 + (now.mono_ns - self._publish_ns) // STATE_PERIOD_NS)
             sends.append(Send("state", encode(self._state(now))))
-            rest = StationaryStatus(self.gate.at_rest(self.vehicle.state()), self.gate.holder)
+            rest = StationaryStatus(self.gate.at_rest(self.vehicle.state()), self.gate.active_operator)
             if rest != self._rest:
                 self._rest = rest
                 sends.append(Send("rest", rest))
@@ -246,7 +246,7 @@ class ActuatorNode:
 
     def _state(self, now: Now) -> State:
         vehicle = self.vehicle.state()
-        holder, holder_instance = self.gate.holder or ("", 0)
+        active_operator, active_operator_instance = self.gate.active_operator or ("", 0)
         return State(
             sent_wall_ns=now.wall_ns,
             state_mono_ns=vehicle.mono_ns,
@@ -254,13 +254,13 @@ class ActuatorNode:
             steering_rad=vehicle.steering_rad,
             gear=vehicle.gear,
             safety=self.gate.state,
-            because=self.gate.because,
+            reason=self.gate.reason,
             applied_sequence=self.gate.applied_sequence,
-            refused=self.gate.refused if now.mono_ns - self._refused_ns < REFUSED_FOR_NS else "",
+            rejected=self.gate.rejected if now.mono_ns - self._rejected_ns < REJECTED_FOR_NS else "",
             limited=", ".join(self._limited),
-            holder=holder,
-            holder_instance=holder_instance,
-            asked_by=self.gate.claims.asked_by(now.mono_ns),
+            active_operator=active_operator,
+            active_operator_instance=active_operator_instance,
+            requested_by=self.gate.claims.requested_by(now.mono_ns),
             instance=self.gate.instance,
         )
 
@@ -280,8 +280,8 @@ class ActuatorNode:
     def _changes(self, now: Now) -> list[Send]:
         """Tell every transition of the safety state, the begin of a drive, and its end by a stop."""
         sends = []
-        for before, after, because in self.gate.take_transitions():
-            sends.append(Send("event", Event(now.mono_ns, "safety", f"{before} -> {after}: {because}")))
+        for before, after, reason in self.gate.take_transitions():
+            sends.append(Send("event", Event(now.mono_ns, "safety", f"{before} -> {after}: {reason}")))
             if before == "arming" and after == "driving":
                 self._driving, self._ending = True, None
                 sends.append(Send("event", Event(now.mono_ns, "drive_began", "")))

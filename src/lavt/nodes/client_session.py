@@ -37,7 +37,7 @@ class ClientSession:
         self.epoch = 0
         self.emergency_stop = 0
         """Number of the emergency stop that every command carries; 0: none."""
-        self.because = ""
+        self.reason = ""
         self.host = ""
         self.safety = ""
         self.released = False
@@ -46,14 +46,14 @@ class ClientSession:
         self._instance = instance
         self._rearm = rearm
         self._clear_stop = clear_stop
-        self._waits_because = "the network's condition is not in force yet" if waits else ""
+        self._waits_reason = "the network's condition is not in force yet" if waits else ""
         self._take_over = take_over
         self._asks: Operation = "hold"
         """What is asked next while seeking: with `take_over`, hold and ask in turn."""
-        self._asked: Operation = "hold"
+        self._requested: Operation = "hold"
         self._said: dict[Operation, str] = {}
         """What was answered to either."""
-        self._known_as_holder = False
+        self._known_as_active_operator = False
         """Whether the vehicle's state has named this client as the one who holds it."""
         self._server = 0
         """Instance of the server's process that the last state came from."""
@@ -67,7 +67,7 @@ class ClientSession:
     @property
     def commanding(self) -> bool:
         """Whether commands make sense: there is an epoch to send them under, and the network is as it shall be."""
-        return self.phase == "driving" or (self.phase == "arming" and not self._waits_because)
+        return self.phase == "driving" or (self.phase == "arming" and not self._waits_reason)
 
     @property
     def holds(self) -> bool:
@@ -93,18 +93,18 @@ class ClientSession:
             return SessionRequest("release", self._who, self._instance, 0)
         if self._clear_stop and self.phase == "arming" and self.safety == "emergency_stop":
             return SessionRequest("clear_emergency_stop", self._who, self._instance, self._highest_emergency_stop)
-        self._asked, self._asks = self._asks, "hold"
-        return SessionRequest(self._asked, self._who, self._instance, 0)
+        self._requested, self._asks = self._asks, "hold"
+        return SessionRequest(self._requested, self._who, self._instance, 0)
 
     def release(self, now_ns: int) -> None:
         """Give the vehicle up, and ask for it no more; the query is due at once, and again until it is answered."""
         if self.phase != "watching":
-            self.phase, self.because, self._ask_ns = "watching", "released", now_ns
+            self.phase, self.reason, self._ask_ns = "watching", "released", now_ns
 
-    def note_condition(self, because: str) -> None:
-        """The network's condition is in force, or `because` says why it is not; once it was, it is not waited for."""
-        if self._waits_because:
-            self._waits_because = self.because = because
+    def note_condition(self, reason: str) -> None:
+        """The network's condition is in force, or `reason` says why it is not; once it was, it is not waited for."""
+        if self._waits_reason:
+            self._waits_reason = self.reason = reason
 
     def note_reply(self, reply: SessionReply, now_ns: int) -> None:
         """Take over what the server granted, or why it did not."""
@@ -120,8 +120,8 @@ class ClientSession:
             self.host = reply.host
             self.epoch = reply.epoch
             if self.phase == "seeking":
-                self.phase, self._known_as_holder = "arming", False
-        elif self.phase == "seeking" and self._take_over and self._asked == "hold":
+                self.phase, self._known_as_active_operator = "arming", False
+        elif self.phase == "seeking" and self._take_over and self._requested == "hold":
             self._asks, self._ask_ns = "ask", now_ns
 
     def _note_reason(self, reply: SessionReply) -> None:
@@ -131,8 +131,8 @@ class ClientSession:
         if reply.token:
             self._said.clear()
         else:
-            self._said[self._asked] = "asked for it" if reply.granted and self._asked == "ask" else reply.because
-        self.because = "; ".join(each for each in self._said.values() if each) or self._waits_because
+            self._said[self._requested] = "asked for it" if reply.granted and self._requested == "ask" else reply.reason
+        self.reason = "; ".join(each for each in self._said.values() if each) or self._waits_reason
 
     def note_state(self, state: State, now_ns: int) -> None:
         """Follow the vehicle's safety state."""
@@ -141,18 +141,22 @@ class ClientSession:
         self.safety, self._server = state.safety, state.instance
         if state.safety == "emergency_stop":
             self._stop_ns = None
-        own = (state.holder, state.holder_instance) == (self._who, self._instance)
-        others = state.holder != "" and not own
+        own = (state.active_operator, state.active_operator_instance) == (self._who, self._instance)
+        others = state.active_operator != "" and not own
         if self.phase == "arming" and state.safety == "driving" and not others:
             self.phase = "driving"
         elif self.phase == "driving" and state.safety in ("disarmed", "safe_stop", "emergency_stop"):
-            self.phase, self.because = "stopped", state.because
+            self.phase, self.reason = "stopped", state.reason
         elif self.phase == "stopped" and self._rearm and abs(state.speed_mps) < 0.05 and not self._was_disarmed:
             self.phase, self._ask_ns = "seeking", now_ns
-        if others and self._known_as_holder and self.phase not in ("seeking", "watching"):
+        if others and self._known_as_active_operator and self.phase not in ("seeking", "watching"):
             # Taking over at standstill needs no consent; whoever took it back would have it taken again.
-            self.phase, self.because, self.released = "watching", f"{state.holder} has taken the vehicle over", True
-        self._known_as_holder |= own
+            self.phase, self.reason, self.released = (
+                "watching",
+                f"{state.active_operator} has taken the vehicle over",
+                True,
+            )
+        self._known_as_active_operator |= own
 
     def stop_now(self, now: Now) -> SessionRequest:
         """Raise an emergency stop: every command carries its number from now on, and this query asks for an answer.

@@ -36,7 +36,7 @@ class ClockSyncNode:
         self.counts: Counter[str] = Counter()
         self._start_ns = start_ns
         self._tick = 0
-        self._asked = -1
+        self._requested = -1
         self._period_ns = PERIOD_NS // self.wakes
         self._latest: ClockReport | None = None
         self.chains: Mapping[str, Sequence[Hop]] = {
@@ -56,9 +56,9 @@ class ClockSyncNode:
         gone_ns = now.mono_ns - self._start_ns
         self._tick = gone_ns // self._period_ns + 1  # by the grid: being late must not add up
         probes = self._probes(now)
-        if gone_ns // PERIOD_NS == self._asked:
+        if gone_ns // PERIOD_NS == self._requested:
             return probes
-        self._asked = gone_ns // PERIOD_NS
+        self._requested = gone_ns // PERIOD_NS
         return [Send("clock_query", None), *probes]
 
     def _probes(self, _now: Now) -> list[Send]:
@@ -72,7 +72,7 @@ class ClockSyncNode:
         try:
             sequence, sent_wall_ns = decode_request(message.payload)
         except BadMessage:
-            self.counts["probes_refused"] += 1
+            self.counts["probes_rejected"] += 1
             return None
         received_ns = message.arrived.wall_ns
         known = (None, None) if self._latest is None else (self._latest.correction_s, self._latest.bound_s)
@@ -107,10 +107,10 @@ class ProbingClockSyncNode(ClockSyncNode):
         try:
             reply = decode_reply(message.payload)
         except BadMessage:
-            self.counts["probes_refused"] += 1
+            self.counts["probes_rejected"] += 1
             return None
         if self._sent_ns.get(reply.sequence) != reply.sent_wall_ns:
-            self.counts["probes_refused"] += 1
+            self.counts["probes_rejected"] += 1
             return None
         del self._sent_ns[reply.sequence]
         times = (reply.sent_wall_ns, reply.received_wall_ns, reply.answered_wall_ns, message.arrived.wall_ns)

@@ -78,11 +78,11 @@ class DriverNode:
         self._state_ns = 0
         self._command_ns: int | None = None
         self.chains: Mapping[str, Sequence[Hop]] = {
-            "access_unit": reader.hops,
+            "access_unit": reader.stages,
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),
             "session_reply": (("note", self._note_reply),),
-            "operator": (("obey", self._obey_operator),),
+            "operator": (("accept", self._accept_operator),),
             "condition_in_force": (("note", self._note_condition),),
             WAKE: (("command", self._wake),),
         }
@@ -160,18 +160,26 @@ class DriverNode:
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
         if self.session.phase != "driving":
             return "arm", Decision(0.0, 0.0, 1.0, decision.path_curvature_per_m)
-        blind_ns, deaf_ns = now_ns - self._view_ns, now_ns - self._state_ns
+        frame_age_ns, state_age_ns = now_ns - self._view_ns, now_ns - self._state_ns
         limits = self._limits
-        if self._lane_says == "stop" or blind_ns >= limits.no_picture_stop_ns or deaf_ns >= limits.no_state_stop_ns:
+        if (
+            self._lane_says == "stop"
+            or frame_age_ns >= limits.no_picture_stop_ns
+            or state_age_ns >= limits.no_state_stop_ns
+        ):
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
-        if self._lane_says == "brake" or blind_ns >= limits.no_picture_brake_ns or deaf_ns >= limits.no_state_brake_ns:
+        if (
+            self._lane_says == "brake"
+            or frame_age_ns >= limits.no_picture_brake_ns
+            or state_age_ns >= limits.no_state_brake_ns
+        ):
             brake = max(decision.brake, limits.brake)
             return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
         return "drive", decision
 
     # The person beside it asks for something.
 
-    def _obey_operator(self, message: Message, now: Now) -> list[Send]:
+    def _accept_operator(self, message: Message, now: Now) -> list[Send]:
         return self._FOR_THE_OPERATOR[message.payload](self, now)
 
     def _stop_now(self, now: Now) -> list[Send]:

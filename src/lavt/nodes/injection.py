@@ -25,7 +25,7 @@ MEASURE_PERIOD_NS = 5 * NS_PER_S
 ASK_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
 """The client asks once a second: four may be lost."""
-LONGEST_BECAUSE = 300
+LONGEST_REASON = 300
 QUESTIONS_KEPT = 64
 """So many wait for the queues; as many as the link keeps."""
 
@@ -56,21 +56,21 @@ class _Queues:
         """Take in what became of the newest order; None where it was an older one."""
         if done.number != self._number:
             return None
-        self.in_force = done.because == ""
+        self.in_force = done.reason == ""
         if not self.in_force:
             self.again_ns = now.mono_ns + ASK_PERIOD_NS
         elif self.condition:
             self.again_ns = now.mono_ns + MEASURE_PERIOD_NS
-        asked_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
+        requested_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
         measured_ms = dict(done.measured_ms)
         return [
             Send(
                 "injection",
                 InjectionSample(
-                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.because or done.doubts
+                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.reason or done.doubts
                 ),
             )
-            for name, each_ms in asked_ms.items()
+            for name, each_ms in requested_ms.items()
         ]
 
     def _inject(self) -> list[Send]:
@@ -81,7 +81,7 @@ class _Queues:
 class Lease:
     """Who has the network's condition in hand, and until when."""
 
-    holder: tuple[str, int]
+    active_operator: tuple[str, int]
     until_ns: int
 
 
@@ -130,24 +130,24 @@ class InjectionNode:
             return []
         flows = self._flows(request)
         changes = flows != self._queues.flows or request.condition != self._queues.condition
-        refusal = self._refusal(request, changes=changes)
-        self.counts[f"netem {'refused' if refusal else 'granted'}"] += 1
-        if refusal:
-            return [_reply(refusal, message.peer)]
+        rejection = self._rejection(request, changes=changes)
+        self.counts[f"netem {'refused' if rejection else 'granted'}"] += 1
+        if rejection:
+            return [_reply(rejection, message.peer)]
         self._lease = Lease((request.who, request.instance), now.mono_ns + request.lease_ms * NS_PER_MS)
         if not changes and self._queues.in_force:
             return [_reply("", message.peer)]
         self._waiting.append(message.peer)
         return self._queues.tell(request.condition, flows) if changes else []
 
-    def _refusal(self, request: NetemRequest, *, changes: bool) -> str:
+    def _rejection(self, request: NetemRequest, *, changes: bool) -> str:
         if not self._allowed:
             return "this server lets nobody inject delay: set injection.remote: true in its config"
         asking = (request.who, request.instance)
-        if self._lease is not None and self._lease.holder != asking:
-            return f"{self._lease.holder[0]} has the condition in hand until its lease ends"
-        if self._rest.holder is not None and self._rest.holder != asking:
-            return f"{self._rest.holder[0]} holds the vehicle"
+        if self._lease is not None and self._lease.active_operator != asking:
+            return f"{self._lease.active_operator[0]} has the condition in hand until its lease ends"
+        if self._rest.active_operator is not None and self._rest.active_operator != asking:
+            return f"{self._rest.active_operator[0]} holds the vehicle"
         if changes and not (self._simulated or self._rest.at_rest):
             return "a vehicle that is not simulated must stand disarmed for this"
         try:
@@ -175,7 +175,7 @@ class InjectionNode:
     def _note_rest(self, message: Message, _now: Now) -> list[Send]:
         """Whoever holds the vehicle drives without what another had asked for."""
         self._rest = message.payload
-        if self._lease is None or self._rest.holder in (None, self._lease.holder):
+        if self._lease is None or self._rest.active_operator in (None, self._lease.active_operator):
             return []
         return self._end_lease()
 
@@ -184,9 +184,9 @@ class InjectionNode:
         sends = self._queues.note(done, now)
         if sends is None:
             return []
-        sends += [_reply(done.because, peer) for peer in self._waiting]
+        sends += [_reply(done.reason, peer) for peer in self._waiting]
         self._waiting.clear()
-        if not done.because:
+        if not done.reason:
             return sends
         self.counts["netem_failed"] += 1
         self._lease = None
@@ -254,9 +254,9 @@ class InjectionClient:
     def _note_injected(self, message: Message, now: Now) -> list[Send]:
         done: InjectionResult = message.payload
         sends = self._queues.note(done, now) or []
-        if done.because:
+        if done.reason:
             self.counts["netem_failed"] += 1
-            return [*sends, Send("condition_in_force", f"this machine does not delay the control: {done.because}")]
+            return [*sends, Send("condition_in_force", f"this machine does not delay the control: {done.reason}")]
         self._ask_ns = now.mono_ns if self._ask_ns is None else min(self._ask_ns, now.mono_ns)
         return sends
 
@@ -267,13 +267,13 @@ class InjectionClient:
             self.counts["netem_replies_unreadable"] += 1
             return []
         granted = reply.granted and self._queues.in_force
-        because = "" if granted else f"the server does not delay the video: {reply.because}"
-        return [Send("condition_in_force", because)]
+        reason = "" if granted else f"the server does not delay the video: {reply.reason}"
+        return [Send("condition_in_force", reason)]
 
 
 def _first(*times_ns: int | None) -> int | None:
     return min((each for each in times_ns if each is not None), default=None)
 
 
-def _reply(because: str, peer: Peer) -> Send:
-    return Send("netem_reply", encode(NetemReply(because == "", because[:LONGEST_BECAUSE])), peer)
+def _reply(reason: str, peer: Peer) -> Send:
+    return Send("netem_reply", encode(NetemReply(reason == "", reason[:LONGEST_REASON])), peer)

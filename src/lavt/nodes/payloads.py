@@ -141,7 +141,7 @@ class StationaryStatus:
     """Whether the vehicle stands and nobody drives it, and who holds it."""
 
     at_rest: bool
-    holder: tuple[str, int] | None
+    active_operator: tuple[str, int] | None
 
 
 @value
@@ -152,7 +152,7 @@ class InjectionSample:
     condition: str
     """Empty: none is in force any more."""
     flow: str
-    asked_ms: float
+    requested_ms: float
     measured_ms: float | None
-    because: str
+    reason: str
     """Why it is not in force, or what was measured to be otherwise than asked; empty: all is well."""

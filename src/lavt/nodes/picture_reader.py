@@ -36,7 +36,7 @@ class PictureReader:
     """Decodes every access unit, reads its stamp, and shows it where that can be believed.
 
     `agrees(stamp, RTP timestamp)` says whether it can. Where that check is weak, stamps of pictures in doubt are better
-    not shown to it (`reads_doubtful` false): made up ones can agree with each other. `hops` are a node's chain for
+    not shown to it (`reads_doubtful` false): made up ones can agree with each other. `stages` are a node's chain for
     "access_unit"; what comes out is a "view" for whoever looks at pictures, and "picture_lost" where the decoder has
     none or had to make parts of it up.
     """
@@ -49,7 +49,7 @@ class PictureReader:
         reads_doubtful: bool = True,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.hops: Sequence[Hop] = (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show))
+        self.stages: Sequence[Hop] = (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show))
         self._pictures = pictures
         self._agrees = agrees
         self._reads_doubtful = reads_doubtful

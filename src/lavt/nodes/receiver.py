@@ -59,7 +59,7 @@ class ReceiverNode:
         self._media_ssrc: int | None = None
         self._report_ns = self._sample_ns = 0
         self._in_doubt = False
-        self._asked_ns: int | None = None
+        self._requested_ns: int | None = None
         """When a keyframe was asked for last."""
         self.chains: Mapping[str, Sequence[Hop]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
@@ -182,16 +182,18 @@ class ReceiverNode:
 
     def _ask_ns(self) -> int:
         """Tell when a keyframe may be asked for next: one that was asked for can be on its way for a round trip."""
-        if self._asked_ns is None:
+        if self._requested_ns is None:
             return 0
         round_trip_ns = self._reception.round_trip_ns
-        return self._asked_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
+        return (
+            self._requested_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
+        )
 
     def _ask_for_keyframe(self, now_ns: int) -> list[Send]:
         """Ask for a keyframe, unless one that was asked for can be on its way."""
         if self._media_ssrc is None or self._path is None or now_ns < self._ask_ns():
             return []
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         self._counts["picture_loss_requests"] += 1
         return [self._control(picture_loss(SSRC, self._media_ssrc))]
 
@@ -203,7 +205,7 @@ class ReceiverNode:
         return sends
 
     def _control(self, packet: bytes) -> Send:
-        return self._feedback(packet if self._path is None else self._path.seal_control(packet))
+        return self._feedback(packet if self._path is None else self._path.protect_control(packet))
 
     def _feedback(self, datagram: bytes) -> Send:
         return Send("feedback", datagram, self._port)

@@ -17,7 +17,7 @@ class WatcherNode:
 
     def __init__(self, reader: PictureReader) -> None:
         self.counts: Mapping[str, int] = reader.counts
-        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.hops, "view": (("forget", _forget),)}
+        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.stages, "view": (("forget", _forget),)}
 
     def next_wake_ns(self) -> None:
         """It sleeps until a picture comes."""

@@ -56,17 +56,17 @@ class LiveTap:
     def _state(self, state: Any, now: Now) -> None:
         if isinstance(state, State):
             self._status.update(
-                speed_mps=state.speed_mps, safety=state.safety, because=state.because,
-                holder=state.holder, asked_by=state.asked_by, limited=state.limited,
+                speed_mps=state.speed_mps, safety=state.safety, reason=state.reason,
+                active_operator=state.active_operator, requested_by=state.requested_by, limited=state.limited,
             )  # fmt: skip
-            if state.refused:
-                self._status["refused"] = state.refused
+            if state.rejected:
+                self._status["rejected"] = state.rejected
             self._heard.append((state, now))
 
     def _admission(self, admission: Any, now: Now) -> None:
         self._status["raw_tau_c_ms"] = (admission.received_wall_ns - admission.sent_wall_ns) / NS_PER_MS
         if admission.reason:
-            self._status["refused"] = admission.reason
+            self._status["rejected"] = admission.reason
             self._heard.append((admission.reason, now))
 
     def _picture(self, picture: Any, _now: Now) -> None:

@@ -20,7 +20,7 @@ class Timeline:
     channel: str
     stamp_ns: int
     arrived_mono_ns: int
-    hops: tuple[tuple[str, int], ...]
+    stages: tuple[tuple[str, int], ...]
 
 
 @value
@@ -34,14 +34,14 @@ class PipelineResult:
     """How many hops were called."""
 
 
-def walk(node: str, hops: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
+def walk(node: str, stages: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
     """Call hop after hop; `ends`, asked after each, gives the time when it was done."""
     value: object = message
     now = start
     stamp_ns: int | None = None
     done = [("wait", start.mono_ns)]
-    for name, hop in hops:
-        value = hop(value, now)
+    for name, stage in stages:
+        value = stage(value, now)
         now = next(ends)
         done.append((name, now.mono_ns))
         stamp_ns = getattr(value, "stamp_ns", stamp_ns)

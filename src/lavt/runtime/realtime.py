@@ -114,14 +114,14 @@ class RealRuntime:
         self.failed = self.failed or error  # what comes after is of the first
         self.stopped.set()
 
-    def run_chain(self, node: Node, message: Message) -> None:
+    def run_pipeline(self, node: Node, message: Message) -> None:
         """Walk a message through its hops and send what comes out."""
         readings = iter(self._clock.now, None)
-        walked = walk(node.name, node.chains[message.channel], message, next(readings), readings)
-        for carrier, sends in groupby(walked.sends, lambda send: CHANNELS[send.channel].carrier):
+        outcome = walk(node.name, node.chains[message.channel], message, next(readings), readings)
+        for carrier, sends in groupby(outcome.sends, lambda send: CHANNELS[send.channel].carrier):
             self._send(carrier, tuple(sends))
-        if walked.timeline is not None:
-            self._recorder.write("timeline", walked.timeline, walked.end)
+        if outcome.timeline is not None:
+            self._recorder.write("timeline", outcome.timeline, outcome.end)
 
     def now(self) -> Now:
         """Read the clocks."""
@@ -187,8 +187,8 @@ class _Worker:
         try:
             while not self._runtime.stopped.is_set():
                 with self._turn:
-                    walked = self._walk_next()
-                if not walked:
+                    outcome = self._walk_next()
+                if not outcome:
                     self._sleep()
         except BaseException as error:  # as in `_walk`
             self._runtime.fail(error)
@@ -205,7 +205,7 @@ class _Worker:
         if self._runtime.stopped.is_set():
             return
         try:
-            self._runtime.run_chain(self.node, message)
+            self._runtime.run_pipeline(self.node, message)
             self._wake_ns = self.node.next_wake_ns()
         except BaseException as error:  # whatever ends a node must end the run, not leave half of it alive
             self._runtime.fail(error)

@@ -114,8 +114,8 @@ class _Running:
         self.node = node
         self.inbox = Inbox()
         self.chains = {
-            channel: (hops, _spent_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in hops))))
-            for channel, hops in node.chains.items()
+            channel: (stages, _spent_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in stages))))
+            for channel, stages in node.chains.items()
         }
         """Each chain, and how long after its begin the first hop begins and each hop is done."""
         self.next_wake_ns = node.next_wake_ns
@@ -220,20 +220,20 @@ class VirtualRuntime:
 
     def _walk(self, running: _Running, message: Message, now: Now) -> None:
         host, true_ns = running.host, self.true_ns
-        hops, spent_ns = running.chains[message.channel]
+        stages, spent_ns = running.chains[message.channel]
         times: Iterator[Now] = repeat(now)
         if spent_ns[-1]:
             times = map(host.clock.at, map(true_ns.__add__, spent_ns))
-        walked = walk(running.node.name, hops, message, next(times), times)
-        took_ns = spent_ns[walked.called]
+        outcome = walk(running.node.name, stages, message, next(times), times)
+        took_ns = spent_ns[outcome.called]
         running.free_ns = free_ns = true_ns + took_ns
-        if walked.timeline is not None:
-            host.recorder.write("timeline", walked.timeline, walked.end)
-        if walked.sends:
+        if outcome.timeline is not None:
+            host.recorder.write("timeline", outcome.timeline, outcome.end)
+        if outcome.sends:
             if took_ns:
-                self.at(free_ns, self._send_all, host, walked.sends, walked.end)
+                self.at(free_ns, self._send_all, host, outcome.sends, outcome.end)
             else:
-                self._send_all(host, walked.sends, walked.end)
+                self._send_all(host, outcome.sends, outcome.end)
         # When the node wants to be woken, nothing but a walk through its hops changes.
         wake_mono_ns = running.next_wake_ns()
         if wake_mono_ns != running.wake_mono_ns:

@@ -49,7 +49,7 @@ TRANSITIONS: dict[tuple[SafetyState, Trigger], SafetyState] = {
 }  # fmt: skip
 """What leads from where to where. What is not in the table changes nothing."""
 
-BECAUSE: dict[Trigger, str] = {
+REASONS: dict[Trigger, str] = {
     "arming begins": "standing, brake on, input neutral, pictures fresh: holding for 1 s",
     "arming broken": "a condition of arming did not hold",
     "arming held": "armed by the client",
@@ -72,16 +72,16 @@ BECAUSE: dict[Trigger, str] = {
 class CommandVerdict:
     """What became of a command; `reason` is empty when it was obeyed."""
 
-    obeyed: bool
+    accepted: bool
     reason: str
 
 
-OBEYED = CommandVerdict(True, "")
+ACCEPTED = CommandVerdict(True, "")
 
 NOT_ARMED = "the vehicle is not armed"
-NOT_STANDING = "arming needs standstill"
+NOT_STATIONARY = "arming needs standstill"
 HINDERED = "the vehicle cannot be driven now"
-BREAKS_ARMING = (NOT_ARMED, NOT_STANDING, HINDERED)
+BREAKS_ARMING = (NOT_ARMED, NOT_STATIONARY, HINDERED)
 """Refused for these reasons, a command of the holder also ends an arming second: input or vehicle were not at rest."""
 
 
@@ -107,11 +107,13 @@ class SafetyGate:
         self.limiter = limiter
         self.written = IssuedStamps(limits.stamp_memory_ns, limits.frozen_frames)
         self.state: SafetyState = "disarmed"
-        self.because = "nobody has armed the vehicle yet"
-        self.refused = ""
+        self.reason = "nobody has armed the vehicle yet"
+        self.rejected = ""
         self.counts: Counter[str] = Counter()
-        self.holder: tuple[str, int] | None = None
-        self.claims = TakeoverRequests(ask_lapses_ns=limits.ask_lapses_ns, kept_ns=limits.kept_ns)
+        self.active_operator: tuple[str, int] | None = None
+        self.claims = TakeoverRequests(
+            handover_request_timeout_ns=limits.handover_request_timeout_ns, kept_ns=limits.kept_ns
+        )
         self.token = b""
         self.applied_sequence = -1
         self._new_epoch = new_epoch
@@ -141,30 +143,30 @@ class SafetyGate:
 
     def answer(self, request: SessionRequest, vehicle: VehicleState, now_ns: int) -> SessionReply:
         """Decide on a session query; only its holder can change the session, anybody can stop the vehicle."""
-        refusal = self._OPERATIONS[request.operation](self, request, vehicle, now_ns)
-        granted = refusal == ""
+        rejection = self._OPERATIONS[request.operation](self, request, vehicle, now_ns)
+        granted = rejection == ""
         self.counts[f"session {request.operation} {'granted' if granted else 'refused'}"] += 1
         holds = granted and self._holds(request)  # whoever stops the vehicle must not thereby get to drive it
         return SessionReply(
-            granted, refusal, self._epoch if holds else 0, self.token if holds else b"", self._video_port,
+            granted, rejection, self._epoch if holds else 0, self.token if holds else b"", self._video_port,
             self._host, self._emergency_number,
         )  # fmt: skip
 
     def _holds(self, request: SessionRequest) -> bool:
-        return (request.who, request.instance) == self.holder
+        return (request.who, request.instance) == self.active_operator
 
     def _hold(self, request: SessionRequest, vehicle: VehicleState, now_ns: int) -> str:
         if self._ends:
             return "the server is about to end"
         if self._holds(request):
             return ""
-        if self.holder is not None and not self.at_rest(vehicle):
-            return f"held by {self.holder[0]}, and the vehicle is not disarmed at standstill"
-        kept_for = self.claims.kept_from(request, now_ns)
+        if self.active_operator is not None and not self.at_rest(vehicle):
+            return f"held by {self.active_operator[0]}, and the vehicle is not disarmed at standstill"
+        kept_for = self.claims.reserved_for(request, now_ns)
         if kept_for:
             return f"handed over to {kept_for}, who has not taken it yet"
         self.claims.forget()
-        self.holder = (request.who, request.instance)
+        self.active_operator = (request.who, request.instance)
         self.token = self._new_token()
         self._renew_epoch()
         return ""
@@ -172,7 +174,7 @@ class SafetyGate:
     def _ask(self, request: SessionRequest, _vehicle: VehicleState, now_ns: int) -> str:
         if self._holds(request):
             return "you hold the vehicle"
-        if self.holder is None:
+        if self.active_operator is None:
             return "nobody holds the vehicle"
         return self.claims.ask(request, now_ns)
 
@@ -185,7 +187,7 @@ class SafetyGate:
         return ""
 
     def _give_up(self) -> None:
-        self.holder = None
+        self.active_operator = None
         self.token = b""
         self._renew_epoch()
 
@@ -198,7 +200,7 @@ class SafetyGate:
     def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState, _now_ns: int) -> str:
         if not self._stop_at_once(request.number):
             return "the number of this emergency stop is not a new one"
-        self.because = f"emergency stop by {request.who}"
+        self.reason = f"emergency stop by {request.who}"
         return ""
 
     def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
@@ -225,17 +227,17 @@ class SafetyGate:
 
     def admit(self, command: Command, vehicle: VehicleState, now_ns: int) -> CommandVerdict:
         """Obey `command` or refuse it, at `now_ns`, when it was received."""
-        self._feel(vehicle)
+        self.check_vehicle(vehicle)
         self.watch(now_ns)  # a command that comes with the end of a silence comes too late
         if command.emergency_stop:
             self._stop_at_once(command.emergency_stop)
-        reason = self._objection(command, vehicle, now_ns)
+        reason = self.rejection_reason(command, vehicle, now_ns)
         if reason:
             if reason in BREAKS_ARMING:
                 self._trigger("arming broken")
-            self.refused = f"{reason}: {vehicle.hindrance}" if reason == HINDERED else reason
+            self.rejected = f"{reason}: {vehicle.inhibit_reason}" if reason == HINDERED else reason
             self.counts[f"refused: {reason}"] += 1
-            return CommandVerdict(False, self.refused)
+            return CommandVerdict(False, self.rejected)
         self._sequence = self.applied_sequence = command.sequence
         newer = self._newer(command)
         if newer:
@@ -249,14 +251,16 @@ class SafetyGate:
             self._command = command
             self._picture_ns = self.written.mono_ns(command.stamp_ns, now_ns) or now_ns
             self._path.look(vehicle)
-            self._path.take(command.steering_rad, command.path_curvature_per_m, self.written.taken_ns(command.stamp_ns))
+            self._path.take(
+                command.steering_rad, command.path_curvature_per_m, self.written.captured_ns(command.stamp_ns)
+            )
             if newer:
                 self._trigger("fresh command")
-        return OBEYED
+        return ACCEPTED
 
-    def _objection(self, command: Command, vehicle: VehicleState, now_ns: int) -> str:
+    def rejection_reason(self, command: Command, vehicle: VehicleState, now_ns: int) -> str:
         """Say why `command` is not obeyed; empty: it is. The cheap checks come first."""
-        if self.holder is None or command.epoch != self._epoch:
+        if self.active_operator is None or command.epoch != self._epoch:
             return "not the epoch in force"
         if command.sequence <= self._sequence:
             return "not newer than the last command"
@@ -276,8 +280,8 @@ class SafetyGate:
         if command.mode == "arm" and self.state == "emergency_stop":
             return "the emergency stop must be cleared first"
         if command.mode == "arm" and not self.stands(vehicle):
-            return NOT_STANDING
-        if command.mode == "arm" and vehicle.hindrance:
+            return NOT_STATIONARY
+        if command.mode == "arm" and vehicle.inhibit_reason:
             return HINDERED
         return ""
 
@@ -317,12 +321,12 @@ class SafetyGate:
 
     # What happens without a command.
 
-    def _feel(self, vehicle: VehicleState) -> None:
+    def check_vehicle(self, vehicle: VehicleState) -> None:
         """Look at the vehicle: whether it obeys, and who drives it."""
         if vehicle.is_overridden:
             self._trigger("driver override")
-        elif vehicle.hindrance:
-            self._trigger("vehicle fault", vehicle.hindrance)
+        elif vehicle.inhibit_reason:
+            self._trigger("vehicle fault", vehicle.inhibit_reason)
         elif not vehicle.is_engaged and self.state in ("driving", "degraded"):
             self._trigger("vehicle fault")
 
@@ -330,11 +334,11 @@ class SafetyGate:
         """Look at the clock: what silence and frozen pictures lead to."""
         if self.written.frozen:
             self._trigger("camera fault")
-        silence_ns = now_ns - self._fresh_ns
-        if silence_ns >= self.limits.degraded_after_ns:
+        since_command_ns = now_ns - self._fresh_ns
+        if since_command_ns >= self.limits.degraded_after_ns:
             self._trigger("arming broken")
             self._trigger("silence")
-        if silence_ns >= self.limits.stop_after_ns:
+        if since_command_ns >= self.limits.stop_after_ns:
             self._trigger("long silence")
 
     def next_wake_ns(self) -> int | None:
@@ -349,17 +353,17 @@ class SafetyGate:
 
         Call it whenever the vehicle has lived on: its odometry is kept here.
         """
-        self._feel(vehicle)
+        self.check_vehicle(vehicle)
         self._path.look(vehicle)
-        asked = self._command if self.state in ("driving", "degraded") else None
-        throttle, brake = (asked.throttle, asked.brake) if asked else (0.0, self.limits.arming_brake)
+        requested = self._command if self.state in ("driving", "degraded") else None
+        throttle, brake = (requested.throttle, requested.brake) if requested else (0.0, self.limits.arming_brake)
         if self.state == "degraded":  # never eases a brake
             throttle, brake = 0.0, max(brake, self._pedal(self.limits.degraded_deceleration_mps2))
         elif self.state == "safe_stop":
             throttle, brake = 0.0, self._pedal(self.limits.stop_deceleration_mps2)
         elif self.state != "driving":
             throttle, brake = 0.0, 1.0
-        picture_age_ns = now_ns - self._picture_ns if asked else None
+        picture_age_ns = now_ns - self._picture_ns if requested else None
         target = Actuation(self._target_rad(vehicle, now_ns), throttle, brake)
         return self.limiter.limit(target, vehicle, now_ns, picture_age_ns)
 
@@ -390,9 +394,9 @@ class SafetyGate:
         after = TRANSITIONS.get((self.state, trigger))
         if after is None:
             return
-        because = f"{BECAUSE[trigger]}: {detail}" if detail else BECAUSE[trigger]
-        self._transitions.append((self.state, after, because))
-        self.state, self.because = after, because
+        reason = f"{REASONS[trigger]}: {detail}" if detail else REASONS[trigger]
+        self._transitions.append((self.state, after, reason))
+        self.state, self.reason = after, reason
         if after in ("safe_stop", "emergency_stop") or trigger == "driver override":
             self._renew_epoch()
 

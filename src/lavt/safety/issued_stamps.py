@@ -19,22 +19,22 @@ class IssuedStamps:
         self._written: dict[int, tuple[int, int, int]] = {}
         self._order: deque[tuple[int, int]] = deque()
         self._last_crc: int | None = None
-        self._last_taken_ns = 0
+        self._last_captured_ns = 0
         self._equal_frames = 0
 
-    def note(self, stamp_ns: int, number: int, mono_ns: int, pixel_crc: int, taken_ns: int | None = None) -> None:
+    def note(self, stamp_ns: int, number: int, mono_ns: int, pixel_crc: int, captured_ns: int | None = None) -> None:
         """A frame was stamped at `mono_ns`; `pixel_crc` is a checksum of its pixels without the stamp.
 
-        `taken_ns` is when the camera says that it took the picture. One that equals the picture before it was taken
+        `captured_ns` is when the camera says that it took the picture. One that equals the picture before it was taken
         when that was.
         """
         if pixel_crc == self._last_crc:
             self._equal_frames += 1
         else:
             self._equal_frames = 1
-            self._last_taken_ns = mono_ns if taken_ns is None else taken_ns
+            self._last_captured_ns = mono_ns if captured_ns is None else captured_ns
         self._last_crc = pixel_crc
-        self._written[stamp_ns] = (number, mono_ns, self._last_taken_ns)
+        self._written[stamp_ns] = (number, mono_ns, self._last_captured_ns)
         self._order.append((mono_ns, stamp_ns))
         while self._order and self._order[0][0] < mono_ns - self._memory_ns:
             old_ns, old_stamp_ns = self._order.popleft()
@@ -46,7 +46,7 @@ class IssuedStamps:
         entry = self._written.get(stamp_ns)
         return entry[1] if entry is not None and now_ns - entry[1] <= self._memory_ns else None
 
-    def taken_ns(self, stamp_ns: int) -> int:
+    def captured_ns(self, stamp_ns: int) -> int:
         """When the picture of a stamp that was written was taken, as far as the camera knows."""
         return self._written[stamp_ns][2]
 

@@ -37,18 +37,18 @@ class Limiter:
         return vehicle.steering_rad if self._steering_rad is None else self._steering_rad
 
     def limit(
-        self, asked: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
+        self, requested: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
     ) -> Actuation:
-        """Bring `asked` within the limits at the vehicle's speed; the wheel turns no faster than the rate allows.
+        """Bring `requested` within the limits at the vehicle's speed; the wheel turns no faster than the rate allows.
 
-        `picture_age_ns` is the age of the picture that `asked` was made from; None: of no picture.
+        `picture_age_ns` is the age of the picture that `requested` was made from; None: of no picture.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
         if self._steering_rad is None:
             step_rad = 0.0
         changed = []
-        steering_rad = asked.steering_rad
+        steering_rad = requested.steering_rad
         bound_rad = self._max_steering_rad
         if not -bound_rad <= steering_rad <= bound_rad:
             changed.append("steering angle")
@@ -62,15 +62,15 @@ class Limiter:
             reached_rad = min(max(steering_rad, before_rad - step_rad), before_rad + step_rad)
             if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
-        throttle = asked.throttle
+        throttle = requested.throttle
         known = math.isfinite(vehicle.speed_mps)
         if throttle > 0 and not (known and vehicle.speed_mps <= self.limits.speed_limit_mps):
             throttle = 0.0
             changed.append("speed")
-        brake = asked.brake
+        brake = requested.brake
         if picture_age_ns is not None and known:
-            excess_mps = vehicle.speed_mps - sight_limit_mps(picture_age_ns / NS_PER_S, self.limits)
-            least = self._sight_brake(excess_mps)
+            excess_mps = vehicle.speed_mps - stopping_speed_limit_mps(picture_age_ns / NS_PER_S, self.limits)
+            least = self._stopping_distance_brake(excess_mps)
             if excess_mps > 0 and (throttle > 0 or brake < least):
                 throttle, brake = 0.0, max(brake, least)
                 changed.append("sight")
@@ -78,9 +78,9 @@ class Limiter:
         self.changed = tuple(changed)
         return Actuation(reached_rad, throttle, brake)
 
-    def _sight_brake(self, excess_mps: float) -> float:
+    def _stopping_distance_brake(self, excess_mps: float) -> float:
         """Pedal that takes the excess away in the settling time, at most that of a safe stop."""
-        deceleration_mps2 = min(excess_mps / self.limits.sight_settling_s, self.limits.stop_deceleration_mps2)
+        deceleration_mps2 = min(excess_mps / self.limits.stopping_brake_settling_s, self.limits.stop_deceleration_mps2)
         return min(1.0, deceleration_mps2 / self.max_braking_mps2)
 
     def _lateral_limit_rad(self, speed_mps: float) -> float:
@@ -95,7 +95,7 @@ class Limiter:
         return math.atan(self.wheelbase_m * self.limits.lateral_acceleration_mps2 / speed_mps**2)
 
 
-def sight_limit_mps(picture_age_s: float, limits: Limits) -> float:
+def stopping_speed_limit_mps(picture_age_s: float, limits: Limits) -> float:
     """Speed from which the car comes to stand on the path that it was shown, should no other command come.
 
     It has gone on for the picture's age, goes on until the safe stop begins, and brakes: the speed v solves
@@ -103,4 +103,4 @@ def sight_limit_mps(picture_age_s: float, limits: Limits) -> float:
     """
     blind_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2
-    return braking_mps2 * (math.sqrt(blind_s * blind_s + 2 * limits.sight_m / braking_mps2) - blind_s)
+    return braking_mps2 * (math.sqrt(blind_s * blind_s + 2 * limits.stopping_distance_limit_m / braking_mps2) - blind_s)

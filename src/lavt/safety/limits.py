@@ -19,10 +19,10 @@ class Limits:
     """Gentle: most silences end by themselves."""
     stop_deceleration_mps2: float = 4.0
     """From 30 km/h to standstill in 2.1 s and 9 m, and leaves grip for steering."""
-    sight_m: float = PATH_STEP_M * PATH_POINTS
-    """The path in a command: what the car would cover until it stands has to lie on it (`sight_limit_mps`). Only a
-    simulated vehicle may be configured beyond it, for studies of what the loop bears at more speed and delay."""
-    sight_settling_s: float = 0.25
+    stopping_distance_limit_m: float = PATH_STEP_M * PATH_POINTS
+    """The stopping distance must lie on the path in the command (`stopping_speed_limit_mps`). Only a simulated vehicle
+    may be configured beyond it, to study higher speeds and delays."""
+    stopping_brake_settling_s: float = 0.25
     """Speed beyond that is braked away so fast. The brake's lag is 0.2 s: quicker would swing, and 1 m/s too much
     already brakes like a safe stop, which is the most."""
     picture_age_limit_ns: int = 500 * NS_PER_MS
@@ -37,7 +37,7 @@ class Limits:
     """No throttle above it; the controllers drive 30 km/h."""
     arming_hold_ns: int = NS_PER_S
     """For how long all conditions of arming must hold."""
-    ask_lapses_ns: int = 3 * NS_PER_S
+    handover_request_timeout_ns: int = 3 * NS_PER_S
     """Who asks for the vehicle asks again each second; after three that did not come it counts as gone."""
     kept_ns: int = 5 * NS_PER_S
     """So long a released vehicle is kept for who asked: it tries each second, and one reply may be lost."""

@@ -40,10 +40,10 @@ class PathFollower:
         """Look where the vehicle has got to; at any times, the more often the better."""
         self._odometry.note(vehicle)
 
-    def take(self, angle_rad: float, path_curvature_per_m: tuple[float, ...], taken_ns: int) -> None:
-        """Take over the path of a command from a picture taken at `taken_ns`; `angle_rad` is how it steers there."""
+    def take(self, angle_rad: float, path_curvature_per_m: tuple[float, ...], captured_ns: int) -> None:
+        """Take over the path of a command from a picture taken at `captured_ns`; `angle_rad` is how it steers there."""
         self._bends_per_m = (curvature_per_m(angle_rad, self._wheelbase_m), *path_curvature_per_m)
-        self._begin = self._odometry.at(taken_ns)
+        self._begin = self._odometry.at(captured_ns)
 
     def forget(self) -> None:
         """There is no path any more."""

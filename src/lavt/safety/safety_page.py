@@ -62,7 +62,7 @@ def transitions() -> str:
         rows.setdefault((trigger, after), []).append(before)
     return _table(
         ("what happens", "in", "leads to", "told as"),
-        [(trigger, ", ".join(befores), after, gate.BECAUSE[trigger]) for (trigger, after), befores in rows.items()],
+        [(trigger, ", ".join(befores), after, gate.REASONS[trigger]) for (trigger, after), befores in rows.items()],
     )
 
 
@@ -76,9 +76,9 @@ def client_limits() -> str:
     return _limits(driver_limits.CLIENT_LIMITS)
 
 
-def refusals() -> str:
+def rejections() -> str:
     """Draw the reasons for which a command is refused, in the order in which they are looked at."""
-    returns = [node for node in ast.walk(_definition(gate, "_objection")) if isinstance(node, ast.Return)]
+    returns = [node for node in ast.walk(_definition(gate, "rejection_reason")) if isinstance(node, ast.Return)]
     said = [_said(node.value) for node in sorted(returns, key=lambda node: node.lineno)]
     return "\n".join(f"{place}. {reason}" for place, reason in enumerate(filter(None, said), 1))
 
@@ -88,7 +88,7 @@ DRAWINGS: Final[dict[str, Callable[[], str]]] = {
     "transitions": transitions,
     "limits of the vehicle": vehicle_limits,
     "limits of the client": client_limits,
-    "refusals": refusals,
+    "rejections": rejections,
 }
 """What can be drawn, by the name of its block."""
 

@@ -23,8 +23,8 @@ class TakeoverRequests:
     Times are of the server's monotonic clock.
     """
 
-    def __init__(self, *, ask_lapses_ns: int, kept_ns: int) -> None:
-        self._ask_lapses_ns = ask_lapses_ns
+    def __init__(self, *, handover_request_timeout_ns: int, kept_ns: int) -> None:
+        self._handover_request_timeout_ns = handover_request_timeout_ns
         self._kept_ns = kept_ns
         self._asking: _TakeoverRequest | None = None
         self._kept: _TakeoverRequest | None = None
@@ -33,20 +33,20 @@ class TakeoverRequests:
         """Note that somebody asks, or asks on; give why not, empty: it is noted."""
         if self._asking is not None and now_ns < self._asking.until_ns and not self._asking.is_of(request):
             return f"{self._asking.who} asks for it already"
-        self._asking = _TakeoverRequest(request.who, request.instance, now_ns + self._ask_lapses_ns)
+        self._asking = _TakeoverRequest(request.who, request.instance, now_ns + self._handover_request_timeout_ns)
         return ""
 
-    def asked_by(self, now_ns: int) -> str:
+    def requested_by(self, now_ns: int) -> str:
         """Give the name of who asks; empty: nobody, or not any more."""
         return self._asking.who if self._asking is not None and now_ns < self._asking.until_ns else ""
 
     def release(self, now_ns: int) -> None:
         """Keep the vehicle, which is free now, for who asks for it."""
-        asked = self.asked_by(now_ns) and self._asking
-        self._kept = _TakeoverRequest(asked.who, asked.instance, now_ns + self._kept_ns) if asked else None
+        requested = self.requested_by(now_ns) and self._asking
+        self._kept = _TakeoverRequest(requested.who, requested.instance, now_ns + self._kept_ns) if requested else None
         self._asking = None
 
-    def kept_from(self, request: SessionRequest, now_ns: int) -> str:
+    def reserved_for(self, request: SessionRequest, now_ns: int) -> str:
         """Give the name of the other for whom the vehicle is kept; empty: who requests may have it."""
         kept = self._kept
         return "" if kept is None or now_ns >= kept.until_ns or kept.is_of(request) else kept.who

@@ -100,13 +100,13 @@ CHECKS: dict[type, dict[str, Check]] = {
         "steering_rad": ROAD_WHEEL,
         "gear": _one_of("park", "reverse", "neutral", "drive"),
         "safety": _one_of("disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"),
-        "because": _text(200),
+        "reason": _text(200),
         "applied_sequence": _integer(-1, 2**63 - 1),
-        "refused": _text(200),
+        "rejected": _text(200),
         "limited": _text(100),
-        "holder": _name_or_none,
-        "holder_instance": U64,
-        "asked_by": _name_or_none,
+        "active_operator": _name_or_none,
+        "active_operator_instance": U64,
+        "requested_by": _name_or_none,
         "instance": U64,
     },
     SessionRequest: {
@@ -117,7 +117,7 @@ CHECKS: dict[type, dict[str, Check]] = {
     },
     SessionReply: {
         "granted": lambda value: type(value) is bool,
-        "because": _text(200),
+        "reason": _text(200),
         "epoch": U64,
         "token": _bytes(0, 16),
         "video_port": _integer(0, 65535),
@@ -139,7 +139,7 @@ CHECKS: dict[type, dict[str, Check]] = {
         "reorder": UNIT,
         "state_delay_ms": _number(0.0, LONGEST_DELAY_MS),
     },
-    NetemReply: {"granted": lambda value: type(value) is bool, "because": _text(400)},
+    NetemReply: {"granted": lambda value: type(value) is bool, "reason": _text(400)},
 }
 
 _NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}

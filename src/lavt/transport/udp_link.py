@@ -102,7 +102,7 @@ class UdpLink:
             except OSError:  # an ICMP error of an earlier datagram
                 if self._closing:
                     return
-                self.counts["datagrams_refused"] += 1
+                self.counts["datagrams_rejected"] += 1
                 continue
             if self._closing:
                 return

@@ -34,7 +34,7 @@ PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws")
 PROTOCOLS_OF_PATHS = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANSWERS = {"session": "session_reply", "netem": "netem_reply"}
 """The queries, by the last part of their keys, and what answers them."""
-ASKED = {answer: query for query, answer in ANSWERS.items()}
+REQUESTED = {answer: query for query, answer in ANSWERS.items()}
 ARRIVING_KEPT = 256
 """So many messages wait to be heard; of more the oldest goes. Zenoh's threads put down what comes and never wait for
 Python's lock, so that a flood makes no queue in sockets."""
@@ -193,23 +193,23 @@ class ZenohLink:
         self._opener: threading.Thread | None = None
         self._listener: threading.Thread | None = None
         self._waiting = waiting
-        self._waits_because = ""
+        self._waits_reason = ""
         try:
             self._session = zenoh.open(self._config)
         except zenoh.ZError as error:
-            self._waits_because = (
+            self._waits_reason = (
                 f"no router answers at {endpoints}: start one with `lavt router FILE.json5`, or name another "
                 f"({_plain(error)})"
             )
             if waiting is None:
-                raise UserError(self._waits_because) from error
+                raise UserError(self._waits_reason) from error
 
     def start(self) -> None:
         """Begin to send and to hear; from here on messages are delivered."""
         if self._session is not None:
             self._declare(self._session)
         elif self._waiting is not None:
-            self._waiting(self._waits_because)
+            self._waiting(self._waits_reason)
             self._opener = threading.Thread(target=self._open_later, name="zenoh opener", daemon=True)
             self._opener.start()
 
@@ -235,8 +235,8 @@ class ZenohLink:
         )
         self._listener.start()
         for channel in ANSWERS if self._side == "server" else ():
-            asked: Any = zenoh.handlers.Callback(functools.partial(self._asked, channel), indirect=False)
-            self._declared.append(session.declare_queryable(f"{self._base}/{channel}", asked))
+            requested: Any = zenoh.handlers.Callback(functools.partial(self._requested, channel), indirect=False)
+            self._declared.append(session.declare_queryable(f"{self._base}/{channel}", requested))
         self._declared.append(session.liveliness().declare_token(f"{self._base}/alive/{self._who}"))
 
     def send(self, *sends: Send) -> None:
@@ -250,8 +250,8 @@ class ZenohLink:
                 self.counts[f"{send.channel}_not_sent"] += 1
             elif send.channel in ANSWERS:
                 self._ask(send.channel, send.payload)
-            elif send.channel in ASKED:
-                self._reply(ASKED[send.channel], send.peer, send.payload)
+            elif send.channel in REQUESTED:
+                self._reply(REQUESTED[send.channel], send.peer, send.payload)
             else:
                 self._publisher.put(send.payload)
         except zenoh.ZError:
@@ -307,7 +307,7 @@ class ZenohLink:
         else:
             self.counts[f"{channel}_unanswered"] += 1
 
-    def _asked(self, channel: str, query: zenoh.Query) -> None:
+    def _requested(self, channel: str, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         number = next(self._number)
         with self._queries_lock:

@@ -155,11 +155,11 @@ class VideoDevice:
             )
         said_hz = capture.get(cv2.CAP_PROP_FPS)
         offer = DeviceFormat(picture.shape[1], picture.shape[0], said_hz if 0 < said_hz <= KNOWN_RATE_HZ else None)
-        asked = DeviceFormat(self.model.width_px, self.model.height_px, self.rate_hz)
-        if not _is_as_asked(offer, self.model, self.rate_hz):
+        requested = DeviceFormat(self.model.width_px, self.model.height_px, self.rate_hz)
+        if not _is_as_requested(offer, self.model, self.rate_hz):
             capture.release()
             raise UserError(
-                f"{self._device} gives {offer}, but camera asks for {asked}: set camera.width_px, height_px and "
+                f"{self._device} gives {offer}, but camera asks for {requested}: set camera.width_px, height_px and "
                 "rate_hz to what it gives, or camera.format to one in which it gives that"
             )
         return capture, picture
@@ -259,7 +259,7 @@ def _read(capture: cv2.VideoCapture) -> Picture | None:
     return cast("Picture", picture) if good and picture.ndim == 3 and picture.dtype == np.uint8 else None
 
 
-def _is_as_asked(offer: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
+def _is_as_requested(offer: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
     """Whether a device gives what it was asked for; a rate that it does not tell is not held against it."""
     is_of_size = (offer.width_px, offer.height_px) == (model.width_px, model.height_px)
     return is_of_size and (offer.rate_hz is None or math.isclose(offer.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))

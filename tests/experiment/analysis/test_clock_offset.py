@@ -110,7 +110,7 @@ def test_a_clock_that_is_being_steered_is_known_within_its_bound(
     assert (wrong_ns <= bound_ns + 2).all()
 
 
-def test_being_asked_for_long_matters_only_while_steered() -> None:
+def test_being_requested_for_long_matters_only_while_steered() -> None:
     """An answer that took 100 ms leaves open what was steered meanwhile, and nothing where nothing was."""
     still, steered = drifting(0, 0), slewed(0, 10_000, 0, 100)
     bounds_ms = []

@@ -215,7 +215,7 @@ def test_picture_age_by_hand() -> None:
     )
     admissions = table(
         [
-            {"stamp_ns": n, "verdict": "obeyed", "applied_mono_ns": applied * millisecond}
+            {"stamp_ns": n, "verdict": "accepted", "applied_mono_ns": applied * millisecond}
             for n, applied in ((1, 10), (2, 20), (3, 40))
         ]
     )

@@ -10,7 +10,7 @@ from lavt.experiment.analysis.injection_validity import absent_reasons, recorded
 from lavt.recording.record import Record
 from lavt.recording.table import Table, table_of
 
-ASKED_MS = {"video": 150.0, "control": 75.0}
+REQUESTED_MS = {"video": 150.0, "control": 75.0}
 BEGAN_S, ENDED_S = 10, 20
 Sample = tuple[float, str, str, float, float | None, str]
 VIDEO: list[Sample] = [(5, "L4", "video", 150.0, 150.2, ""), (15, "L4", "video", 150.0, 150.4, "")]
@@ -23,7 +23,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
-    keys = ("mono_ns", "condition", "flow", "asked_ms", "measured_ms", "because")
+    keys = ("mono_ns", "condition", "flow", "requested_ms", "measured_ms", "reason")
     rows = [dict(zip(keys, (round(sample[0] * 1e9), *sample[1:]), strict=True)) for sample in samples]
     tables = {"injection": table(rows)} if rows else {}
     if drove:
@@ -32,8 +32,10 @@ def record(samples: Sequence[Sample], *, drove: bool = False) -> Record:
     return Record(Path("none"), True, tables, {}, ENDED_S * 10**9)
 
 
-def reasons(video: Sequence[Sample], control: Sequence[Sample], asked_ms: Mapping[str, float] = ASKED_MS) -> list[str]:
-    return recorded_reasons(record(video, drove=True), record(control), "L4", asked_ms)
+def reasons(
+    video: Sequence[Sample], control: Sequence[Sample], requested_ms: Mapping[str, float] = REQUESTED_MS
+) -> list[str]:
+    return recorded_reasons(record(video, drove=True), record(control), "L4", requested_ms)
 
 
 def test_a_condition_that_was_in_force_all_the_time_is_no_reason() -> None:
@@ -60,7 +62,7 @@ def test_each_way_of_not_being_in_force_is_a_reason(video: list[Sample], control
     assert [reason for reason in reasons(video, control) if said in reason]
 
 
-def test_what_was_not_asked_for_need_not_be_measured() -> None:
+def test_what_was_not_requested_for_need_not_be_measured() -> None:
     """Under a condition that delays the video only, nobody has to measure the control."""
     assert reasons(VIDEO, [(1, "L4", "", 0.0, None, "")], {"video": 150.0, "control": 0.0}) == []
 
@@ -79,10 +81,10 @@ def test_a_long_silence_is_a_reason() -> None:
 
 def test_a_drive_without_a_condition_must_not_have_anothers() -> None:
     """A run that asked for nothing is invalid where another client's condition was in force."""
-    (reason,) = recorded_reasons(record(VIDEO, drove=True), record([]), "", ASKED_MS)
+    (reason,) = recorded_reasons(record(VIDEO, drove=True), record([]), "", REQUESTED_MS)
     assert "L4 was in force on the server" in reason
     ended = [VIDEO[0], (8, "", "", 0.0, None, "")]
-    assert recorded_reasons(record(ended, drove=True), record([]), "", ASKED_MS) == []
+    assert recorded_reasons(record(ended, drove=True), record([]), "", REQUESTED_MS) == []
 
 
 @pytest.mark.parametrize(
@@ -94,5 +96,5 @@ def test_latencies_that_are_too_short_for_what_was_injected(
 ) -> None:
     """Where video or control took less than was injected into them, the delay was on another path: invalid."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
-    said = absent_reasons(entry, ASKED_MS)
+    said = absent_reasons(entry, REQUESTED_MS)
     assert [each.split()[1] for each in said] == flows

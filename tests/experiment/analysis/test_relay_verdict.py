@@ -11,7 +11,7 @@ from lavt.cli.relay import flows
 from lavt.config import Condition, ImpairmentConfig, RunConfig
 from lavt.config_file import conditions, parse_config
 from lavt.experiment.runs.plan import PlannedRun, injected_entry, plan_run
-from lavt.experiment.runs.real_run import _asked_ms, _relay_config, relay_reasons
+from lavt.experiment.runs.real_run import _relay_config, _requested_ms, relay_reasons
 
 
 def planned(condition: str, **network: Any) -> PlannedRun:
@@ -23,12 +23,12 @@ def test_the_relay_is_told_all(name: str) -> None:
     """From a run's condition to the flows of the relay nothing is lost: the same law, trace, queue and seed."""
     run = planned(name, inherent="paper_wifi5")
     video, control = flows(_relay_config(run, 5600, 7448))
-    asked = run.asked
-    assert video.downstream_injected == injected("video", asked.video_ms, asked.video, run.seed)
-    assert control.upstream_injected == injected("control", asked.control_ms, asked.control, run.seed)
+    requested = run.requested
+    assert video.downstream_injected == injected("video", requested.video_ms, requested.video, run.seed)
+    assert control.upstream_injected == injected("control", requested.control_ms, requested.control, run.seed)
     assert video.upstream_injected is control.downstream_injected is None
     constant = video.downstream_injected is None
-    assert video.downstream.constant_ms == pytest.approx(_inherent_ms() + (asked.video_ms if constant else 0))
+    assert video.downstream.constant_ms == pytest.approx(_inherent_ms() + (requested.video_ms if constant else 0))
 
 
 def _inherent_ms() -> float:
@@ -36,11 +36,13 @@ def _inherent_ms() -> float:
     return video.downstream.constant_ms
 
 
-def said(held: tuple[float | None, float | None], late: tuple[float | None, float | None], **asked: Any) -> list[str]:
+def said(
+    held: tuple[float | None, float | None], late: tuple[float | None, float | None], **requested: Any
+) -> list[str]:
     ways = ("video downstream", "control upstream")
     return relay_reasons(
         {
-            "asked_ms": asked,
+            "requested_ms": requested,
             "held_ms": dict(zip(ways, held, strict=True)),
             "late_ms": dict(zip(ways, late, strict=True)),
         }
@@ -70,17 +72,17 @@ def test_a_relay_that_said_nothing() -> None:
     assert relay_reasons({}) == [f"nobody measured the injected delay of {flow}" for flow in ("video", "control")]
 
 
-def test_asked_of_the_relay() -> None:
+def test_requested_of_the_relay() -> None:
     """A median is asked of a flow with a constant delay only."""
-    assert _asked_ms(planned("L4")) == {"video": 150, "control": 75}
-    assert _asked_ms(planned("jitter")) == {"video": None, "control": 0}
+    assert _requested_ms(planned("L4")) == {"video": 150, "control": 75}
+    assert _requested_ms(planned("jitter")) == {"video": None, "control": 0}
 
 
 def test_least() -> None:
     """A latency is too short for a condition only where jitter and overtaking do not explain it."""
     assert injected_entry(conditions()["L4"]) == {"injected_ms": {"video": 150, "control": 75}}
     jitter, early = ImpairmentConfig(jitter_ms=10), ImpairmentConfig(reorder=0.5)
-    asked = Condition(video_ms=75, control_ms=30, video=jitter, control=jitter)
-    assert injected_entry(asked)["injected_least_ms"] == {"video": 35, "control": 0}
-    asked = Condition(video_ms=75, control_ms=30, video=early)
-    assert injected_entry(asked)["injected_least_ms"] == {"video": 0, "control": 30}
+    requested = Condition(video_ms=75, control_ms=30, video=jitter, control=jitter)
+    assert injected_entry(requested)["injected_least_ms"] == {"video": 35, "control": 0}
+    requested = Condition(video_ms=75, control_ms=30, video=early)
+    assert injected_entry(requested)["injected_least_ms"] == {"video": 0, "control": 30}

@@ -14,25 +14,25 @@ from lavt.recording.table import table_of
 MakeRun = Callable[..., Path]
 
 
-def test_every_hop_is_timed_in_the_order_of_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
+def test_every_stage_is_timed_in_the_order_of_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
     """Hops have their recorded durations; a link is tau less what the nodes did, whatever the clocks show."""
     make_run(tmp_path)
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
-    hops = {(hop["node"], hop["hop"]): hop for hop in entry["hops_ms"]}
-    assert list(hops) == [
+    stages = {(stage["node"], stage["stage"]): stage for stage in entry["stages_ms"]}
+    assert list(stages) == [
         ("camera", "encode"),
         ("camera", "packetize"),
         ("network", "video link"),
         ("receiver", "reorder and depacketize"),
-        *(("driver", hop) for hop in ("reorder", "decode", "read_stamp", "lane", "control")),
+        *(("driver", stage) for stage in ("reorder", "decode", "read_stamp", "lane", "control")),
         ("network", "control link"),
     ]
-    assert hops["driver", "decode"]["p50"] == pytest.approx(2.0)
+    assert stages["driver", "decode"]["p50"] == pytest.approx(2.0)
     # Of tau_v, 62 ms, the camera takes 5 after the stamp, and the client 10 from the packet to the stamp.
-    link = hops["network", "video link"]
+    link = stages["network", "video link"]
     assert (link["p50"], link["p95"]) == pytest.approx((47.0, 49.0), abs=1e-3)
     assert link["n"] == entry["tau_v_ms"]["n"]
-    assert hops["network", "control link"]["p50"] == entry["tau_c_ms"]["p50"]
+    assert stages["network", "control link"]["p50"] == entry["tau_c_ms"]["p50"]
 
 
 def test_links_need_the_offset_between_the_clocks(make_run: MakeRun, tmp_path: Path) -> None:
@@ -40,14 +40,14 @@ def test_links_need_the_offset_between_the_clocks(make_run: MakeRun, tmp_path: P
     unknown = {"client_clock": lambda _second: {"correction_s": None}, "probes": False}
     make_run(tmp_path, **unknown)
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
-    assert {hop["node"] for hop in entry["hops_ms"]} == {"camera", "receiver", "driver"}
+    assert {stage["node"] for stage in entry["stages_ms"]} == {"camera", "receiver", "driver"}
 
 
-def test_each_obeyed_command_has_the_age_of_its_picture() -> None:
+def test_each_accepted_command_has_the_age_of_its_picture() -> None:
     """Of a picture stamped at 10 ms, commands applied at 30 and 50 ms are 20 and 40 ms old; a refused one has none."""
     milliseconds = 1_000_000
     frames = table_of([{"stamp_ns": 7, "stamped_mono_ns": 10 * milliseconds}], [0], [0])
-    rows = [(30, 7, "obeyed"), (40, 7, "refused"), (50, 7, "obeyed"), (60, 8, "obeyed"), (90, 7, "obeyed")]
+    rows = [(30, 7, "accepted"), (40, 7, "rejected"), (50, 7, "accepted"), (60, 8, "accepted"), (90, 7, "accepted")]
     admissions = table_of(
         [{"applied_mono_ns": at * milliseconds, "stamp_ns": stamp, "verdict": said} for at, stamp, said in rows],
         [0] * len(rows),

@@ -10,7 +10,7 @@ import pytest
 from lavt.experiment.analysis.clock_validity import step_reasons
 from lavt.experiment.analysis.metrics import measure
 from lavt.experiment.analysis.results import IDENTITY, MEASURES, run_result, write_json
-from lavt.experiment.analysis.validity import injection_reasons, invalid_because
+from lavt.experiment.analysis.validity import injection_reasons, invalid_reasons
 from lavt.recording.record import read_record
 
 MakeRun = Callable[..., Path]
@@ -19,7 +19,7 @@ MakeRun = Callable[..., Path]
 def reasons(make_run: MakeRun, directory: Path, **settings: Any) -> list[str]:
     make_run(directory, **settings)
     server, client = read_record(directory / "server.mcap"), read_record(directory / "client.mcap")
-    return invalid_because(server, client, measure(server, client))
+    return invalid_reasons(server, client, measure(server, client))
 
 
 def test_a_good_run_is_valid(make_run: MakeRun, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_client_that_follows_its_server_is_known_as_well_as_the_path(make_run:
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
     assert measured.clocks.bound_ms == pytest.approx(0.3 + 0.03 + 0.002, abs=1e-3)
-    assert invalid_because(server, client, measured) == []
+    assert invalid_reasons(server, client, measured) == []
 
 
 @pytest.mark.parametrize("lacking", ["peer_delay_s", "peer_dispersion_s", "skew_ppm", "age_s"])
@@ -216,7 +216,7 @@ def test_a_clock_that_is_set_while_nobody_drives_yet(
     make_run(tmp_path, step_s=step_s, stepped_s=-20.0, waited_s=40, drift=0.0, **alone)
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
-    assert invalid_because(server, client, measured) == []
+    assert invalid_reasons(server, client, measured) == []
     assert measured.entry["delta"]["source"] == source
     assert measured.entry["delta"]["ms"] == pytest.approx(250.0 - 1000 * step_s, abs=1e-3)
 
@@ -257,7 +257,7 @@ def test_without_chrony_the_probe_alone_counts(make_run: MakeRun, tmp_path: Path
     make_run(tmp_path, **{silent: lambda _second: unknown})
     server, client = read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")
     measured = measure(server, client)
-    assert invalid_because(server, client, measured) == []
+    assert invalid_reasons(server, client, measured) == []
     delta = measured.entry["delta"]
     assert delta["source"] == "probe"
     assert delta["ms"] == delta["probe_ms"] == pytest.approx(250.0 + 20e-6 * 6000, abs=0.001)
@@ -285,7 +285,7 @@ def test_a_loop_that_does_not_close_is_told(make_run: MakeRun, tmp_path: Path) -
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", tau_v_ms=64.5)
     server, client = read_record(tmp_path / "a" / "server.mcap"), read_record(tmp_path / "b" / "client.mcap")
-    said = invalid_because(server, client, measure(server, client))
+    said = invalid_reasons(server, client, measure(server, client))
     assert said == ["the parts of the loop miss the whole by 2.50 ms (p95, limit 1.0 ms)"]
 
 
@@ -294,10 +294,10 @@ def test_a_cut_record_is_told(make_run: MakeRun, tmp_path: Path) -> None:
     path = make_run(tmp_path) / "client.mcap"
     path.write_bytes(path.read_bytes()[:-100])
     server, client = read_record(tmp_path / "server.mcap"), read_record(path)
-    assert "the record of the client is not complete" in invalid_because(server, client, measure(server, client))
+    assert "the record of the client is not complete" in invalid_reasons(server, client, measure(server, client))
 
 
-def test_injection_is_held_against_what_was_asked() -> None:
+def test_injection_is_held_against_what_was_requested() -> None:
     """A measured delay more than 1 ms from the one asked for, or none at all, is a reason."""
     assert injection_reasons({"video": 75.0, "control": 0.0}, {"video": 75.6, "control": 0.2}) == []
     assert injection_reasons({"video": 75.0}, {"video": 60.0}) == ["video was delayed by 60.0 ms where 75 ms was asked"]
@@ -312,7 +312,7 @@ def test_a_result_has_every_key(make_run: MakeRun, tmp_path: Path) -> None:
     result = run_result(identity, server, client, digest="ab", reasons=["the relay died"])
     write_json(tmp_path / "result.json", {**result, "mae_m": float("nan")})
     read = json.loads((tmp_path / "result.json").read_text())
-    assert list(read) == [*IDENTITY, "digest", "ending", "valid", "invalid_because", *MEASURES]
+    assert list(read) == [*IDENTITY, "digest", "ending", "valid", "invalid_reasons", *MEASURES]
     assert read["participant"] is None
     assert read["mae_m"] is None
-    assert (read["valid"], read["invalid_because"]) == (False, ["the relay died"])
+    assert (read["valid"], read["invalid_reasons"]) == (False, ["the relay died"])

@@ -43,13 +43,13 @@ MS = 1_000_000
 
 
 def counted(function: Callable[[float], Any]) -> tuple[Callable[[float], Any], list[float]]:
-    asked: list[float] = []
+    requested: list[float] = []
 
     def ask(delay_ms: float) -> Any:
-        asked.append(delay_ms)
+        requested.append(delay_ms)
         return function(delay_ms)
 
-    return ask, asked
+    return ask, requested
 
 
 # The search.
@@ -57,11 +57,11 @@ def counted(function: Callable[[float], Any]) -> tuple[Callable[[float], Any], l
 
 def test_bisection_closes_in_on_the_first_crossing() -> None:
     """What begins at 137 ms is bracketed to 2 ms: the grid is asked first, then six halves of 100 ms."""
-    happens, asked = counted(lambda delay_ms: delay_ms >= 137)
+    happens, requested = counted(lambda delay_ms: delay_ms >= 137)
     found = first_bracket(happens, GRID_MS, 2.0)
     assert found == Bracket(135.9375, 137.5, monotone=True)
-    assert asked[:4] == GRID_MS
-    assert len(asked) == 10
+    assert requested[:4] == GRID_MS
+    assert len(requested) == 10
 
 
 def test_what_stops_again_is_told() -> None:
@@ -130,10 +130,10 @@ def frame(number: int) -> FrameWritten:
     )  # fmt: skip
 
 
-def admission(stamp: int, applied_ns: int, *, verdict: str = "obeyed", limited: str = "") -> Admission:
+def admission(stamp: int, applied_ns: int, *, verdict: str = "accepted", limited: str = "") -> Admission:
     return Admission(
         epoch=0, stamp_ns=stamp, sequence=0, sent_wall_ns=0, stamp_received_wall_ns=0, received_mono_ns=applied_ns,
-        received_wall_ns=0, applied_mono_ns=applied_ns if verdict == "obeyed" else None, verdict=verdict, reason="",
+        received_wall_ns=0, applied_mono_ns=applied_ns if verdict == "accepted" else None, verdict=verdict, reason="",
         limited=limited, mode="drive", steering_rad=0.0, throttle=0.0, brake=0.0,
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
             each
             for number in range(10, 50)
             for each in (
-                admission(number, number * 33 * MS + 70 * MS, verdict="refused"),
+                admission(number, number * 33 * MS + 70 * MS, verdict="rejected"),
                 admission(number, number * 33 * MS + 80 * MS, limited="steering rate" if number == 20 else ""),
                 admission(number, number * 33 * MS + 100 * MS),
             )
@@ -285,7 +285,7 @@ def test_first_seeds_of_all_come_before_second_ones() -> None:
         ("network.condition=L9", "no condition 'L9'"),
     ],
 )
-def test_what_cannot_be_searched_is_refused(change: str, says: str) -> None:
+def test_what_cannot_be_searched_is_rejected(change: str, says: str) -> None:
     """Each is said in a sentence before anything is driven."""
     with pytest.raises(UserError, match=says):
         plan_boundary(config(change))
@@ -310,9 +310,9 @@ def small(*changes: str) -> BoundaryConfig:
 @pytest.mark.full
 def test_one_real_search() -> None:
     """One seed: the swing grows within 10 ms of the theory, then the car leaves its lane, then it does not arrive."""
-    (asked,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
-    found = search(asked)
-    assert found["theory_ms"] == theoretical_ms(asked.planned.config)
+    (requested,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
+    found = search(requested)
+    assert found["theory_ms"] == theoretical_ms(requested.planned.config)
     assert found["onset_ms"] == pytest.approx(found["theory_ms"], abs=10)
     assert found["onset_ms"] < found["departure_ms"] < found["completion_ms"]
     low_ms, high_ms = found["searched_ms"]
@@ -324,8 +324,8 @@ def test_one_real_search() -> None:
 @pytest.mark.full
 def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
     """With a limit of 100 ms the vehicle is not even armed beyond it: completion ends there, and no swing has begun."""
-    (asked,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
-    found = search(asked)
+    (requested,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
+    found = search(requested)
     assert (found["onset_ms"], found["departure_ms"]) == (None, None)
     assert found["completion_ms"] == pytest.approx(100, abs=60)
     assert found["searched_ms"][1] == pytest.approx(412, abs=2)
@@ -349,23 +349,23 @@ def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(boundary_module, "watch_drive", fake)
     monkeypatch.setattr(boundary_module, "straight_growth", lambda _: (math.nan, -math.inf))
-    (asked,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
+    (requested,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
     leaves_ms = 137
-    found = search(asked)
+    found = search(requested)
     assert found["departure_ms"] == pytest.approx(147, abs=1)
     assert found["not_monotone"] == []
     assert found["completion_ms"] == pytest.approx(260, abs=1)
     leaves_ms = 0
-    assert (search(asked)["below"], search(asked)["not_monotone"]) == (["departure"], [])
+    assert (search(requested)["below"], search(requested)["not_monotone"]) == (["departure"], [])
     leaves_ms = 300
-    assert (search(asked)["departure_ms"], search(asked)["searched_ms"]) == (None, [10, 410])
+    assert (search(requested)["departure_ms"], search(requested)["searched_ms"]) == (None, [10, 410])
 
 
 def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is told with its reason, and what the others found is there."""
 
-    def fake(asked: boundary_module.BoundarySearch) -> dict[str, Any]:
-        if asked.name.endswith("01"):
+    def fake(requested: boundary_module.BoundarySearch) -> dict[str, Any]:
+        if requested.name.endswith("01"):
             raise WorkError("the vehicle was never armed")
         return run_entry("a_key", 0)
 
@@ -378,10 +378,10 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
 
 
-def killed_by(asked: boundary_module.BoundarySearch) -> dict[str, Any]:
+def killed_by(requested: boundary_module.BoundarySearch) -> dict[str, Any]:
     """Search as if it were one of repetition 1 that its process does not survive, and of 2 that dies the first time."""
-    repetition = int(asked.name[-2:])
-    mark = Path(asked.planned.config.study.participant or "") / str(repetition)
+    repetition = int(requested.name[-2:])
+    mark = Path(requested.planned.config.study.participant or "") / str(repetition)
     if repetition == 1 or (repetition == 2 and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -401,7 +401,7 @@ def test_a_process_that_dies_costs_no_search(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Ctrl-C after the second seed: what was under way is taken too, nothing more, and the files hold it."""
-    monkeypatch.setattr(boundary_module, "search", lambda asked: run_entry("a_key", int(asked.name[-2:])))
+    monkeypatch.setattr(boundary_module, "search", lambda requested: run_entry("a_key", int(requested.name[-2:])))
     monkeypatch.setattr(boundary_module, "processes", in_this_process)
     monkeypatch.setattr(_InThisProcess, "begins", 3)
     told: list[str] = []
@@ -411,8 +411,8 @@ def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tm
         if len(told) == 2:
             raise KeyboardInterrupt
 
-    asked = small("repetitions=5")
-    found, done = boundary_module.boundary(asked, plan_boundary(asked), tmp_path, jobs=1, tell=tell)
+    requested = small("repetitions=5")
+    found, done = boundary_module.boundary(requested, plan_boundary(requested), tmp_path, jobs=1, tell=tell)
     assert (len(told), done) == (3, False)
     assert [run["repetition"] for run in found["runs"]] == [0, 1, 2]
     assert json.loads((tmp_path / "boundary.json").read_text()) == found
@@ -455,5 +455,5 @@ def test_paths_of_roads_can_be_routes(tmp_path: Path) -> None:
     """A road of one's own is a route like those that come with LAVT."""
     road = tmp_path / "bend.yaml"
     road.write_text("title: Bend\nsegments: [{length_m: 60}, {length_m: 40, curvature_per_m: 0.02}]\n")
-    (asked,) = plan_boundary(small(f"routes=[{road}]"))
-    assert asked.planned.identity["route"] == str(road)
+    (requested,) = plan_boundary(small(f"routes=[{road}]"))
+    assert requested.planned.identity["route"] == str(road)

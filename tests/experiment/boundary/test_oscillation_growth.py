@@ -103,8 +103,8 @@ def check_onset(config: RunConfig) -> None:
     theory_ms = theoretical_ms(config)
     assert theory_ms is not None
     for side in (-1, 1):
-        asked_ms = theory_ms + side * (WITHIN_MS - 0.5) - LOOPBACK_MS
-        total_ms, rate_per_s = straight_growth(with_video_delay(config, asked_ms))
+        requested_ms = theory_ms + side * (WITHIN_MS - 0.5) - LOOPBACK_MS
+        total_ms, rate_per_s = straight_growth(with_video_delay(config, requested_ms))
         assert abs(total_ms - theory_ms) <= WITHIN_MS
         assert rate_per_s * side > 0, (total_ms, theory_ms)
 

@@ -18,7 +18,7 @@ from lavt.experiment.report import table_format
 from lavt.experiment.report.figure_style import condition_colours
 from lavt.experiment.report.report import write_report
 from lavt.experiment.report.run_sections import received_pictures
-from lavt.experiment.report.tables import hop_table
+from lavt.experiment.report.tables import stage_table
 from lavt.nodes.payloads import VideoUnit
 from lavt.recording.record import RecordWriter, read_record
 
@@ -70,7 +70,7 @@ def test_the_report_is_whole(sweep: Path) -> None:
     html = page_of(sweep)
     figures = {name.rpartition(".")[0] for name in re.findall(r'src="([^"]+)"', html)}
     assert figures == {
-        "degradation", "injected", "hops_virtual", "hops_real", "time_virtual", "time_real", "survival_virtual",
+        "degradation", "injected", "stages_virtual", "stages_real", "time_virtual", "time_real", "survival_virtual",
         "survival_real", "incidence_virtual", "incidence_real", "trajectories_whole_virtual", "trajectories_whole_real",
         "cross_track_virtual", "cross_track_real",
     }  # fmt: skip
@@ -182,7 +182,7 @@ def test_what_is_before_the_stamp_is_in_the_table_only(make_run: MakeRun, tmp_pa
     assert capture_to_stamp_ms(tmp_path / "server.mcap") == 7.5
     assert capture_to_stamp_ms(sweep / "runs" / "0" / "server.mcap") is None
     row = "camera: capture to stamp, before the loop"
-    assert list(hop_table({"L0": []}, {"L0": 7.5}).rows) == [[row, 7.5]]
+    assert list(stage_table({"L0": []}, {"L0": 7.5}).rows) == [[row, 7.5]]
     assert re.search(f"{row}</td><td>–</td>", page_of(sweep))
 
 

@@ -25,10 +25,10 @@ from lavt.experiment.report.sections import (
     difference_parts,
     group_parts,
     head,
-    hop_parts,
     injected_parts,
     route_parts,
     run_parts,
+    stage_parts,
     survival_parts,
 )
 from lavt.experiment.report.sweep_figures import axis_figure
@@ -42,7 +42,7 @@ INJECTED = {"L0": (0, 0), "L1": (75, 0), "L2": (150, 0), "L3": (225, 0), "L4": (
 NEW_OF_CONDITION = (
     "completion_such_roads", "endings", "routes", "p95_common_m", "p95_common_interval", "p95_worst_rank_m",
     "collisions_per_km", "lane_invasions_per_km", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz",
-    "mae_m", "rms_m", "max_m", "picture_age_ms", "age_at_actuation_ms", "hops_ms", "survival",
+    "mae_m", "rms_m", "max_m", "picture_age_ms", "age_at_actuation_ms", "stages_ms", "survival",
 )  # fmt: skip
 """Keys that a summary of an older version lacks."""
 
@@ -56,7 +56,7 @@ def run_of(condition: str, route: str = "a", repetition: int = 0, **changes: Any
         "run": f"{route}_{condition}_{repetition}", "time": "virtual", "fidelity": "geometry", "injection": "model",
         "inherent": "paper_wifi5", "route": route, "condition": condition, "controller": "lane_keeper",
         "preset": "paper_calibrated", "driver": "lane_keeper", "repetition": repetition, "seed": 7 + repetition,
-        "injected_ms": {"video": float(video), "control": float(control)}, "valid": True, "invalid_because": [],
+        "injected_ms": {"video": float(video), "control": float(control)}, "valid": True, "invalid_reasons": [],
         "ending": "completed" if completed else "collision", "distance_m": 100.0 if completed else 50.0,
         "route_length_m": 100.0, "duration_s": 12.0, "p95_m": 0.1, "p95_by_10m": [0.1] * (10 if completed else 5),
         "mae_m": 0.1, "rms_m": 0.1, "max_m": 0.2, "heading_rms_rad": 0.01, "steering_reversals_per_s": 0.2,
@@ -65,7 +65,7 @@ def run_of(condition: str, route: str = "a", repetition: int = 0, **changes: Any
         "loop_ms": {**percentiles, "p5": 60.0, "p50": 72.0 + video + control},
         "tau_v_ms": percentiles, "tau_c_ms": {**percentiles, "p50": 9.0 + control},
         "picture_age_ms": {"mean": 90.0 + video + control, "p95": 120.0}, "age_at_actuation_ms": {**percentiles},
-        "hops_ms": [{"node": "camera", "hop": "encode", "p50": 2.0, "p95": 3.0, "n": 9}],
+        "stages_ms": [{"node": "camera", "stage": "encode", "p50": 2.0, "p95": 3.0, "n": 9}],
     }  # fmt: skip
     return {**run, **changes}
 
@@ -88,7 +88,7 @@ def all_parts(report: ReportContext) -> dict[str, str]:
     parts = {
         "head": head(report), "conditions": conditions_parts(report), "contrasts": contrast_parts(report),
         "differences": difference_parts(report), "injected": injected_parts(report),
-        "degradation": degradation_parts(report), "survival": survival_parts(report), "hops": hop_parts(report, {}),
+        "degradation": degradation_parts(report), "survival": survival_parts(report), "stages": stage_parts(report, {}),
         "groups": group_parts(report), "axes": axis_parts(report), "routes": route_parts(report),
         "runs": run_parts(report),
     }  # fmt: skip
@@ -139,16 +139,16 @@ def test_figures_and_tables_say_of_which_group_they_are(tmp_path: Path) -> None:
     assert "<p>L3 (225 + 0 ms) and L4" in alone["contrasts"]
 
 
-def test_the_bar_of_hops_is_the_loop(tmp_path: Path) -> None:
+def test_the_bar_of_stages_is_the_loop(tmp_path: Path) -> None:
     """What the actuator reports once the command is applied is in the table and in no bar; a rest fills the loop."""
-    hops = [
-        {"node": "camera", "hop": "encode", "p50": 50.0}, {"node": "actuator", "hop": "apply", "p50": 10.0},
-        {"node": "actuator", "hop": "report", "p50": 8.0},
+    stages = [
+        {"node": "camera", "stage": "encode", "p50": 50.0}, {"node": "actuator", "stage": "apply", "p50": 10.0},
+        {"node": "actuator", "stage": "report", "p50": 8.0},
     ]  # fmt: skip
-    report = report_of(summarize([run_of("L0", hops_ms=hops)], None), tmp_path)
-    said = text_of("".join(hop_parts(report, {"virtual": {"L0": 5.0}})))
-    assert ">72 ms</text>" in (tmp_path / "hops_virtual.svg").read_text()
-    with (tmp_path / "tables" / "hops_virtual.csv").open(newline="") as file:
+    report = report_of(summarize([run_of("L0", stages_ms=stages)], None), tmp_path)
+    said = text_of("".join(stage_parts(report, {"virtual": {"L0": 5.0}})))
+    assert ">72 ms</text>" in (tmp_path / "stages_virtual.svg").read_text()
+    with (tmp_path / "tables" / "stages_virtual.csv").open(newline="") as file:
         assert list(csv.reader(file))[1:] == [
             ["camera: capture to stamp, before the loop", "5.0"],
             ["camera: encode", "50.0"],
@@ -162,7 +162,7 @@ def test_the_bar_of_hops_is_the_loop(tmp_path: Path) -> None:
 
 def test_runs_that_failed_are_told_at_the_top(tmp_path: Path) -> None:
     """The summary of a report names the runs that failed and why, and how many they are."""
-    failed = [{"run": "a_L0_00", "because": "the disk is full"}]
+    failed = [{"run": "a_L0_00", "reason": "the disk is full"}]
     said = text_of("".join(head(report_of(summarize(campaign(), None, failed=failed), tmp_path))))
     assert "1 of the runs asked for failed and are in no number of this page: a_L0_00: the disk is full" in said
     assert "failed" not in text_of("".join(head(report_of(summarize(campaign(), None), tmp_path))))
@@ -189,7 +189,7 @@ def test_an_old_summary_has_the_parts_it_can_have(tmp_path: Path) -> None:
                 del condition[key]
     parts = all_parts(report_of(summary, tmp_path))
     assert [name for name, html in parts.items() if not html] == [
-        "contrasts", "differences", "survival", "hops", "groups", "axes", "routes",
+        "contrasts", "differences", "survival", "stages", "groups", "axes", "routes",
     ]  # fmt: skip
     rows = re.findall(r'<tr><td class="text">(L\d)</td>(.*?)</tr>', parts["conditions"])
     assert [name for name, _ in rows] == [*INJECTED] * 3

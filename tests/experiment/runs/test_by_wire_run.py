@@ -34,7 +34,9 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None
     assert (result["ending"], result["valid"]) == ("completed", True)
     assert result["p95_m"] <= 0.22
     assert result["p95_m"] == pytest.approx(without["p95_m"], abs=0.03)
-    (wheel,) = [hop for hop in result["hops_ms"] if (hop["node"], hop["hop"]) == ("vehicle", "command to wheel")]
+    (wheel,) = [
+        stage for stage in result["stages_ms"] if (stage["node"], stage["stage"]) == ("vehicle", "command to wheel")
+    ]
     assert wheel["n"] > 100
     assert 0 < wheel["p50"] < wheel["p95"] < 20, "a frame's time on the bus, the kit's report, and half its period"
 

@@ -41,14 +41,14 @@ def test_two_directories_become_one_run(make_run: MakeRun, tmp_path: Path) -> No
     assert (result["time"], result["injection"], result["inherent"], result["condition"]) == (
         "real", "none", "network", "none",
     )  # fmt: skip
-    assert (result["valid"], result["invalid_because"]) == (True, [])
+    assert (result["valid"], result["invalid_reasons"]) == (True, [])
     config = load_config(RunConfig, tmp_path / "run" / "config.yaml")
     assert (config.vehicle.route, config.video.bit_rate_bps, config.time) == ("b_key", 2_000_000, "real")
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert compute_result(tmp_path / "run", written, None) == written
 
 
-def test_records_of_two_drives_are_refused(make_run: MakeRun, tmp_path: Path) -> None:
+def test_records_of_two_drives_are_rejected(make_run: MakeRun, tmp_path: Path) -> None:
     """Directories in which the client has not seen what the server sent are refused, and nothing is left."""
     server, _ = sides(make_run, tmp_path / "one")
     _, client = sides(make_run, tmp_path / "two", began_s=100.0)
@@ -64,7 +64,7 @@ def test_the_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
     assert load_config(RunConfig, tmp_path / "run" / "config.yaml").video.reorder_hold_ms == 25.0
 
 
-def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+def test_a_client_of_a_later_drive_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
     """A client that has only seen what the server sent after its first drive is refused: that drive was not its own."""
     server, client = sides(make_run, tmp_path)
     seen = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
@@ -79,7 +79,7 @@ def test_a_client_of_a_later_drive_is_refused(make_run: MakeRun, tmp_path: Path)
     assert not (tmp_path / "run").exists()
 
 
-def test_what_is_not_the_directory_of_a_side_is_refused(make_run: MakeRun, tmp_path: Path) -> None:
+def test_what_is_not_the_directory_of_a_side_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
     """A directory without the record or the config of its side is refused with what to name instead."""
     server, client = sides(make_run, tmp_path)
     with pytest.raises(UserError, match="--out of `lavt server`"):

@@ -92,7 +92,7 @@ def test_a_run_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert kernel.commands[-1] == "tc qdisc del dev lo root"
 
 
-def test_a_run_that_is_refused_leaves_what_another_holds(tmp_path: Path) -> None:
+def test_a_run_that_is_rejected_leaves_what_another_holds(tmp_path: Path) -> None:
     """Where another program holds the loopback a run is refused, and that program's queue stays."""
     kernel = Kernel(tmp_path)
     kernel.commands = ["tc qdisc add dev lo root"]
@@ -103,7 +103,7 @@ def test_a_run_that_is_refused_leaves_what_another_holds(tmp_path: Path) -> None
     assert kernel.commands == ["tc qdisc add dev lo root"]
 
 
-def test_what_was_not_done_as_asked_makes_a_run_invalid(tmp_path: Path) -> None:
+def test_what_was_not_done_as_requested_makes_a_run_invalid(tmp_path: Path) -> None:
     """A delay that is 3 ms longer after the drive is said for each flow, held or not, with when it was measured."""
     kernel = Kernel(tmp_path)
     with run_by(kernel, "L1") as netem:

@@ -73,7 +73,7 @@ def test_both_opinions_hold_the_truth(tmp_path: Path) -> None:
     assert delta["ms"] == pytest.approx(250.0, abs=1.0)
     assert delta["drift_ppm"] == pytest.approx(30.0, abs=0.1)
     assert delta["bound_ms"] == result["tau_v_ms"]["bound"] == result["tau_c_ms"]["bound"]
-    assert result["valid"], result["invalid_because"]
+    assert result["valid"], result["invalid_reasons"]
 
 
 def test_the_probe_alone_under_delayed_control(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_the_probe_alone_under_delayed_control(tmp_path: Path) -> None:
     assert (wrong_ms <= bound_ms).all()
     assert bound_ms.max() <= 2.0
     assert result["delta"]["source"] == "probe"
-    assert result["valid"], result["invalid_because"]
+    assert result["valid"], result["invalid_reasons"]
     for name in ("tau_v_ms", "tau_c_ms"):
         assert result[name]["p50"] == pytest.approx(with_sources[name]["p50"], abs=result[name]["bound"])
 
@@ -97,7 +97,7 @@ def test_a_misled_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
         host.clock_source = modelled_clock_source(host.clock, "virtual-client", 0.0375, 0.0001)
 
     _, result, _ = drive_with(tmp_path / "run", change=mislead)
-    (reason,) = result["invalid_because"]
+    (reason,) = result["invalid_reasons"]
     assert "model and the probe disagree" in reason
     assert ": 287." in reason
 
@@ -109,7 +109,7 @@ def test_a_probe_without_answers(tmp_path: Path) -> None:
         loop.runtime.links["probe_reply"].open = False
 
     _, result, _ = drive_with(tmp_path / "run", change=block)
-    (reason,) = result["invalid_because"]
+    (reason,) = result["invalid_reasons"]
     assert reason.startswith("the probe had no answer")
     assert (result["delta"]["probe_ms"], result["delta"]["probe_bound_ms"]) == (None, None)
 
@@ -125,5 +125,5 @@ def test_a_step_is_one_reason(tmp_path: Path, side: str, known: bool) -> None:
         loop.runtime.hosts[side].clock.steps = [(10 * NS_PER_S, NS_PER_S)]
 
     _, result, _ = drive_with(tmp_path / "run", change=step)
-    (reason,) = result["invalid_because"]
+    (reason,) = result["invalid_reasons"]
     assert f"the {side} stepped by +1000.0 ms" in reason

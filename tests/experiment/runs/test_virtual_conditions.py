@@ -54,7 +54,7 @@ def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> Non
     """Without pixels every condition is driven to the goal, validly, and with equal digests when driven again."""
     changes = ("fidelity=geometry", f"network.condition={name}")
     result, again = driven(tmp_path / "run", *changes), driven(tmp_path / "again", *changes)
-    assert (result["ending"], result["valid"], result["invalid_because"]) == ("completed", True, [])
+    assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("completed", True, [])
     assert result["digest"] == again["digest"]
     other = driven(tmp_path / "other", *changes, "seed=2", "vehicle.time_limit_s=2")
     assert other["digest"] != result["digest"]
@@ -107,7 +107,7 @@ def test_a_trace_is_no_constant_and_is_told_by_its_content(tmp_path: Path) -> No
 def test_a_slow_link_is_a_late_picture_and_no_doubt(tmp_path: Path) -> None:
     """A queue that grows to seconds ends the drive by the age of the pictures, and says nothing against the run."""
     result = driven(tmp_path / "run", "network.condition=rate")
-    assert (result["ending"], result["valid"], result["invalid_because"]) == ("safe_stop", True, [])
+    assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("safe_stop", True, [])
     assert result["loop_ms"]["p50"] > 1000
 
 
@@ -147,4 +147,4 @@ def test_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> Non
     assert [result["axes"] for result in results] == [{key: value} for value in values]
     assert len({result["seed"] for result in results}) == 1
     assert len({result["digest"] for result in results}) == len(values)
-    assert all(result["valid"] for result in results), [result["invalid_because"] for result in results]
+    assert all(result["valid"] for result in results), [result["invalid_reasons"] for result in results]

@@ -82,19 +82,19 @@ def test_the_car_keeps_its_lane_without_delay(l0: Path) -> None:
     assert result["ending"] == "completed"
     assert result["p95_m"] < 0.3
     assert result["lane_invasions"] == 0
-    assert result["valid"], result["invalid_because"]
+    assert result["valid"], result["invalid_reasons"]
 
 
 def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
     """What the model delays video and control by: the costs of the hops and the laws of the links."""
     costs = read_costs()
-    asked = injected_network(
+    requested = injected_network(
         run.config.network.inherent, condition(run.config.network.condition), costs, run.seed, state_delay="none"
     )
-    network = virtual_network(asked, costs)
-    hops_us = sum(costs.hops_us.get(node, {}).get(hop, 0.0) for node, hop in STAMP_TO_STAMP)
-    sending_us = costs.hops_us["driver"]["command"]
-    return network.video.constant_ms + hops_us / 1000, network.control.constant_ms + sending_us / 1000
+    network = virtual_network(requested, costs)
+    stages_us = sum(costs.stages_us.get(node, {}).get(stage, 0.0) for node, stage in STAMP_TO_STAMP)
+    sending_us = costs.stages_us["driver"]["command"]
+    return network.video.constant_ms + stages_us / 1000, network.control.constant_ms + sending_us / 1000
 
 
 def test_latencies_are_true_within_the_printed_bound(l0: Path) -> None:
@@ -303,4 +303,4 @@ def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: 
     ]
     result = run_result(config.identity, server, client)
     assert result["ending"] == "completed"
-    assert [each for each in result["invalid_because"] if "stepped" in each]
+    assert [each for each in result["invalid_reasons"] if "stepped" in each]

@@ -128,25 +128,28 @@ def test_rates_by_distance_are_of_all_kilometres() -> None:
 
 def test_means_and_latencies_are_over_the_runs_that_know_them() -> None:
     """Means are over valid runs, latencies and hops medians over runs; what no run knows is null."""
-    hops = [{"node": "camera", "hop": "encode", "p50": 2.0, "p95": 3.0, "n": 9}]
+    stages = [{"node": "camera", "stage": "encode", "p50": 2.0, "p95": 3.0, "n": 9}]
     ages = {"p5": 1.0, "p50": 2.0, "p95": 3.0, "n": 10}
     runs = [
         run(
             mae_m=1.0,
             oscillation_hz=0.4,
-            hops_ms=hops,
+            stages_ms=stages,
             age_at_actuation_ms=ages,
             picture_age_ms={"mean": 90, "p95": 99},
         ),
         run(
-            mae_m=2.0, oscillation_hz=None, hops_ms=[{**hops[0], "p50": 4.0}], age_at_actuation_ms={**ages, "p50": 4.0}
+            mae_m=2.0,
+            oscillation_hz=None,
+            stages_ms=[{**stages[0], "p50": 4.0}],
+            age_at_actuation_ms={**ages, "p50": 4.0},
         ),
         run(mae_m=1.5, age_at_actuation_ms={**ages, "p50": 9.0}),
         run(mae_m=9.0, oscillation_hz=9.0, valid=False),
     ]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["mae_m"], condition["oscillation_hz"], condition["rms_m"]) == (1.5, 0.4, None)
-    assert condition["hops_ms"] == [{"node": "camera", "hop": "encode", "p50": 3.0}]
+    assert condition["stages_ms"] == [{"node": "camera", "stage": "encode", "p50": 3.0}]
     assert condition["age_at_actuation_ms"] == {**ages, "p50": 4.0, "n": 30}
     assert condition["picture_age_ms"] == {"mean": 90.0, "p95": 99.0}
 
@@ -182,7 +185,7 @@ def test_results_of_an_older_version_are_summarised() -> None:
     """What an older result does not say is null or empty, and what it says is there."""
     condition = summarize([run()], SPEED)["conditions"]["L0"]
     assert condition["completion_rate"] == 1.0
-    assert (condition["p95_common_m"], condition["mae_m"], condition["hops_ms"]) == (None, None, [])
+    assert (condition["p95_common_m"], condition["mae_m"], condition["stages_ms"]) == (None, None, [])
     assert condition["age_at_actuation_ms"] == {"p5": None, "p50": None, "p95": None, "n": 0}
     assert condition["survival"]["A"]["distance_m"] == [0.0, 500.0]
 

@@ -18,14 +18,14 @@ CHANGES = ("fidelity=geometry", "conditions=[L0, L1]", "routes=[a_key, b_key]", 
 RUN_KEYS = {
     "route_length_m", "heading_mae_rad", "heading_rms_rad", "heading_p95_rad", "steering_rms_rad",
     "steering_rate_rms_radps", "steering_reversals_per_s", "steering_reversals_per_km", "oscillation_hz",
-    "collisions_per_km", "lane_invasions_per_km", "p95_by_10m", "age_at_actuation_ms", "hops_ms",
+    "collisions_per_km", "lane_invasions_per_km", "p95_by_10m", "age_at_actuation_ms", "stages_ms",
 }  # fmt: skip
 CONDITION_KEYS = {
     "runs", "completed", "completion_rate", "completion_interval", "completion_such_roads", "endings", "routes",
     "collisions_per_run", "lane_invasions_per_run", "collisions_per_km", "lane_invasions_per_km", "p95_m",
     "p95_interval", "p95_common_m", "p95_common_interval", "p95_worst_rank_m", "mae_m", "rms_m", "max_m",
     "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms",
-    "picture_age_ms", "age_at_actuation_ms", "hops_ms", "survival",
+    "picture_age_ms", "age_at_actuation_ms", "stages_ms", "survival",
 }  # fmt: skip
 ROUTE_KEYS = {"runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m"}
 
@@ -54,10 +54,10 @@ def test_every_key_is_there(summary: Any) -> None:
     assert summary["paper"]["conditions"]["L1"]["completed"] == 28
 
 
-def test_the_hops_of_a_driven_run_make_its_loop(summary: Any) -> None:
+def test_the_stages_of_a_driven_run_make_its_loop(summary: Any) -> None:
     """In virtual time, where a hop takes what was asked, medians from stamp to actuator add up to the loop to 3 ms."""
     for run in summary["runs"]:
-        made_ms = sum(hop["p50"] for hop in run["hops_ms"])
+        made_ms = sum(stage["p50"] for stage in run["stages_ms"])
         assert made_ms == pytest.approx(run["loop_ms"]["p50"], abs=3.0)
         assert run["age_at_actuation_ms"]["p50"] >= run["loop_ms"]["p50"]
 

@@ -32,12 +32,12 @@ from lavt.experiment.sweep.workers import Workers, processes
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
 
-def asked(*changes: str) -> SweepConfig:
+def requested(*changes: str) -> SweepConfig:
     return load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, *changes])
 
 
 def two_runs() -> list[PlannedRun]:
-    return plan_sweep(asked())
+    return plan_sweep(requested())
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two runs, driven by two processes."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(asked(), two_runs(), out, jobs=2, tell=lambda _: None)
+    sweep(requested(), two_runs(), out, jobs=2, tell=lambda _: None)
     return out
 
 
@@ -54,7 +54,7 @@ def test_a_sweep_leaves_a_whole_directory(swept: Path) -> None:
     for run in two_runs():
         names = {path.name for path in (swept / "runs" / run.name).iterdir()}
         assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
-    assert load_config(SweepConfig, swept / "sweep.yaml") == asked()
+    assert load_config(SweepConfig, swept / "sweep.yaml") == requested()
     assert (swept / "report" / "index.html").is_file()
     summary = json.loads((swept / "summary.json").read_text())
     assert list(summary["conditions"]) == ["L0", "L3"]
@@ -70,7 +70,7 @@ def resumed(swept: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
     first, second = (swept / "runs" / run.name / RESULT for run in two_runs())
     kept = second.stat().st_mtime_ns
     first.unlink()  # as if it had been killed while driving
-    sweep(asked(), two_runs(), swept, jobs=1, tell=lambda _: None)
+    sweep(requested(), two_runs(), swept, jobs=1, tell=lambda _: None)
     return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == kept
 
 
@@ -88,7 +88,7 @@ def test_the_speed_is_that_of_what_was_driven(
     """Runs that were driven before do not make a resumed sweep faster; where nothing is driven the speed is kept."""
     speed = resumed[1]["speed"]
     assert speed["simulated_s"] == read_json(swept / "runs" / two_runs()[0].name / RESULT)["duration_s"]
-    sweep(asked(), two_runs(), swept, jobs=2, tell=lambda _: None)
+    sweep(requested(), two_runs(), swept, jobs=2, tell=lambda _: None)
     assert read_json(swept / "summary.json")["speed"] == speed
 
 
@@ -112,9 +112,9 @@ def test_a_run_directory_repeats_its_run(swept: Path, tmp_path: Path) -> None:
     assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
 
 
-def test_resuming_with_another_config_is_refused(swept: Path) -> None:
+def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
     """A sweep that was driven with another config is not resumed: its runs would not belong together."""
-    changed, before = asked("seed=2"), (swept / "sweep.yaml").read_bytes()
+    changed, before = requested("seed=2"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
         sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
@@ -123,9 +123,9 @@ def test_resuming_with_another_config_is_refused(swept: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"), [("conditions", "[L1]"), ("repetitions", "2"), ("axes", "{study.block: [1]}")]
 )
-def test_resuming_a_sweep_of_other_runs_is_refused(swept: Path, key: str, value: str) -> None:
+def test_resuming_a_sweep_of_other_runs_is_rejected(swept: Path, key: str, value: str) -> None:
     """Nor one that asks for other runs, or more: the report would hold those that are there already, too."""
-    changed, before = asked(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
+    changed, before = requested(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
         sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
@@ -149,7 +149,7 @@ BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
 @pytest.mark.parametrize(("changes", "base"), BASES, ids=str)
 def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[str, Any], tmp_path: Path) -> None:
     """The base of a sweep is what its config itself says at each axis, wherever that stands among the axis' values."""
-    config = asked(*changes)
+    config = requested(*changes)
     assert base_of(config, plan_sweep(config)) == base
     assert recorded_base(tmp_path) is None
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
@@ -207,7 +207,7 @@ def test_a_sweep_that_is_stopped_while_files_come_in_keeps_no_half_of_a_run(
     monkeypatch.setattr("lavt.experiment.sweep.sweep.cluster", far)
     monkeypatch.setattr("lavt.experiment.sweep.workers.put_files", put_one_and_stop)
     (tmp_path / "runs").mkdir()
-    planned = plan_sweep(asked("fidelity=geometry"))[:1]
+    planned = plan_sweep(requested("fidelity=geometry"))[:1]
     with pytest.raises(KeyboardInterrupt):
         run_all(planned, tmp_path / "runs", jobs=1, tell=lambda _: None, cluster_at="local")
     assert not list(tmp_path.glob("runs/*"))

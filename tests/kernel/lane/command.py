@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 
 from tests.kernel.lane.guests import Guest, prepare, start_guest
 from tests.kernel.lane.packages import fetched
-from tests.kernel.lane.refusal import Refusal
+from tests.kernel.lane.rejection import Refusal
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 HERE = REPOSITORY / "tests" / "kernel"
@@ -51,8 +51,8 @@ def main(arguments: Sequence[str]) -> int:
         compileall.compile_dir(REPOSITORY / "src", quiet=2)  # the machines are slow, and start LAVT a hundred times
         tests = [python, "-B", "-m", "pytest", "-p", "no:cacheprovider", *pytest_arguments(given)]
         return _native(tests) if options.native else _pair(python, tests, out)
-    except Refusal as refusal:
-        print(f"tests/kernel/run: {refusal}", file=sys.stderr)
+    except Refusal as rejection:
+        print(f"tests/kernel/run: {rejection}", file=sys.stderr)
         return 2
 
 
@@ -156,7 +156,7 @@ def _pair(python: str, tests: Sequence[str], writable: Sequence[Path]) -> int:
 @contextmanager
 def _host_stalls(python: str) -> Iterator[tuple[int, int]]:
     """Record this machine's stalls; give what a guest needs to ask for them: where it reads and where it writes."""
-    questions, asked = os.pipe()
+    questions, requested = os.pipe()
     answered, answers = os.pipe()
     recorder = [python, "-B", "-m", "tests.kernel.lane.host_stalls"]
     process = subprocess.Popen(
@@ -165,9 +165,9 @@ def _host_stalls(python: str) -> Iterator[tuple[int, int]]:
     os.close(questions)
     os.close(answers)
     try:
-        yield answered, asked
+        yield answered, requested
     finally:
-        os.close(asked)
+        os.close(requested)
         os.close(answered)
         process.wait()
 

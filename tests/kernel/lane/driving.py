@@ -142,7 +142,7 @@ def collect(loop: Loop, client: Machine, out: Path) -> Drive:
 def reasons_against(driven: Drive) -> list[str]:
     """Reasons against a drive, but those of a machine too slow for it: a user-mode kernel has one processor."""
     slow = ("the physics was", "the camera missed")
-    return [reason for reason in driven.result["invalid_because"] if not reason.startswith(slow)]
+    return [reason for reason in driven.result["invalid_reasons"] if not reason.startswith(slow)]
 
 
 def _start(machine: Machine, command: str, *arguments: str, changes: Sequence[str] = ()) -> Started:

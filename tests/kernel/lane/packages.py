@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.kernel.lane import newer
-from tests.kernel.lane.refusal import Refusal
+from tests.kernel.lane.rejection import Refusal
 
 WANTED = (
     "user-mode-linux",

@@ -173,7 +173,7 @@ def test_any_answer(answer: str) -> None:
         assert each is None or 0 <= each < math.inf
 
 
-def test_one_client_of_chrony_stays_and_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_client_of_chrony_stays_and_is_requested_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One process answers every question, each with all that it said until it found a command that it does not know."""
     (tmp_path / "chronyc").write_text(
         "#!/bin/sh\n"

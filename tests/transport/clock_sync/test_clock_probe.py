@@ -68,7 +68,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_no_reply_is_refused(case: str) -> None:
+def test_what_is_no_reply_is_rejected(case: str) -> None:
     """Anything that is not exactly a reply of this version is refused."""
     with pytest.raises(BadMessage):
         decode_reply(BAD[case])

@@ -72,17 +72,17 @@ class SteppedClock:
 @pytest.mark.parametrize(("took_ns", "in_time"), [(2 * NS_PER_S, True), (2 * NS_PER_S + 1, False)])
 def test_an_answer_may_take_two_seconds(took_ns: int, *, in_time: bool) -> None:
     """An answer within 2 s is parsed with the clocks before and after it; a later one is a missed poll."""
-    asked: list[tuple[Sequence[str], float]] = []
+    requested: list[tuple[Sequence[str], float]] = []
 
     def run(command: Sequence[str], timeout_s: float) -> Completed:
-        asked.append((command, timeout_s))
+        requested.append((command, timeout_s))
         return Completed(0, "answer")
 
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)
 
     report = ask(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
-    assert asked == [(("tool",), 2.0)]
+    assert requested == [(("tool",), 2.0)]
     assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 
 

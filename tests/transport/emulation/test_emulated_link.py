@@ -342,12 +342,12 @@ CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
 @pytest.mark.parametrize(("law", "trace", "said"), CONTRADICTIONS)
 def test_contradictions(law: Impairment, trace: str | None, said: str) -> None:
     """What contradicts itself is refused with the flow's name."""
-    asked = LinkInjection(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
+    requested = LinkInjection(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
     with pytest.raises(UserError, match=rf"^video: .*{said}"):
-        check_injected(asked)
+        check_injected(requested)
 
 
-def test_what_the_kernel_refuses_is_allowed() -> None:
+def test_what_the_kernel_rejects_is_allowed() -> None:
     """Jitter beyond the delay, correlation without jitter, and overtaking what only a trace delays are no nonsense."""
     check_injected(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
     check_injected(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))

@@ -171,7 +171,7 @@ def test_state_does_not_wait(net: Net) -> None:
     assert client.receive() == (b"state", net.at["control"])
 
 
-def test_state_waits_where_asked() -> None:
+def test_state_waits_where_requested() -> None:
     """With a delay of its own the state waits for it, and not for that of control."""
     with closing(Net(state=DelayConfig(constant_ms=VIDEO_MS))) as net:
         client, seen_at = net.connect("control")
@@ -289,9 +289,9 @@ def test_the_relay_does_what_the_link_says(name: str) -> None:
     """Through the relay each packet is lost, or leaves, as the model of the link has it, and that is counted."""
     law = LINKS[name]
     with closing(Net(video=DelayConfig(link=law))) as net:
-        asked = injected("video", law.delay_ms, ImpairmentConfig(**law.model_dump(exclude={"delay_ms"})), 1)
-        assert asked is not None
-        model = EmulatedLink(asked)
+        requested = injected("video", law.delay_ms, ImpairmentConfig(**law.model_dump(exclude={"delay_ms"})), 1)
+        assert requested is not None
+        model = EmulatedLink(requested)
         came = through(net, law, count := 60, 10.0)
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]

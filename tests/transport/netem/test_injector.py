@@ -91,7 +91,7 @@ def test_an_order_is_applied_once_and_measured_whenever_it_comes() -> None:
         queues, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ())
     )
     assert said[0] == InjectionResult(1, "", "", (("video", 150.1),))
-    assert (said[1].number, said[1].because, said[1].measured_ms) == (1, "", (("video", 150.1),))
+    assert (said[1].number, said[1].reason, said[1].measured_ms) == (1, "", (("video", 150.1),))
     assert said[1].doubts.startswith("its jitter has stopped; ")
     assert "NTP: no packet came through" in said[1].doubts
     assert said[2] == InjectionResult(2, "", "", ())
@@ -109,7 +109,7 @@ def test_a_failure_is_told_and_the_next_order_is_done() -> None:
     assert broken.did == ["clear", "clear"]
 
 
-def test_a_condition_that_is_not_as_asked_when_it_is_applied_is_not_in_force() -> None:
+def test_a_condition_that_is_not_as_requested_when_it_is_applied_is_not_in_force() -> None:
     """Where verifying finds otherwise than asked, the order has failed, with what was found."""
     assert ordered(NamedQueues(doubts=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
         InjectionResult(1, "video was late; no filter", "", ())
@@ -135,5 +135,5 @@ def test_of_orders_that_wait_only_the_last_is_done() -> None:
 def test_without_an_interface_only_nothing_can_be_ordered() -> None:
     """Where no interface is configured, a delay is refused with what to do, and none is granted."""
     said = ordered(None, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "L0", (NOTHING,)))
-    assert said[0].because == "no interface is configured for it: set injection.interface"
-    assert said[1].because == ""
+    assert said[0].reason == "no interface is configured for it: set injection.interface"
+    assert said[1].reason == ""

@@ -258,11 +258,11 @@ def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> 
         (Impairment(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
     ],
 )
-def test_what_netem_cannot_do_is_refused(law: Impairment, said: str) -> None:
+def test_what_netem_cannot_do_is_rejected(law: Impairment, said: str) -> None:
     """A law that netem cannot do is refused in one sentence that names the flow."""
-    with pytest.raises(UserError, match=said) as refused:
+    with pytest.raises(UserError, match=said) as rejected:
         check_law("video", law)
-    assert str(refused.value).startswith("video: ")
+    assert str(rejected.value).startswith("video: ")
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_what_netem_cannot_do_is_refused(law: Impairment, said: str) -> None:
         ([], "no flow"),
     ],
 )
-def test_flows_that_must_not_be_held_are_refused(flows: list[ImpairedFlow], said: str) -> None:
+def test_flows_that_must_not_be_held_are_rejected(flows: list[ImpairedFlow], said: str) -> None:
     """A flow on a port of NTP, ssh or the clock probe is refused at either end, as are two with the same packets."""
     with pytest.raises(UserError, match=said):
         check_flows(flows, [ExemptPort("udp", 5602, "the clock probe")])
@@ -288,14 +288,14 @@ class Tc:
 
     def __init__(self, qdiscs: str = FREE, filters_told: str = "") -> None:
         self.qdiscs, self.filters_told, self.told = qdiscs, filters_told, list[str]()
-        self.refuses: Callable[[Command], bool] = lambda _command: False
+        self.rejects: Callable[[Command], bool] = lambda _command: False
 
     def __call__(self, command: Command) -> str:
         """Run a command."""
         if "show" in command:
             return self.filters_told if "filter" in command else self.qdiscs
-        if self.refuses(command):
-            raise WorkError("refused")
+        if self.rejects(command):
+            raise WorkError("rejected")
         self.told.append(" ".join(command))
         return ""
 
@@ -322,16 +322,16 @@ def test_a_change_touches_only_what_differs(tmp_path: Path) -> None:
 def test_a_first_application_that_fails_is_undone(tmp_path: Path) -> None:
     """Where a filter is refused on a free interface, the root is deleted again and nothing is written down."""
     tc = Tc()
-    tc.refuses = lambda command: "filter" in command
+    tc.rejects = lambda command: "filter" in command
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
-    with pytest.raises(WorkError, match="refused"):
+    with pytest.raises(WorkError, match="rejected"):
         netem.apply([VIDEO])
 
     assert tc.told[-1] == "tc qdisc del dev eth0 root"
     assert netem.applied() is None
 
 
-def test_somebody_elses_root_is_refused(tmp_path: Path) -> None:
+def test_somebody_elses_root_is_rejected(tmp_path: Path) -> None:
     """A root with a handle that is not ours is refused, and tc is told nothing."""
     tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
@@ -342,7 +342,7 @@ def test_somebody_elses_root_is_refused(tmp_path: Path) -> None:
     assert tc.told == []
 
 
-def test_what_another_program_owns_is_refused(tmp_path: Path) -> None:
+def test_what_another_program_owns_is_rejected(tmp_path: Path) -> None:
     """A delay that a living process owns, or that was left in place, is not changed by another program of ours."""
     tc = Tc(QDISCS, FILTERS)
     owner = os.getppid(), started(os.getppid())
@@ -452,7 +452,7 @@ def test_flows_are_read_as_they_were_written() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "eth0/1", "-x", "a" * 16, "a b", ".."])
-def test_a_name_that_no_interface_has_is_refused(name: str) -> None:
+def test_a_name_that_no_interface_has_is_rejected(name: str) -> None:
     """An interface's name is up to 15 characters without space and slash, and no option of tc."""
     with pytest.raises(UserError, match="no name of an interface"):
         NetemInterface(name)
@@ -466,7 +466,7 @@ def test_correlated_jitter_needs_somebody_who_stays(tmp_path: Path) -> None:
         )
 
 
-def test_a_wandering_delay_is_correlated_as_asked_and_repeats() -> None:
+def test_a_wandering_delay_is_correlated_as_requested_and_repeats() -> None:
     """Steps of the process have standard deviation 1 and are correlated by 0.9, and the same seed gives the same."""
 
     def walk(seed: int) -> list[float]:
@@ -549,8 +549,8 @@ def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pyte
 
 def test_what_is_probed_beside_the_flows() -> None:
     """Beside L4's flows are probed: challenges, the other directions, NTP, ssh and the clock probe."""
-    asked = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
-    assert [(each.name, each.source, each.destination, each.law.delay_ms) for each in asked] == [
+    requested = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
+    assert [(each.name, each.source, each.destination, each.law.delay_ms) for each in requested] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
         ("video, other direction", 9, 5600, 0),
@@ -626,7 +626,7 @@ JUDGED = {
         (Impairment(150, loss=0.1), "video", ProbeResult(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
     ],
 )
-def test_what_is_measured_otherwise_than_asked_is_said(
+def test_what_is_measured_otherwise_than_requested_is_said(
     law: Impairment, name: str, found: ProbeResult, said: str
 ) -> None:
     """Each quantity that is not as asked is one sentence, and what is as asked is none."""
@@ -655,7 +655,7 @@ def test_what_a_law_may_do_is_no_reason(law: Impairment, found: ProbeResult) -> 
     assert judge([flow], [], {**JUDGED, "video": found}) == []
 
 
-def test_a_refusal_of_tc_is_a_sentence() -> None:
+def test_a_rejection_of_tc_is_a_sentence() -> None:
     """An interface that is not there is said so, whatever tc calls it."""
     with pytest.raises(UserError, match=r"there is no interface nowhere0|no tc"):
         run_tc(["tc", "qdisc", "show", "dev", "nowhere0"])

@@ -219,8 +219,8 @@ def test_the_vehicle_is_not_flooded() -> None:
     forwarder = registered()
     ask(forwarder, SECOND)
     answer(forwarder, SECOND)
-    asked = [ask(forwarder) is not None for _ in range(2 * UPSTREAM_PER_S)]
-    assert sum(asked) == UPSTREAM_PER_S - 1, "SECOND was one of them"
+    requested = [ask(forwarder) is not None for _ in range(2 * UPSTREAM_PER_S)]
+    assert sum(requested) == UPSTREAM_PER_S - 1, "SECOND was one of them"
     told = [ask(forwarder, SECOND) is not None for _ in range(2 * UPSTREAM_PER_S)]
     assert sum(told) == UPSTREAM_PER_S
     assert ask(forwarder, now_ns=T + NS_PER_S) is not None

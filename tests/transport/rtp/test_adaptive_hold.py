@@ -12,12 +12,12 @@ LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * N
 
 
 @pytest.mark.parametrize(
-    ("overtaken_ms", "hold_ms"), [(0, 10), (7, 10), (8, 10), (40, 50), (240, 300), (300, 300), (301, 10)]
+    ("reordered_ms", "hold_ms"), [(0, 10), (7, 10), (8, 10), (40, 50), (240, 300), (300, 300), (301, 10)]
 )
-def test_the_hold(overtaken_ms: int, hold_ms: int) -> None:
+def test_the_hold(reordered_ms: int, hold_ms: int) -> None:
     """A quarter longer than what was seen, within bounds; what is beyond them is not waited for."""
     hold = AdaptiveHold()
-    hold.note(overtaken_ms * NS_PER_MS, 0)
+    hold.note(reordered_ms * NS_PER_MS, 0)
     assert hold.at(NS_PER_S) == hold_ms * NS_PER_MS
 
 
@@ -37,7 +37,7 @@ def test_it_forgets_after_30_to_60_s() -> None:
 def test_it_is_within_bounds(notes: list[tuple[int, int]]) -> None:
     """Whatever is seen when."""
     hold, now_ns = AdaptiveHold(), 0
-    for pause_ns, overtaken_ns in notes:
+    for pause_ns, reordered_ns in notes:
         now_ns += pause_ns
-        hold.note(overtaken_ns, now_ns)
+        hold.note(reordered_ns, now_ns)
         assert LEAST_HOLD_NS <= hold.at(now_ns) <= MOST_HOLD_NS

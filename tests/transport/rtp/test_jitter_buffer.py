@@ -348,7 +348,7 @@ def test_nobody_waits_for_ever() -> None:
     assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS + 1) == LEAST_HOLD_NS
 
 
-def test_a_loss_does_not_make_what_was_only_swapped_long_overtaken() -> None:
+def test_a_loss_does_not_make_what_was_only_swapped_long_reordered() -> None:
     """While a lost packet is waited for, others swap places behind it: each was overtaken by that much only."""
     buffer = started(hold_ns=None)
     now_ns = STARTED_NS

@@ -137,7 +137,7 @@ def test_reordered_late_and_duplicate() -> None:
 FATES = {
     "arrives": [("arrive", 0)],
     "twice": [("arrive", 0), ("arrive", 2)],
-    "overtaken": [("arrive", 5)],
+    "reordered": [("arrive", 5)],
     "late": [("arrive", 40)],
     "lost": [],
     "made again": [("recover", 3)],

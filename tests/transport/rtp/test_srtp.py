@@ -24,7 +24,7 @@ def packet(sequence: int, payload: bytes = b"picture", ssrc: int = MEDIA_SSRC) -
 
 
 def counters(unprotector: Unprotector) -> tuple[int, int]:
-    return unprotector.refused, unprotector.replayed
+    return unprotector.rejected, unprotector.replayed
 
 
 @given(

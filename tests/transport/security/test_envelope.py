@@ -54,15 +54,15 @@ class Pair:
 
     def request(self, operation: str = "hold", number: int = 0) -> bytes:
         request = SessionRequest(operation, self.who, 5, number)  # type: ignore[arg-type]
-        return self.operator.seal_request("session", encode(request))
+        return self.operator.sign_request("session", encode(request))
 
     def ask(self, data: bytes, reply: SessionReply = GRANTED) -> tuple[bytes, bytes | None]:
         """Let the vehicle take a request: its reply's bytes, and what the operator reads in it."""
         request = self.vehicle.open_request("session", data)
         assert request is not None
-        sealed = self.vehicle.seal_reply(request, b"" if request.is_stale else encode(reply))
-        opened = self.operator.open_reply("session", sealed)
-        return sealed, opened.again if request.is_stale else opened.body
+        signed = self.vehicle.sign_reply(request, b"" if request.is_stale else encode(reply))
+        opened = self.operator.open_reply("session", signed)
+        return signed, opened.again if request.is_stale else opened.body
 
     def hold(self) -> None:
         _, again = self.ask(self.request())
@@ -71,7 +71,7 @@ class Pair:
         assert body == encode(GRANTED)
 
     def command(self, command: Command = COMMAND) -> bytes:
-        return self.operator.seal_command(encode(command))
+        return self.operator.sign_command(encode(command))
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def pair() -> Pair:
     return Pair()
 
 
-def test_the_first_request_is_asked_again_and_then_granted(pair: Pair) -> None:
+def test_the_first_request_is_requested_again_and_then_granted(pair: Pair) -> None:
     """A server that has just started takes no request but with a place of its own, which its reply tells."""
     request = pair.vehicle.open_request("session", pair.request())
     assert request is not None
@@ -87,18 +87,18 @@ def test_the_first_request_is_asked_again_and_then_granted(pair: Pair) -> None:
     pair.hold()
 
 
-def test_a_command_of_the_holder_is_opened(pair: Pair) -> None:
+def test_a_command_of_the_active_operator_is_opened(pair: Pair) -> None:
     """What the holder has signed comes out as it went in, and its code says cheaply that it is the holder's."""
     pair.hold()
-    assert pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.is_from_active_operator(pair.command())
     assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
 
 
-def test_nobody_but_the_holder_commands(pair: Pair) -> None:
+def test_nobody_but_the_active_operator_commands(pair: Pair) -> None:
     """Another operator's command is refused, though his key is known; so is that of a key nobody knows."""
     pair.hold()
     for other in (Pair("bob", BOB), Pair("alice", MALLORY)):
-        assert not pair.vehicle.is_from_holder(other.command())
+        assert not pair.vehicle.is_from_active_operator(other.command())
         assert pair.vehicle.open_command(other.command()) is None
     assert pair.vehicle.counts["commands_forged"] == 2
 
@@ -109,34 +109,34 @@ def test_any_operator_stops_the_vehicle(pair: Pair) -> None:
     stop = replace(COMMAND, emergency_stop=9)
     assert pair.vehicle.open_command(Pair("bob", BOB).command(stop)) == encode(stop)
     assert pair.vehicle.open_command(Pair("bob", MALLORY).command(stop)) is None
-    assert pair.vehicle.open_command(Pair("bob", BOB).operator.seal_command(b"garbage")) is None
+    assert pair.vehicle.open_command(Pair("bob", BOB).operator.sign_command(b"garbage")) is None
 
 
 def test_before_a_session_no_command_has_a_valid_code(pair: Pair) -> None:
     """Before there is a session its codes are zeros, and the vehicle accepts no zeros as a code."""
     assert pair.command()[-TRAILER_BYTES:-64] == bytes(16)
-    assert not pair.vehicle.is_from_holder(pair.command())
-    assert not pair.vehicle.is_next_of_holder("session", pair.request())
-    assert not pair.operator.is_next_state(pair.vehicle.seal_state(b"state"))
+    assert not pair.vehicle.is_from_active_operator(pair.command())
+    assert not pair.vehicle.is_next_of_active_operator("session", pair.request())
+    assert not pair.operator.is_next_state(pair.vehicle.sign_state(b"state"))
 
 
 def test_after_a_release_nobody_commands(pair: Pair) -> None:
     """When the holder has released the vehicle his commands are no longer his to give."""
     pair.hold()
     pair.ask(pair.request("release"), SessionReply(True, "", 0, b"", 5600, "kernel", 0))
-    assert not pair.vehicle.is_from_holder(pair.command())
+    assert not pair.vehicle.is_from_active_operator(pair.command())
     assert pair.vehicle.open_command(pair.command()) is None
 
 
-def test_an_altered_command_is_refused(pair: Pair) -> None:
+def test_an_altered_command_is_rejected(pair: Pair) -> None:
     """A change of any byte of a command, its code or its signature makes it a forgery; the code shows it cheaply."""
     pair.hold()
-    sealed = pair.command()
-    for at in range(len(sealed)):
-        altered = sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :]
-        within = at < len(sealed) - 64
-        assert not (within and pair.vehicle.is_from_holder(altered))
-        in_the_code = len(sealed) - 80 <= at < len(sealed) - 64
+    signed = pair.command()
+    for at in range(len(signed)):
+        altered = signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]
+        within = at < len(signed) - 64
+        assert not (within and pair.vehicle.is_from_active_operator(altered))
+        in_the_code = len(signed) - 80 <= at < len(signed) - 64
         assert (pair.vehicle.open_command(altered) is None) != in_the_code
 
 
@@ -144,22 +144,22 @@ def test_the_code_of_one_kind_serves_for_no_other(pair: Pair) -> None:
     """What the holder has sent as one kind of message is cheaply told from another, as is the next from one before."""
     pair.hold()
     request = pair.request()
-    assert pair.vehicle.is_next_of_holder("session", request)
-    assert not pair.vehicle.is_next_of_holder("netem", request)
-    assert not pair.vehicle.is_from_holder(request)
+    assert pair.vehicle.is_next_of_active_operator("session", request)
+    assert not pair.vehicle.is_next_of_active_operator("netem", request)
+    assert not pair.vehicle.is_from_active_operator(request)
     pair.ask(request)
-    assert not pair.vehicle.is_next_of_holder("session", request)
-    state = pair.vehicle.seal_state(b"state")
+    assert not pair.vehicle.is_next_of_active_operator("session", request)
+    state = pair.vehicle.sign_state(b"state")
     assert pair.operator.is_next_state(state)
     assert pair.operator.open_state(state).body == b"state"
     assert not pair.operator.is_next_state(state)
 
 
-def test_a_command_for_another_vehicle_is_refused(pair: Pair) -> None:
+def test_a_command_for_another_vehicle_is_rejected(pair: Pair) -> None:
     """A signature serves for one vehicle only."""
     pair.hold()
     elsewhere = OperatorAuthenticator("truck", "alice", ALICE, VEHICLE.public)
-    assert pair.vehicle.open_command(elsewhere.seal_command(encode(COMMAND))) is None
+    assert pair.vehicle.open_command(elsewhere.sign_command(encode(COMMAND))) is None
 
 
 def test_a_replayed_request_is_not_looked_at(pair: Pair) -> None:
@@ -182,7 +182,7 @@ def test_a_request_to_another_process_of_the_server_is_not_looked_at(pair: Pair)
     assert anew.is_stale
 
 
-def test_an_emergency_stop_is_not_asked_twice(pair: Pair) -> None:
+def test_an_emergency_stop_is_not_requested_twice(pair: Pair) -> None:
     """An emergency stop counts at once, whatever its place: its own number refuses a replay."""
     request = pair.vehicle.open_request("session", pair.request("emergency_stop", 7))
     assert request is not None
@@ -193,13 +193,13 @@ def test_a_request_without_a_body_only_asks_for_the_place(pair: Pair) -> None:
     """An empty request is never decided on, though its place is the next, and is not counted as a replay."""
     pair.hold()
     before = pair.vehicle.counts["session_requests_of_another_time"]
-    request = pair.vehicle.open_request("session", pair.operator.seal_request("session", b""))
+    request = pair.vehicle.open_request("session", pair.operator.sign_request("session", b""))
     assert request is not None
     assert request.is_stale
     assert pair.vehicle.counts["session_requests_of_another_time"] == before
 
 
-def test_a_request_with_an_impossible_key_is_refused(pair: Pair) -> None:
+def test_a_request_with_an_impossible_key_is_rejected(pair: Pair) -> None:
     """A request whose X25519 key gives no secret is counted as a forgery, whoever has signed it."""
     pair.operator._agreement.public = bytes(32)
     assert pair.vehicle.open_request("session", pair.request()) is None
@@ -210,56 +210,56 @@ def test_a_reply_without_a_token_leaves_the_codes_as_they_are(pair: Pair) -> Non
     """A request that is granted without a token, as an emergency stop is, does not end the holder's session."""
     pair.hold()
     pair.ask(pair.request("emergency_stop", 7), SessionReply(True, "", 0, b"", 5600, "kernel", 7))
-    assert pair.vehicle.is_from_holder(pair.command())
+    assert pair.vehicle.is_from_active_operator(pair.command())
     assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
 
 
-def test_a_request_in_another_name_is_refused(pair: Pair) -> None:
+def test_a_request_in_another_name_is_rejected(pair: Pair) -> None:
     """Nobody asks in the name of another operator, nor without a name that is known."""
     for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
         assert pair.vehicle.open_request("session", Pair(name, key).request()) is None
-    forged = pair.operator.seal_request("session", encode(SessionRequest("hold", "bob", 5, 0)))
+    forged = pair.operator.sign_request("session", encode(SessionRequest("hold", "bob", 5, 0)))
     assert pair.vehicle.open_request("session", forged) is None
     assert pair.vehicle.counts["session_requests_forged"] == 4
 
 
 @pytest.mark.parametrize("channel", ["session", "netem"])
-def test_a_signed_request_that_is_no_message_is_refused(pair: Pair, channel: str) -> None:
+def test_a_signed_request_that_is_no_message_is_rejected(pair: Pair, channel: str) -> None:
     """A request that an operator has signed, but that cannot be decoded, is counted and raises nothing."""
     pair.hold()
-    assert pair.vehicle.open_request(channel, pair.operator.seal_request(channel, b"garbage")) is None
+    assert pair.vehicle.open_request(channel, pair.operator.sign_request(channel, b"garbage")) is None
     assert pair.vehicle.counts[f"{channel}_requests_forged"] == 1
 
 
-def test_the_token_is_read_by_who_asked_only(pair: Pair) -> None:
+def test_the_token_is_read_by_who_requested_only(pair: Pair) -> None:
     """A reply holds the token encrypted, for whoever has asked and nobody else."""
     _, again = pair.ask(pair.request())
     assert again is not None
-    sealed, _ = pair.ask(again)
-    assert TOKEN not in sealed
-    assert Pair().operator.open_reply("session", sealed).body is None
+    signed, _ = pair.ask(again)
+    assert TOKEN not in signed
+    assert Pair().operator.open_reply("session", signed).body is None
 
 
 def test_a_reply_counts_once(pair: Pair) -> None:
     """A reply of the vehicle is taken once; one to no request of ours, altered or of another vehicle never."""
     pair.hold()
-    sealed, body = pair.ask(pair.request())
+    signed, body = pair.ask(pair.request())
     assert body is not None
-    assert pair.operator.open_reply("session", sealed).body is None
+    assert pair.operator.open_reply("session", signed).body is None
     data = pair.request()
     request = pair.vehicle.open_request("session", data)
     assert request is not None
-    sealed = pair.vehicle.seal_reply(request, encode(GRANTED))
-    for at in range(len(sealed)):
+    signed = pair.vehicle.sign_reply(request, encode(GRANTED))
+    for at in range(len(signed)):
         assert (
-            pair.operator.open_reply("session", sealed[:at] + bytes([sealed[at] ^ 1]) + sealed[at + 1 :]).body is None
+            pair.operator.open_reply("session", signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]).body is None
         )
     other = VehicleAuthenticator("car", MALLORY, OPERATORS)
-    asked = other.open_request("session", data)
-    assert asked is not None
-    assert pair.operator.open_reply("session", other.seal_reply(asked, b"")).again is None
-    assert pair.operator.open_reply("netem", sealed).body is None
-    assert pair.operator.open_reply("session", sealed).body == encode(GRANTED)
+    requested = other.open_request("session", data)
+    assert requested is not None
+    assert pair.operator.open_reply("session", other.sign_reply(requested, b"")).again is None
+    assert pair.operator.open_reply("netem", signed).body is None
+    assert pair.operator.open_reply("session", signed).body == encode(GRANTED)
 
 
 @pytest.mark.parametrize("changes", [{"secret": bytes(32)}, {"public": bytes(32)}], ids=["secret", "key"])
@@ -268,10 +268,10 @@ def test_a_reply_that_cannot_be_decrypted_is_a_forgery(pair: Pair, changes: dict
     pair.hold()
     request = pair.vehicle.open_request("session", pair.request())
     assert request is not None
-    unreadable = pair.vehicle.seal_reply(replace(request, **changes), encode(GRANTED))
+    unreadable = pair.vehicle.sign_reply(replace(request, **changes), encode(GRANTED))
     assert pair.operator.open_reply("session", unreadable) == VerifiedReply(None, None)
     assert pair.operator.counts["session_replies_forged"] == 1
-    assert pair.operator.open_reply("session", pair.vehicle.seal_reply(request, encode(GRANTED))).body is not None
+    assert pair.operator.open_reply("session", pair.vehicle.sign_reply(request, encode(GRANTED))).body is not None
 
 
 def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
@@ -281,7 +281,7 @@ def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
     for number in range(2):
         request = pair.vehicle.open_request("session", pair.request("hold", number))
         assert request is not None
-        replies.append(pair.vehicle.seal_reply(request, b"" if request.is_stale else encode(GRANTED)))
+        replies.append(pair.vehicle.sign_reply(request, b"" if request.is_stale else encode(GRANTED)))
     assert pair.operator.open_reply("session", replies[1]).again is not None
     assert pair.operator.open_reply("session", replies[0]) == VerifiedReply(None, None)
     assert pair.operator.open_reply("session", replies[1]) == VerifiedReply(None, None)
@@ -290,7 +290,7 @@ def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
 def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
     """A state is shown once, in order, and only where the vehicle has signed it; any other causes no query."""
     pair.hold()
-    first, second = pair.vehicle.seal_state(b"first"), pair.vehicle.seal_state(b"second")
+    first, second = pair.vehicle.sign_state(b"first"), pair.vehicle.sign_state(b"second")
     assert pair.operator.open_state(second).body == b"second"
     for old in (second, first):
         assert pair.operator.open_state(old) == VerifiedState(None, ask=False)
@@ -298,14 +298,14 @@ def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
     forged = VehicleAuthenticator("car", MALLORY, OPERATORS)
     forged._instance = pair.vehicle._instance
     forged._states = 100
-    assert pair.operator.open_state(forged.seal_state(b"forged")) == VerifiedState(None, ask=False)
+    assert pair.operator.open_state(forged.sign_state(b"forged")) == VerifiedState(None, ask=False)
     assert pair.operator.counts["states_forged"] == 1
 
 
 def test_a_reply_makes_no_old_state_new(pair: Pair) -> None:
     """After a reply of the same process of the server, states from before are still replays."""
     pair.hold()
-    state = pair.vehicle.seal_state(b"state")
+    state = pair.vehicle.sign_state(b"state")
     assert pair.operator.open_state(state).body == b"state"
     pair.ask(pair.request())
     assert not pair.operator.is_next_state(state)
@@ -317,13 +317,13 @@ def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pa
     """A state of a server's process that has not answered a request may be a recorded one: it is asked first."""
     pair.hold()
     anew = VehicleAuthenticator("car", VEHICLE, OPERATORS)
-    opened = pair.operator.open_state(anew.seal_state(b"new"))
+    opened = pair.operator.open_state(anew.sign_state(b"new"))
     assert opened.body is None
     assert opened.ask
     assert pair.operator.counts["states_of_another_time"] == 1
     pair.vehicle = anew
-    pair.ask(pair.operator.seal_request("session", b""))
-    assert pair.operator.open_state(anew.seal_state(b"newer")).body == b"newer"
+    pair.ask(pair.operator.sign_request("session", b""))
+    assert pair.operator.open_state(anew.sign_state(b"newer")).body == b"newer"
 
 
 def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
@@ -331,13 +331,13 @@ def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
     pair.hold()
     session = pair.request()
     netem = encode(NetemRequest("alice", 5, "L4", 0, 0.0, 0.0, 0.0, "uniform", 0.0, 1.0, 0, 0.0, 0.0))
-    asked = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", netem))
-    assert asked is not None
-    again = pair.operator.open_reply("netem", pair.vehicle.seal_reply(asked, b"")).again
+    requested = pair.vehicle.open_request("netem", pair.operator.sign_request("netem", netem))
+    assert requested is not None
+    again = pair.operator.open_reply("netem", pair.vehicle.sign_reply(requested, b"")).again
     assert again is not None
-    asked = pair.vehicle.open_request("netem", again)
-    assert asked is not None
-    reply = pair.operator.open_reply("netem", pair.vehicle.seal_reply(asked, encode(NetemReply(True, ""))))
+    requested = pair.vehicle.open_request("netem", again)
+    assert requested is not None
+    reply = pair.operator.open_reply("netem", pair.vehicle.sign_reply(requested, encode(NetemReply(True, ""))))
     assert decode(NetemReply, reply.body or b"").granted
     request = pair.vehicle.open_request("session", session)
     assert request is not None
@@ -347,13 +347,13 @@ def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
 def test_requests_without_replies_are_bounded(pair: Pair) -> None:
     """Of requests that wait for a reply only the newest are kept: their replies are accepted, those before are not."""
     pair.hold()
-    requests = [pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))]
+    requests = [pair.vehicle.open_request("netem", pair.operator.sign_request("netem", b""))]
     requests += [pair.vehicle.open_request("session", pair.request("hold", number)) for number in range(3 * KEPT)]
-    assert len(pair.operator._asked) == KEPT
-    replies = [pair.vehicle.seal_reply(request, encode(GRANTED)) for request in requests if request is not None]
+    assert len(pair.operator._requested) == KEPT
+    replies = [pair.vehicle.sign_reply(request, encode(GRANTED)) for request in requests if request is not None]
     assert pair.operator.open_reply("netem", replies[0]) == VerifiedReply(None, None)
     assert pair.operator.open_reply("session", replies[-KEPT - 1]) == VerifiedReply(None, None)
-    assert len(pair.operator._asked) == KEPT
+    assert len(pair.operator._requested) == KEPT
     assert pair.operator.open_reply("session", replies[-KEPT]) != VerifiedReply(None, None)
 
 
@@ -376,32 +376,32 @@ def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted:
     """An envelope of the largest size is opened; one that is a byte longer is a forgery, whoever has signed it."""
     pair.hold()
     command = bytes(LONGEST_BYTES - TRAILER_BYTES + more_bytes)
-    sealed = pair.operator.seal_command(command)
-    assert len(sealed) == LONGEST_BYTES + more_bytes
-    assert pair.vehicle.body(sealed) == (command if accepted else b"")
-    assert pair.vehicle.is_from_holder(sealed) == accepted
-    assert pair.vehicle.open_command(sealed) == (command if accepted else None)
+    signed = pair.operator.sign_command(command)
+    assert len(signed) == LONGEST_BYTES + more_bytes
+    assert pair.vehicle.body(signed) == (command if accepted else b"")
+    assert pair.vehicle.is_from_active_operator(signed) == accepted
+    assert pair.vehicle.open_command(signed) == (command if accepted else None)
     state = bytes(LONGEST_BYTES - TRAILER_BYTES - 16 + more_bytes)
-    sealed = pair.vehicle.seal_state(state)
-    assert pair.operator.is_next_state(sealed) == accepted
-    assert pair.operator.open_state(sealed).body == (state if accepted else None)
-    request = pair.vehicle.open_request("netem", pair.operator.seal_request("netem", b""))
+    signed = pair.vehicle.sign_state(state)
+    assert pair.operator.is_next_state(signed) == accepted
+    assert pair.operator.open_state(signed).body == (state if accepted else None)
+    request = pair.vehicle.open_request("netem", pair.operator.sign_request("netem", b""))
     assert request is not None
-    reply = bytes(LONGEST_BYTES - len(pair.vehicle.seal_reply(request, b"")) + more_bytes)
+    reply = bytes(LONGEST_BYTES - len(pair.vehicle.sign_reply(request, b"")) + more_bytes)
     fresh = replace(request, is_stale=False)
-    assert pair.operator.open_reply("netem", pair.vehicle.seal_reply(fresh, reply)).body == (
+    assert pair.operator.open_reply("netem", pair.vehicle.sign_reply(fresh, reply)).body == (
         reply if accepted else None
     )
-    refused = 0 if accepted else 1
-    assert pair.vehicle.counts["commands_forged"] == refused
-    assert pair.operator.counts == Counter(states_forged=refused, netem_replies_forged=refused)
+    rejected = 0 if accepted else 1
+    assert pair.vehicle.counts["commands_forged"] == rejected
+    assert pair.operator.counts == Counter(states_forged=rejected, netem_replies_forged=rejected)
 
 
 @given(st.binary(max_size=1400))
 def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
     """Whatever comes in at any of the openings is refused without an error."""
     pair = Pair()
-    assert not pair.vehicle.is_from_holder(data)
+    assert not pair.vehicle.is_from_active_operator(data)
     assert pair.vehicle.open_command(data) is None
     assert pair.vehicle.open_request("session", data) is None
     assert pair.vehicle.open_request("netem", data) is None
@@ -411,9 +411,14 @@ def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
 
 def test_without_keys_everything_is_as_it_is() -> None:
     """Where nothing is signed, bytes go in and out unchanged."""
-    seal = NoVehicleAuthenticator()
-    request = seal.open_request("session", b"request")
+    authenticator = NoVehicleAuthenticator()
+    request = authenticator.open_request("session", b"request")
     assert request is not None
-    assert {seal.body(b"x"), seal.open_command(b"x"), seal.seal_state(b"x"), seal.seal_reply(request, b"x")} == {b"x"}
+    assert {
+        authenticator.body(b"x"),
+        authenticator.open_command(b"x"),
+        authenticator.sign_state(b"x"),
+        authenticator.sign_reply(request, b"x"),
+    } == {b"x"}
     assert request.body == b"request"
-    assert seal.is_from_holder(b"x")
+    assert authenticator.is_from_active_operator(b"x")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_S, PATH_POINTS, Command
 from lavt.streams import stream
 from lavt.transport.messages import VERSION, encode
-from lavt.transport.security.flood_filter import FloodFilter, RateLimiter, may_be_obeyed
+from lavt.transport.security.flood_filter import FloodFilter, RateLimiter, may_be_accepted
 
 OTHERS_PER_S = 200
 """The limit that docs/wire.md states."""
@@ -24,13 +24,13 @@ def new_screen() -> FloodFilter:
     return FloodFilter(lambda: (EPOCH, SEQUENCE), lambda data: data.endswith(b"\0"))
 
 
-def passed(screen: FloodFilter, bodies: list[bytes], *, from_holder: bool = True) -> int:
+def passed(screen: FloodFilter, bodies: list[bytes], *, from_active_operator: bool = True) -> int:
     """Tell how many of `bodies`, which come within one second, go on."""
-    end = b"\0" if from_holder else b"\1"
+    end = b"\0" if from_active_operator else b"\1"
     return sum(screen.passes(body + end, body, number * NS_PER_S // len(bodies)) for number, body in enumerate(bodies))
 
 
-def test_what_may_be_obeyed_always_goes_on() -> None:
+def test_what_may_be_accepted_always_goes_on() -> None:
     """Commands of the epoch in force, newer than the last, go on however many they are."""
     commands = [encode(replace(COMMAND, sequence=SEQUENCE + 1 + number)) for number in range(FLOOD_PER_S)]
     screen = new_screen()
@@ -90,7 +90,7 @@ def test_what_is_not_the_holders_cannot_hide_what_is() -> None:
     """A flood of strangers, who copy epoch and sequence, leaves the holder's own commands alone, old ones too."""
     screen = new_screen()
     flood = [encode(replace(COMMAND, sequence=SEQUENCE + number)) for number in range(FLOOD_PER_S)]
-    assert passed(screen, flood, from_holder=False) == OTHERS_PER_S
+    assert passed(screen, flood, from_active_operator=False) == OTHERS_PER_S
     assert passed(screen, [encode(replace(COMMAND, epoch=7))] * 50) == 50
 
 
@@ -104,9 +104,9 @@ def test_the_budget_is_for_each_second() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_may_not_be_obeyed(data: bytes) -> None:
+def test_any_bytes_may_not_be_accepted(data: bytes) -> None:
     """What is not a command is not taken for one, and raises nothing."""
-    assert not may_be_obeyed(data, EPOCH, SEQUENCE)
+    assert not may_be_accepted(data, EPOCH, SEQUENCE)
 
 
 @pytest.mark.parametrize(
@@ -120,22 +120,22 @@ def test_any_bytes_may_not_be_obeyed(data: bytes) -> None:
         {VERSION: EPOCH, SEQUENCE + 1: 0},
     ],
 )
-def test_another_head_may_not_be_obeyed(head: object) -> None:
+def test_another_head_may_not_be_accepted(head: object) -> None:
     """A message of another version, or with other than whole numbers at its beginning, is not taken for a command."""
-    assert may_be_obeyed(msgpack.packb([VERSION, EPOCH, SEQUENCE + 1]), EPOCH, SEQUENCE)
-    assert not may_be_obeyed(msgpack.packb(head), EPOCH, SEQUENCE)
+    assert may_be_accepted(msgpack.packb([VERSION, EPOCH, SEQUENCE + 1]), EPOCH, SEQUENCE)
+    assert not may_be_accepted(msgpack.packb(head), EPOCH, SEQUENCE)
 
 
 @pytest.mark.parametrize(("size", "may_be"), [(1024, True), (1025, False)])
 def test_a_command_has_a_largest_size(size: int, *, may_be: bool) -> None:
     """A command of the largest size of a message is looked at, and one that is a byte longer is not."""
-    assert may_be_obeyed(encode(COMMAND).ljust(size, b"\0"), EPOCH, SEQUENCE) == may_be
+    assert may_be_accepted(encode(COMMAND).ljust(size, b"\0"), EPOCH, SEQUENCE) == may_be
 
 
 @given(st.integers(0, 2**64 - 1), st.integers(0, 2**63 - 1))
 def test_the_head_of_any_command_is_read(epoch: int, sequence: int) -> None:
     """Epoch and sequence of any size are found at the beginning of a command."""
     body = encode(replace(COMMAND, epoch=epoch, sequence=sequence))
-    assert may_be_obeyed(body, epoch, sequence - 1)
-    assert not may_be_obeyed(body, epoch, sequence)
-    assert not may_be_obeyed(body, epoch ^ 1, sequence - 1)
+    assert may_be_accepted(body, epoch, sequence - 1)
+    assert not may_be_accepted(body, epoch, sequence)
+    assert not may_be_accepted(body, epoch ^ 1, sequence - 1)

@@ -52,8 +52,8 @@ class Both:
         """Carry everything that is outside, and what that leads to."""
         while self.outside:
             send = self.outside.pop(0)
-            door = self.desk if send.channel in ("state", "session_reply", "netem_reply") else self.car
-            door.let_in(send.channel, send.payload, Now(mono_ns, 0), send.peer or "query")
+            gateway = self.desk if send.channel in ("state", "session_reply", "netem_reply") else self.car
+            gateway.receive(send.channel, send.payload, Now(mono_ns, 0), send.peer or "query")
 
     def hold(self) -> None:
         """Get the vehicle for the one at the desk."""
@@ -100,15 +100,15 @@ def test_a_replayed_message_does_not_get_in(both: Both) -> None:
     assert both.desk.counts["states_replayed"] == 1
 
 
-def test_a_command_that_the_vehicle_refused_is_no_flood(both: Both) -> None:
+def test_a_command_that_the_vehicle_rejected_is_no_flood(both: Both) -> None:
     """Sent again by somebody ten thousand times it gets in as seldom as an old one, and what the holder says next does.
 
     The vehicle does not count a command that it refused, so its sequence stays newer than that of the last one obeyed.
     """
     both.desk.send(Send("control", COMMAND))
-    refused, before = both.outside.pop().payload, len(both.in_the_car)
+    rejected, before = both.outside.pop().payload, len(both.in_the_car)
     for _ in range(10_000):
-        both.car.let_in("control", refused, Now(2 * NS_PER_S, 0), None)
+        both.car.receive("control", rejected, Now(2 * NS_PER_S, 0), None)
     assert len(both.in_the_car) - before == 1 + OTHERS_PER_S
     both.desk.send(Send("control", NEXT_COMMAND))
     both.carry(2 * NS_PER_S)
@@ -121,41 +121,42 @@ def test_a_command_under_a_broken_signature_hides_no_true_one(both: Both) -> Non
         both.desk.send(Send("control", command))
     first, following = (both.outside.pop(0).payload for _ in range(2))
     inside = len(both.in_the_car)
-    both.car.let_in("control", following[:-1] + bytes([following[-1] ^ 1]), Now(0, 0), None)
+    both.car.receive("control", following[:-1] + bytes([following[-1] ^ 1]), Now(0, 0), None)
     for _ in range(1000):  # nothing is left of what old commands may take
-        both.car.let_in("control", first, Now(0, 0), None)
-    both.car.let_in("control", following, Now(0, 0), None)
+        both.car.receive("control", first, Now(0, 0), None)
+    both.car.receive("control", following, Now(0, 0), None)
     assert len(both.in_the_car) - inside == 1 + OTHERS_PER_S + 1
     assert both.in_the_car[-1] == ("control", NEXT_COMMAND, None)
 
 
-def test_a_server_started_anew_is_asked_once_a_second(both: Both) -> None:
+def test_a_server_started_anew_is_requested_once_a_second(both: Both) -> None:
     """States of an unknown process of the server are not shown before it has answered, and do not cause a flood."""
     anew = Both()
     anew.desk, both.desk = both.desk, anew.desk
-    anew.car._seal._key, anew.car._seal._operators = both.car._seal._key, both.car._seal._operators  # type: ignore[attr-defined]
-    asked, times = [], []
+    ours, theirs = vars(anew.car._authenticator), vars(both.car._authenticator)
+    ours["_key"], ours["_operators"] = theirs["_key"], theirs["_operators"]
+    requested, times = [], []
     for number in range(100):
         anew.car.send(Send("state", b"state"))
         state = anew.outside.pop()
         both.outside.clear()
-        anew.desk.let_in("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
-        asked += both.outside
+        anew.desk.receive("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
+        requested += both.outside
         times += [number] * len(both.outside)
-    assert [each.channel for each in asked] == ["session", "session"]
+    assert [each.channel for each in requested] == ["session", "session"]
     assert times == [0, 50]
     assert ("state", b"state") not in both.at_the_desk
-    anew.car.let_in("session", asked[-1].payload, Now(0, 0), "query")
-    anew.desk.let_in("session_reply", anew.outside.pop().payload, Now(0, 0), None)
+    anew.car.receive("session", requested[-1].payload, Now(0, 0), "query")
+    anew.desk.receive("session_reply", anew.outside.pop().payload, Now(0, 0), None)
     anew.car.send(Send("state", b"state"))
-    anew.desk.let_in("state", anew.outside.pop().payload, Now(0, 0), None)
+    anew.desk.receive("state", anew.outside.pop().payload, Now(0, 0), None)
     assert both.at_the_desk[-1] == ("state", b"state")
 
 
 def test_states_of_a_known_server_cause_no_query(both: Both) -> None:
     """A state of the server's process that has answered is delivered, and nothing is asked because of it."""
     both.car.send(Send("state", b"state"))
-    both.desk.let_in("state", both.outside.pop().payload, Now(0, 0), None)
+    both.desk.receive("state", both.outside.pop().payload, Now(0, 0), None)
     assert both.at_the_desk[-1] == ("state", b"state")
     assert both.outside == []
 
@@ -164,7 +165,7 @@ def test_states_of_a_known_server_cause_no_query(both: Both) -> None:
 def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
     """Of ten thousand queries in a second as many are looked at as one client could ever ask."""
     heard: list[bytes] = []
-    door = (
+    gateway = (
         both.car
         if signed
         else ServerGateway(
@@ -175,12 +176,12 @@ def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
         )
     )
     for number in range(10_000):
-        door.let_in("session", b"garbage", Now(2 * NS_PER_S, 0), number)
-    assert door.counts["session_requests_screened_out"] == 10_000 - QUERIES_PER_S
+        gateway.receive("session", b"garbage", Now(2 * NS_PER_S, 0), number)
+    assert gateway.counts["session_requests_screened_out"] == 10_000 - QUERIES_PER_S
     assert len(heard) == (0 if signed else QUERIES_PER_S)
 
 
-def test_nobody_waits_at_the_door_for_the_link(both: Both) -> None:
+def test_nobody_waits_at_the_gateway_for_the_link(both: Both) -> None:
     """While the link carries something out, the answer to a stale request too, the door can be used by others."""
     free: list[bool] = []
 
@@ -189,7 +190,7 @@ def test_nobody_waits_at_the_door_for_the_link(both: Both) -> None:
         both.outside.extend(sends)
 
     both.car._carry = both.desk._carry = carry
-    both.outside.append(Send("session", both.desk._seal.seal_request("session", b"")))
+    both.outside.append(Send("session", both.desk._authenticator.sign_request("session", b"")))
     both.carry()
     both.hold()
     both.car.send(Send("state", b"state"))
@@ -201,10 +202,10 @@ def test_a_delivered_message_is_answered_in_another_thread() -> None:
     both = Both()
     del both.desk._send_soon
     both.desk.send(Send("session", HOLD))
-    both.car.let_in("session", both.outside.pop().payload, Now(0, 0), "query")
+    both.car.receive("session", both.outside.pop().payload, Now(0, 0), "query")
     sent: queue.SimpleQueue[tuple[threading.Thread, tuple[Send, ...]]] = queue.SimpleQueue()
     both.desk._carry = lambda *sends: sent.put((threading.current_thread(), sends))
-    both.desk.let_in("session_reply", both.outside.pop().payload, Now(0, 0), None)
+    both.desk.receive("session_reply", both.outside.pop().payload, Now(0, 0), None)
     thread, sends = sent.get(timeout=10)
     assert thread is not threading.current_thread()
     assert thread.daemon
@@ -214,7 +215,7 @@ def test_a_delivered_message_is_answered_in_another_thread() -> None:
 def test_a_flood_of_states_is_screened(both: Both) -> None:
     """Of a flood of states no more signatures are verified than a few vehicles could make."""
     for _ in range(10_000):
-        both.desk.let_in("state", bytes(200), Now(2 * NS_PER_S, 0), None)
+        both.desk.receive("state", bytes(200), Now(2 * NS_PER_S, 0), None)
     assert both.desk.counts["states_screened_out"] == 10_000 - STATES_PER_S
     assert both.desk.counts["states_forged"] == STATES_PER_S
     assert not [each for each in both.at_the_desk if each[0] == "state"]
@@ -232,13 +233,13 @@ def test_a_flood_does_not_hide_what_is_the_holders(both: Both) -> None:
     for flooded in (both.desk, both.car):
         channel, true = ("state", state.payload) if flooded is both.desk else ("session", query.payload)
         for number in range(2_000):
-            flooded.let_in(channel, true if number % 2 else true[:-80] + bytes(80), now, number)
+            flooded.receive(channel, true if number % 2 else true[:-80] + bytes(80), now, number)
     both.outside.clear()
     both.car.send(Send("state", b"new"))
     both.desk.send(Send("session", HOLD))
     inside = len(both.in_the_car)
     for send in both.outside:
-        (both.desk if send.channel == "state" else both.car).let_in(send.channel, send.payload, now, "next")
+        (both.desk if send.channel == "state" else both.car).receive(send.channel, send.payload, now, "next")
     assert both.at_the_desk[-1] == ("state", b"new")
     assert both.in_the_car[inside:] == [("session", HOLD, "next")]
     assert both.car.counts["session_requests_screened_out"] > 1_000
@@ -248,23 +249,23 @@ def test_a_flood_does_not_hide_what_is_the_holders(both: Both) -> None:
 def test_requests_that_are_never_answered_are_forgotten() -> None:
     """The door remembers the newest requests, as many as a link keeps queries, and answers each of them once."""
     carried: list[Send] = []
-    door = ServerGateway(
+    gateway = ServerGateway(
         lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NoVehicleAuthenticator()
     )
     for number in range(1000):
-        door.let_in("session", b"request", Now(number * NS_PER_S, 0), number)
+        gateway.receive("session", b"request", Now(number * NS_PER_S, 0), number)
     for _ in range(2):
-        door.send(*(Send("session_reply", b"reply", number) for number in range(1000)))
+        gateway.send(*(Send("session_reply", b"reply", number) for number in range(1000)))
     assert zenoh_link.QUERIES_KEPT == QUERIES_KEPT
     assert carried == [Send("session_reply", b"reply", number) for number in range(1000 - QUERIES_KEPT, 1000)]
 
 
-def test_an_open_door_changes_nothing() -> None:
+def test_an_open_gateway_changes_nothing() -> None:
     """Where nothing is signed the operator's door is none."""
     delivered: list[Any] = []
     sent: list[Send] = []
-    door = OpenClientGateway(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))
-    door.let_in("state", b"state", Now(1, 2), None)
-    door.send(Send("control", b"command"))
+    gateway = OpenClientGateway(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))
+    gateway.receive("state", b"state", Now(1, 2), None)
+    gateway.send(Send("control", b"command"))
     assert delivered == [("state", b"state", Now(1, 2), None)]
     assert sent == [Send("control", b"command")]

@@ -41,7 +41,7 @@ def test_what_a_key_from_a_file_signs_its_public_key_verifies(tmp_path: Path) ->
     assert not key.verifies(b"", b"data")
 
 
-def test_a_key_of_another_kind_is_refused(tmp_path: Path) -> None:
+def test_a_key_of_another_kind_is_rejected(tmp_path: Path) -> None:
     """A key that is valid but cannot sign, such as one of X25519, is refused, private or public."""
     private, public = write_pair(tmp_path, X25519PrivateKey.generate())
     for load, path in ((load_private, private), (load_public, public)):
@@ -50,7 +50,7 @@ def test_a_key_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o620, 0o610, 0o604, 0o602, 0o601])
-def test_a_private_key_that_others_may_open_is_refused(tmp_path: Path, mode: int) -> None:
+def test_a_private_key_that_others_may_open_is_rejected(tmp_path: Path, mode: int) -> None:
     """A private key is refused when its group or anybody else has any permission on its file."""
     private, _ = write_pair(tmp_path, Ed25519PrivateKey.generate())
     private.chmod(mode)
@@ -59,7 +59,7 @@ def test_a_private_key_that_others_may_open_is_refused(tmp_path: Path, mode: int
 
 
 @pytest.mark.parametrize("load", [load_private, load_public])
-def test_a_file_that_is_not_there_or_no_key_is_refused(tmp_path: Path, load: Callable[[Path], object]) -> None:
+def test_a_file_that_is_not_there_or_no_key_is_rejected(tmp_path: Path, load: Callable[[Path], object]) -> None:
     """A missing file, and a file of something else, are errors of the user."""
     path = tmp_path / "key"
     with pytest.raises(UserError, match="lavt keys"):
@@ -95,7 +95,7 @@ def test_encrypted_text_is_read_with_its_secret_and_context_only() -> None:
     assert decrypt(secret, data[:5], b"context") is None
 
 
-def test_a_key_of_an_unknown_algorithm_is_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_a_key_of_an_unknown_algorithm_is_rejected_in_a_sentence(tmp_path: Path) -> None:
     """A file that is PEM, but of an algorithm that nobody knows, is no key, private or public, and no traceback."""
     key = Ed25519PrivateKey.generate()
     private = key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption())

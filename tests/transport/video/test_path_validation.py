@@ -58,7 +58,7 @@ def opened(address: tuple[str, int] = HOME, now_ns: int = T0) -> PathServer:
     return server
 
 
-def refused(server: PathServer) -> dict[str, int]:
+def rejected(server: PathServer) -> dict[str, int]:
     names = ("malformed", "wrong_token", "wrong_address", "stale", "foreign_reports")
     return {name: getattr(server, name) for name in names if getattr(server, name)}
 
@@ -77,7 +77,7 @@ def test_opening() -> None:
     assert server.open_address(T0 + 1) == HOME
     assert server.rtcp_admitted(HOME)
     assert not server.rtcp_admitted(OTHER_PORT)
-    assert refused(server) == {}
+    assert rejected(server) == {}
 
 
 def test_no_amplification() -> None:
@@ -113,14 +113,14 @@ def test_wrong_token() -> None:
     assert right is not None
     server.receive(right[:-32] + bytes(32), HOME, T0)
     assert server.open_address(T0) is None
-    assert refused(server) == {"wrong_token": 2}
+    assert rejected(server) == {"wrong_token": 2}
 
 
 def test_no_session() -> None:
     """Without a session there is no token, and nothing opens the path."""
     server = new_server(None)
     assert server.receive(PathClient(TOKEN).hello(T0), HOME, T0) is None
-    assert refused(server) == {"wrong_token": 1}
+    assert rejected(server) == {"wrong_token": 1}
 
 
 @pytest.mark.parametrize("address", [ELSEWHERE, OTHER_PORT])
@@ -133,7 +133,7 @@ def test_answer_from_another_address(address: tuple[str, int]) -> None:
     server.receive(answer, HOME, T0)
     server.receive(answer, address, T0)
     assert server.open_address(T0) == HOME
-    assert refused(server) == {"wrong_address": 2}
+    assert rejected(server) == {"wrong_address": 2}
 
 
 def test_third_party() -> None:
@@ -150,7 +150,7 @@ def test_stale_challenge() -> None:
     answer = answer_for(server, HOME, T0)
     server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS + 1)
     assert server.open_address(T0 + CHALLENGE_LIFETIME_NS + 1) is None
-    assert refused(server) == {"stale": 1}
+    assert rejected(server) == {"stale": 1}
     server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS)
     assert server.open_address(T0 + CHALLENGE_LIFETIME_NS) == HOME
 
@@ -181,7 +181,7 @@ def test_replay_after_a_move() -> None:
     server.receive(answer_for(server, ELSEWHERE, T0 + 1), ELSEWHERE, T0 + 1)
     server.receive(first, HOME, T0 + 2)
     assert server.open_address(T0 + 2) == ELSEWHERE
-    assert refused(server) == {"stale": 1}
+    assert rejected(server) == {"stale": 1}
 
 
 def test_replay_keeps_nothing_open() -> None:
@@ -208,7 +208,7 @@ def test_report_too_late() -> None:
     late_ns = T0 + REPORT_TIMEOUT_NS + 1
     server.report(HOME, late_ns)
     assert server.open_address(late_ns) is None
-    assert refused(server) == {"foreign_reports": 1}
+    assert rejected(server) == {"foreign_reports": 1}
     server.receive(answer_for(server, HOME, late_ns), HOME, late_ns)
     assert server.open_address(late_ns) == HOME
 
@@ -218,7 +218,7 @@ def test_report_from_elsewhere() -> None:
     server = opened()
     server.report(ELSEWHERE, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + REPORT_TIMEOUT_NS + 1) is None
-    assert refused(server) == {"foreign_reports": 1}
+    assert rejected(server) == {"foreign_reports": 1}
 
 
 def test_a_challenge_of_nobody_is_not_answered() -> None:
@@ -257,13 +257,13 @@ def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
     """What either end seals the other opens, and nothing of a picture can be read in between."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    sealed = server.cipher.seal(RTP)
-    assert b"a picture" not in sealed
-    assert client.open(sealed) == RTP
-    assert client.open(sealed) is None
+    signed = server.cipher.authenticator(RTP)
+    assert b"a picture" not in signed
+    assert client.open(signed) == RTP
+    assert client.open(signed) is None
     assert client.open(RTP) is None
-    assert client.open_control(server.cipher.seal_control(RTCP)) == RTCP
-    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+    assert client.open_control(server.cipher.protect_control(RTCP)) == RTCP
+    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
     assert server.cipher.open_control(RTCP) is None
 
 
@@ -271,19 +271,19 @@ def test_each_opening_has_keys_of_its_own() -> None:
     """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    before = server.cipher.seal(RTP)
-    late = server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    before = server.cipher.authenticator(RTP)
+    late = server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
     reopened(server, client, ELSEWHERE, T0 + 1)
-    after = server.cipher.seal(RTP)
+    after = server.cipher.authenticator(RTP)
     assert after != before
     assert client.open(after) == RTP
     assert client.open(late) is not None
     assert client.open(before) == RTP
     assert client.open(before) is None
-    assert server.cipher.open_control(client.seal_control(RTCP)) is None  # the last that came was under the old keys
-    server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
-    assert client.open(server.cipher.seal(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
-    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+    assert server.cipher.open_control(client.protect_control(RTCP)) is None  # the last that came was under the old keys
+    server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.open(server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
 
 
 def test_answers_that_are_lost_do_no_harm() -> None:
@@ -293,8 +293,8 @@ def test_answers_that_are_lost_do_no_harm() -> None:
     for later_ns in range(1, 4):
         challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
         assert client.answer(challenge or b"") is not None
-    assert client.open(server.cipher.seal(RTP)) == RTP
-    assert server.cipher.open_control(client.seal_control(RTCP)) == RTCP
+    assert client.open(server.cipher.authenticator(RTP)) == RTP
+    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
 
 
 @pytest.mark.parametrize("token", [OTHER_TOKEN, TOKEN, None])
@@ -317,7 +317,7 @@ def test_bad_token() -> None:
         new_server(b"")
 
 
-def test_a_lost_path_is_asked_for_long_before_the_vehicle_misses_a_command() -> None:
+def test_a_lost_path_is_requested_for_long_before_the_vehicle_misses_a_command() -> None:
     """A hello comes within half of the 300 ms after which a vehicle without a newer picture's command is degraded."""
     assert HELLO_AGAIN_NS <= 300_000_000 // 2
 
@@ -340,7 +340,7 @@ def test_any_bytes(data: bytes, head: bytes) -> None:
     server = opened()
     assert server.receive(head + data, ELSEWHERE, T0) is None
     assert server.open_address(T0) == HOME
-    assert sum(refused(server).values()) == 1
+    assert sum(rejected(server).values()) == 1
     assert PathClient(TOKEN).answer(head + data) is None
 
 
@@ -352,4 +352,4 @@ def test_any_change(at: int, flip: int) -> None:
     answer[at] ^= flip
     server.receive(bytes(answer), HOME, T0)
     assert server.open_address(T0) is None
-    assert sum(refused(server).values()) == 1
+    assert sum(rejected(server).values()) == 1

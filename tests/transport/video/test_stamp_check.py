@@ -23,9 +23,9 @@ def sent(
 ) -> list[tuple[int, int]]:
     """Stamps and RTP timestamps of a sender that stamps each picture up to `jitter_ns` after it was taken."""
     late_ns = stream(1, "stamped late").integers(0, jitter_ns + 1, count).tolist()
-    taken_ns = [begin_ns + number * FRAME_NS for number in range(count)]
-    ticks = [(base + round((ns - begin_ns) * (1 + drift) * 9 / 100_000)) % 2**32 for ns in taken_ns]
-    return [(ns + late, tick) for ns, late, tick in zip(taken_ns, late_ns, ticks, strict=True)]
+    captured_ns = [begin_ns + number * FRAME_NS for number in range(count)]
+    ticks = [(base + round((ns - begin_ns) * (1 + drift) * 9 / 100_000)) % 2**32 for ns in captured_ns]
+    return [(ns + late, tick) for ns, late, tick in zip(captured_ns, late_ns, ticks, strict=True)]
 
 
 def learned(base: int = 0) -> tuple[LearnedBase, int, int]:

@@ -92,8 +92,8 @@ def test_the_first_frame_has_a_report() -> None:
 def test_sender_reports() -> None:
     """A report every 500 ms says what was sent by then and answers the last reference time once."""
     sender = stream()
-    asked_ns = 7 * NS_PER_S
-    sender.hear(Feedback(reference_times=(ReferenceTime(9, short_time(ntp_of_elapsed(asked_ns))),)), at(0).mono_ns)
+    requested_ns = 7 * NS_PER_S
+    sender.hear(Feedback(reference_times=(ReferenceTime(9, short_time(ntp_of_elapsed(requested_ns))),)), at(0).mono_ns)
     told = []
     for at_ns in range(0, 1_300 * NS_PER_MS, 100 * NS_PER_MS):
         packets = sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns))
@@ -106,4 +106,4 @@ def test_sender_reports() -> None:
             told.append((at_ns // NS_PER_MS, report.packets // len(packets.media), announcement.answers))
     assert [(ms, frames, len(answers)) for ms, frames, answers in told] == [(0, 1, 1), (500, 6, 0), (1000, 11, 0)]
     (answer,) = told[0][2]
-    assert answered_round_trip_ns(answer, asked_ns + 80 * NS_PER_MS) == pytest.approx(80 * NS_PER_MS, abs=50_000)
+    assert answered_round_trip_ns(answer, requested_ns + 80 * NS_PER_MS) == pytest.approx(80 * NS_PER_MS, abs=50_000)

@@ -41,7 +41,7 @@ class Moment:
 
     at_ns: int
     wheels: Actuation
-    is_asked: bool
+    is_requested: bool
     """Something commanded reaches the wheels: an axis is enabled."""
     state: str
 
@@ -57,7 +57,7 @@ class Rig:
         name = keys.pop("profile", f"dataspeed_gen{generation}")
         self.profile: Profile = name if isinstance(name, Profile) else profile(name)
         self.generation, self.tick_ns = generation, 20 * NS_PER_MS
-        adapter_keys = {key: keys.pop(key) for key in ("hindrance",) if key in keys}
+        adapter_keys = {key: keys.pop(key) for key in ("inhibit_reason",) if key in keys}
         self.adapter = ByWireAdapter(self.profile, start_ns=START_NS, **adapter_keys)
         self.simulator = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
         self.kit = Kit(1 if generation == 1 else 2, start_ns=START_NS, **keys)
@@ -130,7 +130,7 @@ class Rig:
         self.adapter.engage(True, self.now_ns)
         self.run_until(lambda rig: rig.state == "engaged")
 
-    def let_go_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
+    def release_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
         """Let time pass until nothing commanded reaches the wheels any more; how long after `since_ns` that was."""
         self.run_until(lambda rig: not rig.enabled(), limit_ms)
         return (self.now_ns - since_ns) // NS_PER_MS

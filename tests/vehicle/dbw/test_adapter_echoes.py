@@ -49,7 +49,7 @@ class ChosenReports:
     def steer(self, steering_rad: float) -> tuple[int, bytes]:
         """Let a tick ask for an angle; gives when that was, and the angle on the bus."""
         self.rig.actuation = replace(self.rig.actuation, steering_rad=steering_rad)
-        self.rig.run_until(lambda rig: rig.adapter._asked == rig.actuation)
+        self.rig.run_until(lambda rig: rig.adapter._requested == rig.actuation)
         return self.rig.now_ns, next(
             frame.data[:2] for _, frame in reversed(self.rig.sent) if frame.identifier == COMMAND
         )
@@ -68,9 +68,9 @@ class ChosenReports:
 def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool) -> None:
     """A command counts as reached where it is reported within 200 ms; later it is forgotten, even if repeated."""
     car = ChosenReports(driving(1))
-    asked_ns, command = car.steer(FIRST_RAD)
+    requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
-    assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)] * is_known
+    assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)] * is_known
 
 
 def test_only_old_commands_are_forgotten() -> None:
@@ -78,10 +78,10 @@ def test_only_old_commands_are_forgotten() -> None:
     car = ChosenReports(driving(1))
     _, first = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
-    asked_ns, second = car.steer(SECOND_RAD)
+    requested_ns, second = car.steer(SECOND_RAD)
     car.rig.run_ms(120)
     assert car.choose(first) == []
-    assert car.choose(second) == [ReachedCommand(asked_ns, car.rig.now_ns)]
+    assert car.choose(second) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
 def test_all_old_commands_are_forgotten() -> None:
@@ -101,13 +101,13 @@ def test_all_old_commands_are_forgotten() -> None:
 def test_a_command_that_is_given_again_reaches_the_kit_again() -> None:
     """To and fro: each of three commands is reached at its own report, also where the last is as the first."""
     car = ChosenReports(driving(1))
-    asked = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
-    for asked_ns, command in asked:
+    requested = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
+    for requested_ns, command in requested:
         car.rig.run_ms(5)
-        assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)]
+        assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
-def test_overtaken_commands_reach_nothing() -> None:
+def test_reordered_commands_reach_nothing() -> None:
     """Where the kit reports a command those before it were overtaken; those after it are still expected."""
     car = ChosenReports(driving(1))
     (_, first), (second_ns, second), (third_ns, _) = [car.steer(each) for each in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
@@ -119,17 +119,17 @@ def test_overtaken_commands_reach_nothing() -> None:
 def test_a_command_that_was_not_sent_changes_nothing() -> None:
     """A report of a command that was not sent has reached nothing, and what was sent is still expected."""
     car = ChosenReports(driving(1))
-    asked_ns, command = car.steer(FIRST_RAD)
+    requested_ns, command = car.steer(FIRST_RAD)
     assert car.choose(OTHER) == []
-    assert car.choose(command) == [ReachedCommand(asked_ns, car.rig.now_ns)]
+    assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
 def test_a_repeated_command_is_expected_once() -> None:
     """A command that is repeated, or that the kit has already, is no change and reaches nothing."""
     car = ChosenReports(driving(1))
-    asked_ns, command = car.steer(FIRST_RAD)
+    requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
-    assert [each.applied_ns for each in car.choose(command)] == [asked_ns]
+    assert [each.applied_ns for each in car.choose(command)] == [requested_ns]
     car.rig.run_ms(100)
     assert car.choose(car.before) == []
     car.rig.run_ms(100)

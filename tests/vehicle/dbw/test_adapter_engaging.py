@@ -36,7 +36,7 @@ def test_idle_is_silent(generation: int) -> None:
     rig.run_ms(1000)
     state = rig.adapter.state()
     assert rig.sent == []
-    assert (state.hindrance, state.is_engaged, state.is_overridden) == ("", False, False)
+    assert (state.inhibit_reason, state.is_engaged, state.is_overridden) == ("", False, False)
     assert (state.gear, state.speed_mps) == ("park", 0.0)
 
 
@@ -44,8 +44,8 @@ def test_idle_is_silent(generation: int) -> None:
 def test_before_reports(generation: int) -> None:
     """Before every report has come once, their absence hinders, each by its name."""
     rig = Rig(generation, start_frames=False)
-    hindrance = rig.adapter.state().hindrance
-    assert hindrance == "; ".join(f"no {message} yet" for message in rig.profile.reports)
+    inhibit_reason = rig.adapter.state().inhibit_reason
+    assert inhibit_reason == "; ".join(f"no {message} yet" for message in rig.profile.reports)
 
 
 @both
@@ -171,7 +171,7 @@ def test_parking(generation: int) -> None:
     assert rig.enabled() == set()
     assert rig.kit.state.watchdog == 0
     assert rig.speed_mps < 0.1
-    assert rig.adapter.state().hindrance == ""
+    assert rig.adapter.state().inhibit_reason == ""
     rig.sent.clear()
     rig.run_ms(300)
     assert rig.sent == []
@@ -245,11 +245,11 @@ def test_not_engaged_while_rolling(generation: int) -> None:
 
 def test_installation() -> None:
     """An installation that must not drive says why, and never engages."""
-    rig = Rig(2, hindrance="55 signals of dataspeed_gen2 are unverified")
+    rig = Rig(2, inhibit_reason="55 signals of dataspeed_gen2 are unverified")
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
-    assert rig.adapter.state().hindrance == "55 signals of dataspeed_gen2 are unverified"
+    assert rig.adapter.state().inhibit_reason == "55 signals of dataspeed_gen2 are unverified"
 
 
 def test_unknown_sign() -> None:
@@ -259,7 +259,7 @@ def test_unknown_sign() -> None:
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
-    assert rig.adapter.state().hindrance == "the steering's sign is not known: set vehicle.dbw.steering_sign"
+    assert rig.adapter.state().inhibit_reason == "the steering's sign is not known: set vehicle.dbw.steering_sign"
 
 
 @both
@@ -281,7 +281,7 @@ def test_users_commands() -> None:
     deaf = Rig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
     deaf.adapter.engage(True, deaf.now_ns)
     deaf.run_ms(1000)
-    assert deaf.adapter.state().hindrance == "RemoteReport has STATE remote"
+    assert deaf.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
     assert deaf.sent == []
 
 
@@ -292,12 +292,12 @@ def test_reached(generation: int) -> None:
     rig.run_ms(500)
     rig.adapter.take_reached()
     rig.actuation = replace(rig.actuation, steering_rad=0.012)
-    rig.run_until(lambda rig: rig.adapter._asked == rig.actuation)
-    asked_ns = rig.now_ns
+    rig.run_until(lambda rig: rig.adapter._requested == rig.actuation)
+    requested_ns = rig.now_ns
     rig.run_ms(200)
     reached = rig.adapter.take_reached()
-    assert [each.applied_ns for each in reached] == [asked_ns]
-    assert 0 < reached[0].reached_ns - asked_ns <= (5 + 10 + 1) * NS_PER_MS
+    assert [each.applied_ns for each in reached] == [requested_ns]
+    assert 0 < reached[0].reached_ns - requested_ns <= (5 + 10 + 1) * NS_PER_MS
     assert rig.adapter.take_reached() == []
 
 
@@ -322,9 +322,9 @@ def test_drives_as_the_simulator(generation: int) -> None:
     same._car, same._index = deepcopy(rig.simulator._car), rig.simulator._index
     started = rig.simulator.ground_truth()
     for step in range(250):
-        asked = Actuation(0.01 * math.sin(step / 40), 0.2, 0.0)
-        rig.actuation = asked
-        same.apply(asked, rig.now_ns)
+        requested = Actuation(0.01 * math.sin(step / 40), 0.2, 0.0)
+        rig.actuation = requested
+        same.apply(requested, rig.now_ns)
         rig.run_ms(20)
         same.advance(rig.now_ns)
     other, own = same.ground_truth(), rig.simulator.ground_truth()
@@ -366,5 +366,5 @@ def test_no_number_is_no_tick(generation: int) -> None:
     rig.actuation = Actuation(math.nan, 0.1, 0.0)
     stopped_ns = rig.now_ns
     rig.run_ms(300)
-    assert rig.adapter.counts["actuations_refused"] == 15
+    assert rig.adapter.counts["actuations_rejected"] == 15
     assert max(at_ns for at_ns, _ in rig.sent) - stopped_ns <= 60 * NS_PER_MS

@@ -51,13 +51,13 @@ def test_commands_lost(generation: int) -> None:
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     cut_ns = rig.now_ns
     rig.spoil = lambda _: None
-    assert rig.let_go_ms(cut_ns) == 100
+    assert rig.release_ms(cut_ns) == 100
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(150, step_ms=COARSE_MS)
     state = rig.adapter.state()
     assert not state.is_engaged
-    assert "the kit has let go of" in state.hindrance or "watchdog" in state.hindrance
+    assert "the kit has let go of" in state.inhibit_reason or "watchdog" in state.inhibit_reason
     assert any("watchdog" in event.detail for event in rig.events)
     assert {event.kind for event in rig.events} == {"fault"}
 
@@ -74,17 +74,17 @@ def test_counter_stuck(generation: int) -> None:
         place = 7 if generation == 1 else 6
         stuck.append(frame.data[place])
         data = frame.data[:place] + bytes([stuck[0]]) + frame.data[place + 1 :]
-        return sealed(frame.identifier, data) if generation == 2 else CanFrame(frame.identifier, data)
+        return with_crc(frame.identifier, data) if generation == 2 else CanFrame(frame.identifier, data)
 
     rig.spoil = spoil
     rig.run_until(lambda _: len(stuck) == 2)
-    assert rig.let_go_ms(rig.now_ns) == 0
+    assert rig.release_ms(rig.now_ns) == 0
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     assert not rig.adapter.state().is_engaged
 
 
-def sealed(identifier: int, data: bytes) -> CanFrame:
+def with_crc(identifier: int, data: bytes) -> CanFrame:
     """Give a frame its CRC by division, bit by bit."""
     number = int.from_bytes(identifier.to_bytes(2, "big") + data[:-1], "big") << 8
     bits = 8 * (2 + len(data) - 1)
@@ -109,7 +109,7 @@ def test_checksum_wrong(part: int) -> None:
 
     rig.spoil = spoil
     rig.run_until(lambda _: bool(spoiled))
-    assert rig.let_go_ms(spoiled[0]) == 0
+    assert rig.release_ms(spoiled[0]) == 0
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(100)
     assert "SystemReport says crc" in "; ".join(rig.adapter._reports.said("reason"))
@@ -120,9 +120,9 @@ def test_checksum_wrong(part: int) -> None:
 def test_ticks_stop(generation: int) -> None:
     """Ticks that stop: nothing leaves after 60 ms, and nothing commanded stands 100 ms after the last frame."""
     rig = driving(generation)
-    rig.run_until(lambda rig: rig.adapter._asked_ns == rig.now_ns)
+    rig.run_until(lambda rig: rig.adapter._requested_ns == rig.now_ns)
     stopped_ns, rig.is_ticking = rig.now_ns, False
-    took_ms = rig.let_go_ms(stopped_ns)
+    took_ms = rig.release_ms(stopped_ns)
     left_ms = (last_sent_ns(rig) - stopped_ns) // NS_PER_MS
     assert 40 < left_ms <= 60
     assert took_ms == left_ms + 100
@@ -180,11 +180,11 @@ def test_somebody_else_commands_and_nobody_is_engaged(generation: int, which: in
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(999)
     assert (rig.state, rig.sent) == ("idle", [])
-    assert "somebody else on the bus commands the kit" in rig.adapter.state().hindrance
+    assert "somebody else on the bus commands the kit" in rig.adapter.state().inhibit_reason
     assert rig.adapter.counts["foreign_commands"] == 1
     rig.run_ms(2)
     assert rig.state == "clearing"
-    assert rig.adapter.state().hindrance == ""
+    assert rig.adapter.state().inhibit_reason == ""
 
 
 @both
@@ -193,7 +193,7 @@ def test_somebody_else_commands_while_driving(generation: int) -> None:
     rig = driving(generation)
     rig.adapter.receive(SOMEBODY_ELSES[generation][0], rig.now_ns)
     assert rig.state == "lost"
-    assert "somebody else on the bus commands the kit" in rig.adapter.state().hindrance
+    assert "somebody else on the bus commands the kit" in rig.adapter.state().inhibit_reason
     rig.actuation = Actuation(0.01, 0.5, 0.4)
     rig.run_ms(200, step_ms=COARSE_MS)
     assert (rig.moments[-1].wheels.throttle, round(rig.moments[-1].wheels.brake, 2)) == (0.0, 0.4)
@@ -228,17 +228,17 @@ PERIOD_MS = {"steering": 10, "brake": 20, "throttle": 20, "gear": 100}
 def test_override(generation: int, part: str) -> None:
     """The driver takes over: all axes are free at once (generation 2), or with the report that says so (1)."""
     rig = driving(generation)
-    taken_ns = rig.now_ns
+    captured_ns = rig.now_ns
     OVERRIDES[part](rig)
     if part in AXES:
         assert part not in rig.enabled()
-    took_ms = rig.let_go_ms(taken_ns)
+    took_ms = rig.release_ms(captured_ns)
     assert took_ms == 0 if generation == 2 else took_ms <= PERIOD_MS[part]
     rig.run_until(lambda rig: rig.state == "overridden", PERIOD_MS[part] + 1)
     rig.run_ms(PERIOD_MS[part])
     state = rig.adapter.state()
     assert (state.is_overridden, state.is_engaged) == (True, False)
-    assert "the driver has taken over" in state.hindrance
+    assert "the driver has taken over" in state.inhibit_reason
     assert any(WORDS[part] in event.detail for event in rig.events)
     assert rig.kit.state.watchdog == 0
 
@@ -265,7 +265,7 @@ def test_override_is_latched(generation: int, part: str) -> None:
     assert rig.kit.state.is_overridden
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(20)
-    assert (rig.state, rig.adapter.state().hindrance) == ("idle", "")
+    assert (rig.state, rig.adapter.state().inhibit_reason) == ("idle", "")
     assert rig.kit.state.is_overridden
     rig.engage()
     assert not rig.kit.state.is_overridden
@@ -283,7 +283,7 @@ def test_hands_on(generation: int) -> None:
     took_ms = rig.run_until(lambda rig: rig.state == "overridden")
     assert 3000 <= took_ms <= 3010
     assert any("3 s: the driver steers" in event.detail for event in rig.events)
-    assert not any(moment.is_asked for moment in rig.moments)
+    assert not any(moment.is_requested for moment in rig.moments)
     assert rig.adapter.state().is_overridden
 
 
@@ -301,12 +301,12 @@ def test_fault(generation: int, name: str) -> None:
     """A fault: the kit lets go of all axes at once, and its watchdog brakes; the part is named with the next report."""
     rig = driving(generation)
     rig.kit.set_fault(name, rig.now_ns)
-    assert rig.let_go_ms(rig.now_ns) == 0
+    assert rig.release_ms(rig.now_ns) == 0
     assert rig.kit.state.brake == WATCHDOG_BRAKE
     assert rig.run_until(is_lost) <= 20
     rig.run_ms(100)
     part = "gearbox" if name.startswith("gear") else name.partition(".")[0]
-    assert f"the {part}" in rig.adapter.state().hindrance
+    assert f"the {part}" in rig.adapter.state().inhibit_reason
     assert any(f"the {part}" in event.detail for event in rig.events)
 
 
@@ -321,7 +321,7 @@ def test_gear_fault_of_generation_1() -> None:
     rig.actuation = Actuation(0.0, 1.0, 0.6)
     rig.run_ms(200, step_ms=COARSE_MS)
     assert (rig.kit.state.throttle, round(rig.kit.state.brake, 3)) == (0.0, 0.6)
-    assert rig.adapter.state().hindrance == "the gearbox has a bus fault"
+    assert rig.adapter.state().inhibit_reason == "the gearbox has a bus fault"
 
 
 def test_fault_without_a_watchdog() -> None:
@@ -353,9 +353,9 @@ def test_fault_latches(generation: int) -> None:
     rig.kit.set_fault(name, rig.now_ns, is_set=False)
     rig.run_ms(1000, step_ms=COARSE_MS)
     assert rig.state == "lost"
-    assert rig.adapter.state().hindrance != ""
+    assert rig.adapter.state().inhibit_reason != ""
     stop_and_disengage(rig)
-    assert (rig.state, rig.adapter.state().hindrance) == ("idle", "")
+    assert (rig.state, rig.adapter.state().inhibit_reason) == ("idle", "")
     rig.engage()
     assert rig.enabled() == set(AXES)
 
@@ -370,7 +370,7 @@ def test_fault_before(generation: int) -> None:
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.sent == []
-    assert "the brake has a fault" in rig.adapter.state().hindrance
+    assert "the brake has a fault" in rig.adapter.state().inhibit_reason
 
 
 @both
@@ -385,11 +385,11 @@ def test_watchdog(generation: int) -> None:
     rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.kit.state.watchdog_brakes
     if generation == 1:
-        assert rig.adapter.state().hindrance == "the kit's watchdog brakes: take over by a pedal"
+        assert rig.adapter.state().inhibit_reason == "the kit's watchdog brakes: take over by a pedal"
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(4000, step_ms=COARSE_MS)
     assert rig.enabled() == set()
-    assert "watchdog" in rig.adapter.state().hindrance
+    assert "watchdog" in rig.adapter.state().inhibit_reason
     rig.adapter.engage(False, rig.now_ns)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.run_ms(100)
@@ -410,12 +410,12 @@ def test_bus_off(generation: int) -> None:
     rig.run_until(lambda rig: bool(rig.sent) and last_sent_ns(rig) == rig.now_ns)
     rig.kit.bus_off(rig.now_ns)
     cut_ns = rig.now_ns
-    assert rig.let_go_ms(cut_ns) == 100
+    assert rig.release_ms(cut_ns) == 100
     rig.run_until(is_lost)
     shortest_ms = min(report.timeout_ns for report in rig.profile.reports.values()) // NS_PER_MS
     assert shortest_ms - 10 <= (rig.now_ns - cut_ns) // NS_PER_MS <= shortest_ms
     rig.run_ms(400)
-    assert rig.adapter.state().hindrance.count("no ") == len(rig.profile.reports)
+    assert rig.adapter.state().inhibit_reason.count("no ") == len(rig.profile.reports)
     rig.kit.bus_off(rig.now_ns, is_off=False)
     rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.enabled() == set()
@@ -430,8 +430,8 @@ def test_bus_gone(generation: int) -> None:
     cut_ns, rig.is_cut = rig.now_ns, True
     rig.adapter.bus_gone("can0 is down", rig.now_ns)
     state = rig.adapter.state()
-    assert (state.is_engaged, state.hindrance) == (False, "can0 is down")
-    assert rig.let_go_ms(cut_ns) == 100
+    assert (state.is_engaged, state.inhibit_reason) == (False, "can0 is down")
+    assert rig.release_ms(cut_ns) == 100
     assert last_sent_ns(rig) == cut_ns
     rig.is_cut = False
     rig.run_ms(500, step_ms=COARSE_MS)
@@ -465,7 +465,7 @@ def test_report_missing(generation: int, message: str) -> None:
     rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
     timeout_ms = rig.profile.reports[message].timeout_ns // NS_PER_MS
     assert timeout_ms <= (rig.now_ns - heard_ns) // NS_PER_MS <= timeout_ms + 1
-    assert rig.adapter.state().hindrance == f"no {message} for {timeout_ms} ms"
+    assert rig.adapter.state().inhibit_reason == f"no {message} for {timeout_ms} ms"
     rig.actuation = Actuation(0.0, 0.0, 0.6)
     rig.run_ms(200, step_ms=COARSE_MS)
     assert rig.kit.state.brake == pytest.approx(0.6, abs=1e-3)
@@ -492,7 +492,7 @@ def test_wrong_checksum_of_a_report() -> None:
     """A report of generation 2 with a wrong checksum is dropped and counted."""
     rig = driving(2)
     before = rig.adapter.state()
-    frame = sealed(0x107, bytes(8))
+    frame = with_crc(0x107, bytes(8))
     rig.adapter.receive(CanFrame(0x107, frame.data[:-1] + bytes([frame.data[-1] ^ 1])), rig.now_ns)
     assert rig.adapter.state() == before
     assert rig.adapter.counts["wrong_checksum"] == 1
@@ -508,10 +508,10 @@ def test_remote_switch(position: int, words: str) -> None:
     """The remote's switch at stop or pause: the kit lets go at once; the adapter says so with the next report."""
     rig = driving(2)
     rig.kit.switch_remote(position, rig.now_ns)
-    assert rig.let_go_ms(rig.now_ns) == 0
+    assert rig.release_ms(rig.now_ns) == 0
     rig.run_until(is_lost, 101)
     rig.run_ms(100)
-    assert f"RemoteReport has STATE {words}" in rig.adapter.state().hindrance
+    assert f"RemoteReport has STATE {words}" in rig.adapter.state().inhibit_reason
 
 
 def test_remote_switch_elsewhere() -> None:
@@ -521,7 +521,7 @@ def test_remote_switch_elsewhere() -> None:
     turned_ns = rig.now_ns
     rig.run_until(lambda rig: rig.kit.state.throttle == 0.0)
     assert (rig.now_ns - turned_ns) // NS_PER_MS <= 101
-    assert rig.adapter.state().hindrance == "RemoteReport has STATE control allowed"
+    assert rig.adapter.state().inhibit_reason == "RemoteReport has STATE control allowed"
     rig.kit.switch_remote(2, rig.now_ns)
     rig.run_ms(200, step_ms=COARSE_MS)
     assert rig.state == "lost"
@@ -534,18 +534,18 @@ def test_remote_switch_elsewhere() -> None:
 def test_kit_not_ready(name: str, words: str) -> None:
     """What makes generation 2 not ready: the kit lets go at once, and its reason is said."""
     rig = driving(2)
-    rig.kit.hinder(name, rig.now_ns)
-    assert rig.let_go_ms(rig.now_ns) == 0
+    rig.kit.inhibit(name, rig.now_ns)
+    assert rig.release_ms(rig.now_ns) == 0
     rig.run_until(is_lost)
     rig.run_ms(100)
-    assert words in rig.adapter.state().hindrance
+    assert words in rig.adapter.state().inhibit_reason
 
 
 # The gearbox.
 
 
 @both
-def test_drive_refused(generation: int) -> None:
+def test_drive_rejected(generation: int) -> None:
     """A gear that the kit refuses: after 3 s it is said with the kit's reason; then the car is let go of in PARK."""
     known = profile(f"dataspeed_gen{generation}")
     gear = replace(known.gear, numbers={**known.gear.numbers, "drive": 5})
@@ -553,7 +553,7 @@ def test_drive_refused(generation: int) -> None:
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(is_lost)
     assert 3120 <= took_ms <= 3160
-    said = rig.adapter.state().hindrance
+    said = rig.adapter.state().inhibit_reason
     assert "3 s: the gear is park instead of drive" in said
     if generation == 1:
         assert said.endswith("GearReport says unsupported")
@@ -577,7 +577,7 @@ def test_a_shift_that_was_begun_is_waited_for() -> None:
     assert (rig.state, rig.enabled()) == ("parking", set())
 
 
-def test_park_refused() -> None:
+def test_park_rejected() -> None:
     """Where PARK is refused the car is held by its brake, and it is said so."""
     rig = driving(1)
     rig.kit.set_fault("gear.FLTBUS", rig.now_ns)
@@ -589,7 +589,7 @@ def test_park_refused() -> None:
     assert rig.speed_mps == 0.0
     assert rig.kit.state.brake == pytest.approx(rig.profile.limits.holding_brake, abs=1e-3)
     assert rig.enabled() == set(AXES)
-    said = rig.adapter.state().hindrance
+    said = rig.adapter.state().inhibit_reason
     assert "not parked" in said
     assert "GearReport says fault" in said
 
@@ -607,10 +607,10 @@ def test_park_is_missed_after_3_s() -> None:
     rig = without_park()
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(2999)
-    assert (rig.state, rig.adapter.state().hindrance) == ("parking", "")
+    assert (rig.state, rig.adapter.state().inhibit_reason) == ("parking", "")
     rig.run_ms(1)
-    assert "unsupported" in rig.adapter.state().hindrance
-    assert len(rig.adapter.state().hindrance.split(SEPARATOR)) == 2
+    assert "unsupported" in rig.adapter.state().inhibit_reason
+    assert len(rig.adapter.state().inhibit_reason.split(SEPARATOR)) == 2
 
 
 def test_park_is_not_missed_while_the_car_moves() -> None:
@@ -627,7 +627,7 @@ def test_park_is_not_missed_while_the_car_moves() -> None:
     rig.adapter.engage(False, rig.now_ns)
     rig.run_ms(4000, step_ms=COARSE_MS)
     assert rig.adapter.state().speed_mps > 1.0
-    assert (rig.state, rig.adapter.state().hindrance) == ("parking", "")
+    assert (rig.state, rig.adapter.state().inhibit_reason) == ("parking", "")
 
 
 @pytest.mark.parametrize("state", ["idle", "engaged", "lost", "overridden"])
@@ -642,9 +642,9 @@ def test_park_is_missed_only_after_driving(state: str) -> None:
         rig.kit.driver_brakes(0.3, rig.now_ns)
     rig.run_ms(500, step_ms=COARSE_MS)
     assert rig.state == state
-    before = rig.adapter.state().hindrance
+    before = rig.adapter.state().inhibit_reason
     rig.run_ms(3500, step_ms=COARSE_MS)
-    assert (rig.state, rig.adapter.state().hindrance) == (state, before)
+    assert (rig.state, rig.adapter.state().inhibit_reason) == (state, before)
 
 
 @both
@@ -653,7 +653,7 @@ def test_out_of_gear(generation: int) -> None:
     rig = driving(generation)
     rig.kit.state.gear = Gear.NEUTRAL
     assert rig.run_until(is_lost) <= 101
-    assert rig.adapter.state().hindrance == "the gear is neutral instead of drive"
+    assert rig.adapter.state().inhibit_reason == "the gear is neutral instead of drive"
 
 
 @both

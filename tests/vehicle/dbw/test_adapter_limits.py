@@ -38,8 +38,8 @@ def test_angle(generation: int) -> None:
     rig.run_ms(500)
     rig.actuation = Actuation(-0.5, 0.0, 0.2)
     rig.run_ms(500)
-    asked = [angle_deg for _, angle_deg in angles_deg(rig)]
-    assert (max(asked), min(asked)) == (30.0, -30.0)
+    requested = [angle_deg for _, angle_deg in angles_deg(rig)]
+    assert (max(requested), min(requested)) == (30.0, -30.0)
     assert rig.adapter.counts["limited_wheel_deg"] > 20
 
 
@@ -49,10 +49,10 @@ def test_rate(generation: int) -> None:
     rig = driving(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
     rig.actuation = Actuation(0.2, 0.0, 0.0)
     rig.run_ms(400)
-    asked = angles_deg(rig)
-    for (before_ns, before_deg), (after_ns, after_deg) in pairwise(asked):
+    requested = angles_deg(rig)
+    for (before_ns, before_deg), (after_ns, after_deg) in pairwise(requested):
         assert abs(after_deg - before_deg) <= 100.0 * (after_ns - before_ns) / NS_PER_S + 0.1
-    assert asked[-1][1] > 30
+    assert requested[-1][1] > 30
 
 
 @both
@@ -139,11 +139,11 @@ def test_begins_where_the_wheel_is(generation: int) -> None:
 
 
 any_number = st.floats(allow_nan=False, allow_infinity=False)
-asked = st.builds(DriveCommand, any_number, any_number, any_number)
+requested = st.builds(DriveCommand, any_number, any_number, any_number)
 allowed = st.builds(DriveCommand, st.floats(-400, 400), st.floats(0, 0.6), st.floats(0, 0.8))
 
 
-@given(asked, allowed, st.integers(0, 10 * NS_PER_S))
+@given(requested, allowed, st.integers(0, 10 * NS_PER_S))
 def test_never_more(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
     """Whatever is asked, what is allowed is in range and no faster than the rates over at most 60 ms."""
     found = limited(LIMITS, wanted, before, passed_ns)
@@ -155,7 +155,7 @@ def test_never_more(wanted: DriveCommand, before: DriveCommand, passed_ns: int) 
 
 
 @given(allowed)
-def test_as_asked(wanted: DriveCommand) -> None:
+def test_as_requested(wanted: DriveCommand) -> None:
     """What is within the limits is not changed, but that there is no throttle while the brake is asked for."""
     found = limited(LIMITS, wanted, wanted, 0)
     assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)

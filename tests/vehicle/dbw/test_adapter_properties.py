@@ -72,9 +72,9 @@ def test_reports_come_back(name: str, data: st.DataObject) -> None:
 
 
 def generation_2_sealed(identifier: int, data: bytes) -> CanFrame:
-    from lavt.vehicle.software_car.frames import sealed
+    from lavt.vehicle.software_car.frames import with_crc
 
-    return CanFrame(identifier, sealed(identifier, data))
+    return CanFrame(identifier, with_crc(identifier, data))
 
 
 any_frame = st.builds(

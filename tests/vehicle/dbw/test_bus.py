@@ -121,18 +121,18 @@ def test_two_processes(opened: Callable[..., CanPort]) -> None:
 
 def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of `udp_multicast`, which counts as virtual, leave the machine only where the user says how far."""
-    asked: list[dict[str, Any]] = []
+    requested: list[dict[str, Any]] = []
     open_bus = can.Bus
 
     def note(**keys: Any) -> can.BusABC:
-        asked.append(keys)
+        requested.append(keys)
         return open_bus(**keys)
 
     monkeypatch.setattr(can, "Bus", note)
     opened("udp_multicast", GROUP, port=free_port())
     opened("udp_multicast", GROUP, port=free_port(), hop_limit=1)
     opened()
-    assert [keys.get("hop_limit") for keys in asked] == [0, 1, None]
+    assert [keys.get("hop_limit") for keys in requested] == [0, 1, None]
 
 
 def test_arrival(opened: Callable[..., CanPort]) -> None:
@@ -354,7 +354,7 @@ def test_closed(device: Device) -> None:
         port.send([STEERING], 0)
 
 
-REFUSED = [
+REJECTED = [
     ("nosuch", "can0", {}, "there is no CAN interface nosuch: name one of .*socketcan"),
     ("virtual", "", {}, "a bus of virtual needs a channel"),
     ("virtual", "x", {"receive_own_messages": True}, "leave out receive_own_messages"),
@@ -367,13 +367,13 @@ REFUSED = [
 @pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # python-can's
-@pytest.mark.parametrize(("interface", "channel", "options", "because"), REFUSED)
-def test_refused(interface: str, channel: str, options: dict[str, Any], because: str) -> None:
+@pytest.mark.parametrize(("interface", "channel", "options", "reason"), REJECTED)
+def test_rejected(interface: str, channel: str, options: dict[str, Any], reason: str) -> None:
     """A bus that cannot be opened is refused in one sentence."""
-    with pytest.raises(UserError, match=because) as refused:
+    with pytest.raises(UserError, match=reason) as rejected:
         CanPort(interface, channel, options, clock=MachineClock())
-    assert "\n" not in str(refused.value)
-    del refused
+    assert "\n" not in str(rejected.value)
+    del rejected
     gc.collect()  # while python-can's forgotten sockets are no matter
 
 
@@ -382,7 +382,7 @@ def test_refused(interface: str, channel: str, options: dict[str, Any], because:
 )
 def test_remedies(device: Device, number: int, remedy: str) -> None:
     """A channel that is not there, a right that is missing and a kernel without CAN are told with what to do."""
-    device.open_error = OSError(number, "refused")
+    device.open_error = OSError(number, "rejected")
     with pytest.raises(UserError, match=rf"breakable stick cannot be opened \(.*refused\): .*{remedy}"):
         CanPort("breakable", "stick", {}, clock=MachineClock())
 

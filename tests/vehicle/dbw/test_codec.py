@@ -123,7 +123,7 @@ def test_named_values() -> None:
     assert GENERATION_1.messages["GearReport"].signals["STATE"].names[4] == "DRIVE"
 
 
-REFUSED = [
+REJECTED = [
     ("NoSuchCmd", {}, "the DBC has no message NoSuchCmd"),
     ("SteeringCmd", {"SPEED": 1}, "SteeringCmd has no signal SPEED"),
     ("SteeringCmd", {"SCMD_TORQUE": 1}, "SCMD_TORQUE of SteeringCmd is not in a frame with this multiplexer"),
@@ -135,10 +135,10 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("message", "values", "because"), REFUSED)
-def test_refused(message: str, values: dict[str, float], because: str) -> None:
+@pytest.mark.parametrize(("message", "values", "reason"), REJECTED)
+def test_rejected(message: str, values: dict[str, float], reason: str) -> None:
     """What does not fit its message is refused, and the text says what and why."""
-    with pytest.raises(ValueError, match=because):
+    with pytest.raises(ValueError, match=reason):
         GENERATION_1.encode(message, values)
 
 
@@ -198,9 +198,9 @@ def test_no_dbc(tmp_path: Path) -> None:
         Codec(tmp_path / "missing.dbc")
     for text in ("", 'VERSION ""', "BO_ what", "\x00\xff"):
         (tmp_path / "bad.dbc").write_text(text, "latin-1")
-        with pytest.raises(UserError) as refused:
+        with pytest.raises(UserError) as rejected:
             Codec(tmp_path / "bad.dbc")
-        assert "\n" not in str(refused.value)
+        assert "\n" not in str(rejected.value)
 
 
 def test_without_cantools(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

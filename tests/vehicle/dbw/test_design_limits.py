@@ -44,7 +44,7 @@ def test_times(limit_ns: int, limit_ms: int) -> None:
 
 def test_other_limits() -> None:
     """A car stands below 0.1 m/s, the watchdog test brakes with 0.3, and a value may be 1e-6 steps over its range."""
-    assert (states.STANDING_BELOW_MPS, proving.BRAKE, codec.RANGE_SLACK_STEPS) == (0.1, 0.3, 1e-6)
+    assert (states.STATIONARY_BELOW_MPS, proving.BRAKE, codec.RANGE_SLACK_STEPS) == (0.1, 0.3, 1e-6)
 
 
 def test_units() -> None:

@@ -35,7 +35,7 @@ def changed(folder: Path, name: str, **changes: Any) -> Path:
     return path
 
 
-def refused(name_or_path: str | Path, **keys: Any) -> str:
+def rejected(name_or_path: str | Path, **keys: Any) -> str:
     with pytest.raises(UserError) as error:
         load_profile(str(name_or_path), **keys)
     said = str(error.value)
@@ -85,7 +85,7 @@ def test_sign_is_open() -> None:
     assert load_profile("dataspeed_gen1", steering_sign=-1).car.steering_sign == -1
     assert load_profile("dataspeed_gen2").car.steering_sign == 1
     assert load_profile("dataspeed_gen2", steering_sign=1).car.steering_sign == 1
-    assert "steering_sign 1, not -1" in refused("dataspeed_gen2", steering_sign=-1)
+    assert "steering_sign 1, not -1" in rejected("dataspeed_gen2", steering_sign=-1)
 
 
 def test_units() -> None:
@@ -98,13 +98,13 @@ def test_units() -> None:
 @pytest.mark.parametrize("name", ["dataspeed_gen3", "dataspeed_gen2:usr", ":user"])
 def test_no_such_profile(name: str) -> None:
     """A profile that does not exist is refused with the known ones."""
-    assert repr(name) in refused(name)
-    assert "dataspeed_gen1, dataspeed_gen2" in refused(name)
+    assert repr(name) in rejected(name)
+    assert "dataspeed_gen1, dataspeed_gen2" in rejected(name)
 
 
 def test_one_set_only() -> None:
     """A set of commands cannot be chosen where there is one."""
-    assert ":user" in refused("dataspeed_gen1:user")
+    assert ":user" in rejected("dataspeed_gen1:user")
 
 
 def test_own_file(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_other_dbc(tmp_path: Path) -> None:
     vendors.write_text("\n".join(line for line in text.splitlines() if not line.startswith('BA_ "Unverified"')))
     assert load_profile("dataspeed_gen2", str(vendors)).unverified == ()
     vendors.write_text(text.replace("RemoteSteerCmd", "SteerCmdRemote"))
-    assert "has no message 'RemoteSteerCmd': change the profile" in refused("dataspeed_gen2", dbc=str(vendors))
+    assert "has no message 'RemoteSteerCmd': change the profile" in rejected("dataspeed_gen2", dbc=str(vendors))
 
 
 def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
@@ -130,13 +130,13 @@ def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
     text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
     bare = tmp_path / "bare.dbc"
     bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
-    assert refused("dataspeed_gen1", dbc=str(bare)) == (
+    assert rejected("dataspeed_gen1", dbc=str(bare)) == (
         "dataspeed_gen1: a step of PCMD_PERCENT of BrakeCmd is 100% of a pedal: give it its scale or its unit in "
         "the DBC"
     )
 
 
-REFUSED: list[tuple[str, dict[str, Any], str]] = [
+REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("dataspeed_gen1", {"sent__brake__value": "PCMD_PRECENT"}, "BrakeCmd of its DBC has no signal 'PCMD_PRECENT'"),
     ("dataspeed_gen1", {"sent__brake__message": "BreakCmd"}, "its DBC has no message 'BreakCmd'"),
     ("dataspeed_gen1", {"sent__brake__value": "PCMD_TORQUE"}, "PCMD_TORQUE of BrakeCmd is in 'Nm': name a signal in"),
@@ -164,10 +164,10 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "said"), REFUSED, ids=[said for _, _, said in REFUSED])
-def test_refused(tmp_path: Path, name: str, changes: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("name", "changes", "said"), REJECTED, ids=[said for _, _, said in REJECTED])
+def test_rejected(tmp_path: Path, name: str, changes: dict[str, Any], said: str) -> None:
     """What a profile gets wrong is one sentence that says what to do."""
-    assert said in refused(changed(tmp_path, name, **changes))
+    assert said in rejected(changed(tmp_path, name, **changes))
 
 
 def test_section() -> None:

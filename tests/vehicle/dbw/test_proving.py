@@ -63,7 +63,7 @@ def test_proved(generation: int) -> None:
     proving = attempt.run()
     assert proving.failure == ""
     assert proving.seen is not None
-    assert 100 * NS_PER_MS <= proving.seen.let_go_ns == proving.seen.braked_ns <= 121 * NS_PER_MS
+    assert 100 * NS_PER_MS <= proving.seen.released_ns == proving.seen.braked_ns <= 121 * NS_PER_MS
     assert proving.seen.reports == 49  # each 20 ms; the first came before the silence was known to be one
     assert "watchdog has tripped" in proving.seen.words
     assert attempt.kit.state.gear == Gear.PARK
@@ -196,18 +196,18 @@ HINDERED: list[tuple[Callable[[Attempt], object], str]] = [
     (lambda it: setattr(it, "spoil", unsealed), "the kit is not heard: no "),
     (lambda it: setattr(it.kit.state, "gear", Gear.DRIVE), "the gear is drive: put it into park or neutral"),
     (lambda it: it.kit.set_fault("steering.fault", START_NS), "the kit cannot be enabled: the steering has a fault"),
-    (lambda it: it.kit.hinder("door", START_NS), "the kit cannot be enabled: a door is open"),
+    (lambda it: it.kit.inhibit("door", START_NS), "the kit cannot be enabled: a door is open"),
     (lambda it: it.kit.switch_remote(1, START_NS), "the kit cannot be enabled: RemoteReport has STATE pause"),
     (lambda it: it.proving.receive(CanFrame(0x201, bytes(8)), START_NS), "somebody else commands the kit (0x201)"),
     (lambda it: it.proving.bus_gone("pulled out"), "the bus is gone: pulled out"),
 ]
 
 
-@pytest.mark.parametrize(("hinder", "failure"), HINDERED, ids=[each[1][:40] for each in HINDERED])
-def test_hindered(hinder: Callable[[Attempt], object], failure: str) -> None:
+@pytest.mark.parametrize(("inhibit", "failure"), HINDERED, ids=[each[1][:40] for each in HINDERED])
+def test_hindered(inhibit: Callable[[Attempt], object], failure: str) -> None:
     """Whatever keeps the kit from being enabled at standstill is said, and nothing is sent."""
     attempt = Attempt(2)
-    hinder(attempt)
+    inhibit(attempt)
     proving = attempt.run()
     assert proving.seen is None
     assert proving.failure.startswith(failure)

@@ -17,8 +17,8 @@ NONE: frozenset[Axis] = frozenset()
 PAUSE_NS, LIMIT_NS, TIMEOUT_NS = 120 * NS_PER_MS, 3000 * NS_PER_MS, 100 * NS_PER_MS
 GOOD = Situation(
     wanted=True,
-    is_standing=True,
-    hindrance="",
+    is_stationary=True,
+    inhibit_reason="",
     unheard="",
     silent_ns=0,
     faults="",
@@ -68,8 +68,8 @@ CAUSES: list[Cause] = [
     ("trip", {"trips": "t"}, dict.fromkeys(("enabling", "engaged"), "lost")),
     ("lapse", {"lapses": "l"}, {"engaged": "lost"}),
     ("reason only", {"reasons": "r"}, {}),
-    ("hindrance only", {"hindrance": "h"}, {}),
-    ("car moves", {"is_standing": False}, {}),
+    ("hindrance only", {"inhibit_reason": "h"}, {}),
+    ("car moves", {"is_stationary": False}, {}),
     ("gear unknown", {"gear": None}, {"engaged": "lost"}),
     ("reverse", {"gear": "reverse"}, {"engaged": "lost"}),
     ("park", {"gear": "park"}, {"engaged": "lost"}),
@@ -90,12 +90,12 @@ def test_a_cause_ends_the_states_that_it_concerns(
 
 WANTED = {"wanted": True, "enabled": NONE, "gear": "park"}
 NOT_WANTED = {"wanted": False}
-LET_GO = {"wanted": False, "enabled": NONE}
-HINDERED = {**WANTED, "hindrance": "h"}
+RELEASED = {"wanted": False, "enabled": NONE}
+HINDERED = {**WANTED, "inhibit_reason": "h"}
 READY = {"enabled": ALL, "gear": "drive"}
 ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("idle", WANTED, "clearing"),
-    ("idle", {**WANTED, "is_standing": False}, "idle"),
+    ("idle", {**WANTED, "is_stationary": False}, "idle"),
     ("idle", HINDERED, "idle"),
     ("clearing", {"since_ns": PAUSE_NS - 1}, "clearing"),
     ("clearing", {"since_ns": PAUSE_NS}, "enabling"),
@@ -115,22 +115,22 @@ ROWS: list[tuple[State, dict[str, Any], State]] = [
     ("enabling", NOT_WANTED, "parking"),
     ("engaged", {"since_ns": LIMIT_NS}, "engaged"),
     ("engaged", NOT_WANTED, "parking"),
-    ("parking", {**LET_GO, "since_ns": PAUSE_NS - 1}, "parking"),
-    ("parking", {**LET_GO, "since_ns": PAUSE_NS}, "idle"),
-    ("parking", {**LET_GO, "wanted": True, "since_ns": PAUSE_NS}, "idle"),
+    ("parking", {**RELEASED, "since_ns": PAUSE_NS - 1}, "parking"),
+    ("parking", {**RELEASED, "since_ns": PAUSE_NS}, "idle"),
+    ("parking", {**RELEASED, "wanted": True, "since_ns": PAUSE_NS}, "idle"),
     *(("parking", {"enabled": frozenset({axis}), "since_ns": LIMIT_NS}, "parking") for axis in AXES),
     ("lost", {"enabled": NONE, "since_ns": LIMIT_NS}, "lost"),
     ("lost", NOT_WANTED, "parking"),
     *(("lost", {"wanted": False, "enabled": frozenset({axis})}, "parking") for axis in AXES),
     ("lost", {**NOT_WANTED, "unheard": "u"}, "lost"),
-    ("lost", LET_GO, "idle"),
-    ("lost", {**LET_GO, "is_standing": False}, "idle"),
-    ("lost", {**LET_GO, "unheard": "u"}, "lost"),
-    ("overridden", LET_GO, "idle"),
-    ("overridden", {**LET_GO, "overrides": "o"}, "idle"),
-    ("overridden", {**LET_GO, "wanted": True}, "overridden"),
-    ("overridden", {**LET_GO, "is_standing": False}, "overridden"),
-    ("overridden", {**LET_GO, "unheard": "u"}, "overridden"),
+    ("lost", RELEASED, "idle"),
+    ("lost", {**RELEASED, "is_stationary": False}, "idle"),
+    ("lost", {**RELEASED, "unheard": "u"}, "lost"),
+    ("overridden", RELEASED, "idle"),
+    ("overridden", {**RELEASED, "overrides": "o"}, "idle"),
+    ("overridden", {**RELEASED, "wanted": True}, "overridden"),
+    ("overridden", {**RELEASED, "is_stationary": False}, "overridden"),
+    ("overridden", {**RELEASED, "unheard": "u"}, "overridden"),
     *(("overridden", {"wanted": False, "enabled": frozenset({axis})}, "overridden") for axis in AXES),
 ]
 
@@ -194,7 +194,7 @@ def test_what_else_the_kit_reports_is_a_part_of_the_reason(state: State, cause: 
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_the_axes_that_do_not_obey_are_named(axis: Axis) -> None:
+def test_the_axes_that_do_not_accept_are_named(axis: Axis) -> None:
     """An axis that the kit has let go of or did not enable is named, and no other; clearing is about no axis."""
     others = {"enabled": ALL - {axis}}
     for said in (reason("engaged", **others), reason("enabling", **others, since_ns=LIMIT_NS)):

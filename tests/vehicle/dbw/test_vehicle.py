@@ -27,7 +27,7 @@ class StandInPort:
         self.waiting: list[ReceivedCanFrame] = []
         self.sent: list[tuple[CanFrame, int]] = []
         self.wake_ns: int | None = None
-        self.taken_ns = 0
+        self.captured_ns = 0
         self.is_gone = self.is_closed = False
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
@@ -38,7 +38,7 @@ class StandInPort:
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return what is waiting, once, and keep when it was taken."""
         self._check()
-        self.taken_ns = now_ns
+        self.captured_ns = now_ns
         taken, self.waiting = self.waiting, []
         return taken
 
@@ -76,7 +76,7 @@ def test_without_truth(port: StandInPort) -> None:
     assert vehicle.advance(START_NS + NS_PER_MS) == []
     assert vehicle.ground_truth() is None
     assert vehicle.state().speed_mps > 0
-    assert port.taken_ns == START_NS + NS_PER_MS
+    assert port.captured_ns == START_NS + NS_PER_MS
 
 
 def test_truth_and_events(port: StandInPort) -> None:
@@ -126,17 +126,17 @@ def test_bus_gone(port: StandInPort) -> None:
     port.is_gone = True
     vehicle.advance(START_NS + 1)
     vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
-    assert "pulled out" in vehicle.state().hindrance
+    assert "pulled out" in vehicle.state().inhibit_reason
     port.is_gone = False
     port.waiting = [ReceivedCanFrame(SPEED, START_NS + 3)]
     vehicle.advance(START_NS + 3)
-    assert "pulled out" not in vehicle.state().hindrance
+    assert "pulled out" not in vehicle.state().inhibit_reason
 
 
 def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the adapter has due leaves with the time of the tick, after the bus was heard."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
-    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.taken_ns == now_ns else [])
+    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.captured_ns == now_ns else [])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
     assert port.sent == [(SPEED, START_NS + 7)]
@@ -165,7 +165,7 @@ def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(port, "send", fail)
     vehicle.apply(Actuation(0.0, 0.0, 0.0), START_NS + 2)
-    assert "no more room" in vehicle.state().hindrance
+    assert "no more room" in vehicle.state().inhibit_reason
 
 
 def test_what_it_passes_on(port: StandInPort) -> None:

@@ -144,7 +144,7 @@ def test_full_throttle_accelerates_as_stated() -> None:
     assert car.motion.y_m == 0.0
 
 
-def test_without_a_lag_the_next_step_has_what_was_asked() -> None:
+def test_without_a_lag_the_next_step_has_what_was_requested() -> None:
     """Lags of zero are no lags: pedals are there at once, the wheels as fast as their rate allows."""
     car = car_at(parameters=replace(CAR, steering_lag_s=0.0, throttle_lag_s=0.0, brake_lag_s=0.0))
     car.step(Actuation(0.001, 0.5, 0.25))

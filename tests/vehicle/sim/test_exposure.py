@@ -74,7 +74,7 @@ def test_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
     """In a drive it is half the exposure and the delay, and what drawing and checking cost, to the microsecond."""
     (tmp_path / "run").mkdir()
     late_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
-    costs_us = read_costs().hops_us["camera"]
+    costs_us = read_costs().stages_us["camera"]
     assert len(late_us) > 50
     assert {abs(each - round(31_500 + costs_us["capture"] + costs_us["check"])) for each in late_us} <= {0, 1}
 

@@ -27,7 +27,7 @@ def crc_by_division(identifier: int, data: bytes) -> int:
     return number ^ 0xFF
 
 
-def sealed(identifier: int, data: bytes) -> CanFrame:
+def with_crc(identifier: int, data: bytes) -> CanFrame:
     return CanFrame(identifier, data + bytes([crc_by_division(identifier, data)]))
 
 
@@ -50,16 +50,19 @@ class Hand1:
     def __init__(self) -> None:
         self.count = 0
 
-    def commands(self, asked: Asked) -> list[CanFrame]:
+    def commands(self, requested: Asked) -> list[CanFrame]:
         """Steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 256
-        bits = asked.enable | asked.clear << 1 | asked.ignore << 2
+        bits = requested.enable | requested.clear << 1 | requested.ignore << 2
         return [
             CanFrame(
-                0x064, struct.pack("<hBBBBBB", round(asked.angle_deg * 10), bits, asked.rate, 0, 0, 0, self.count)
+                0x064,
+                struct.pack("<hBBBBBB", round(requested.angle_deg * 10), bits, requested.rate, 0, 0, 0, self.count),
             ),
-            CanFrame(0x060, struct.pack("<HBBBBBB", round(asked.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
-            CanFrame(0x062, struct.pack("<HBBBBBB", round(asked.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
+            CanFrame(0x060, struct.pack("<HBBBBBB", round(requested.brake * 65535), 2 << 4, bits, 0, 0, 0, self.count)),
+            CanFrame(
+                0x062, struct.pack("<HBBBBBB", round(requested.throttle * 65535), 2 << 4, bits, 0, 0, 0, self.count)
+            ),
         ]
 
     def clearing(self) -> list[CanFrame]:
@@ -81,16 +84,16 @@ class Hand2:
     def __init__(self, first: int = 0x200) -> None:
         self.count, self.first = 0, first
 
-    def commands(self, asked: Asked) -> list[CanFrame]:
+    def commands(self, requested: Asked) -> list[CanFrame]:
         """Steering, brake and throttle, with the next counter."""
         self.count = (self.count + 1) % 16
-        bits = asked.enable << 4 | asked.clear << 5 | asked.ignore << 6
+        bits = requested.enable << 4 | requested.clear << 5 | requested.ignore << 6
         tail = (0, 0, self.count)
-        steering = struct.pack("<hBBBBB", round(asked.angle_deg * 10), 2 | bits, asked.rate, *tail)
-        pedals = [(1, round(asked.brake * 10_000)), (2, round(asked.throttle * 4_000))]
+        steering = struct.pack("<hBBBBB", round(requested.angle_deg * 10), 2 | bits, requested.rate, *tail)
+        pedals = [(1, round(requested.brake * 10_000)), (2, round(requested.throttle * 4_000))]
         return [
-            sealed(self.first, steering),
-            *(sealed(self.first + part, struct.pack("<HBBBBB", raw, 14 | bits, 0, *tail)) for part, raw in pedals),
+            with_crc(self.first, steering),
+            *(with_crc(self.first + part, struct.pack("<HBBBBB", raw, 14 | bits, 0, *tail)) for part, raw in pedals),
         ]
 
     def clearing(self) -> list[CanFrame]:
@@ -100,12 +103,12 @@ class Hand2:
     def gear(self, gear: int, clear: bool = False) -> CanFrame:
         """A gear by its number."""
         assert not clear
-        return sealed(self.first + 3, bytes([gear, 0, 0]))
+        return with_crc(self.first + 3, bytes([gear, 0, 0]))
 
     def system(self, request: int) -> CanFrame:
         """A request to the system: 0 nothing, 1 enable, 2 disable."""
         self.count = (self.count + 1) % 16
-        return sealed(0x216, bytes([request | self.count << 4]))
+        return with_crc(0x216, bytes([request | self.count << 4]))
 
 
 class Rig:

@@ -1,5 +1,5 @@
 import pytest
-from tests.vehicle.software_car.rig import ALL, Asked, Hand2, Rig, both, driving, sealed
+from tests.vehicle.software_car.rig import ALL, Asked, Hand2, Rig, both, driving, with_crc
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import ReleaseReason, SystemState
@@ -14,7 +14,7 @@ def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
     assert rig.enabled() == {"steering"}
 
 
-def test_generation_2_enables_when_asked_and_all_axes_are_commanded() -> None:
+def test_generation_2_enables_when_requested_and_all_axes_are_commanded() -> None:
     """In generation 2 nothing obeys until the system is asked to enable and every axis is commanded with EN on."""
     rig = Rig(2)
     rig.command()
@@ -51,7 +51,7 @@ def test_disabling_in_park_is_quiet(generation: int) -> None:
     assert (rig.enabled(), state.watchdog, state.watchdog_brakes) == (set(), ReleaseReason.NONE, False)
 
 
-def test_generation_2_has_to_be_asked_anew() -> None:
+def test_generation_2_has_to_be_requested_anew() -> None:
     """Once the kit has let go, requests that were coming all along do not enable it: they have to begin anew."""
     rig = driving(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
@@ -65,7 +65,7 @@ def test_generation_2_has_to_be_asked_anew() -> None:
     assert rig.enabled() == ALL
 
 
-def test_only_the_chosen_set_is_obeyed() -> None:
+def test_only_the_chosen_set_is_accepted() -> None:
     """A kit that obeys the remote's set does not hear the user's, and the other way round."""
     rig = Rig(2)
     rig.hand = Hand2(0x210)
@@ -87,7 +87,7 @@ def test_commands_reach_the_wheels(generation: int) -> None:
 
 
 @both
-def test_the_wheel_turns_no_faster_than_asked(generation: int) -> None:
+def test_the_wheel_turns_no_faster_than_requested(generation: int) -> None:
     """At 25 steps, 100 deg/s, the wheel is at 10 degrees after 100 ms; without a rate it turns at 17.5 rad/s."""
     rig = driving(generation)
     for _ in range(5):
@@ -119,7 +119,7 @@ def test_an_unknown_type_of_command_enables_nothing(generation: int) -> None:
     _, brake, _ = rig.hand.commands(Asked(brake=0.5))
     data = bytearray(brake.data)
     data[2] = 7 << 4 if generation == 1 else 1 << 4 | 7
-    rig.send(CanFrame(0x060, bytes(data)) if generation == 1 else sealed(0x201, bytes(data[:-1])))
+    rig.send(CanFrame(0x060, bytes(data)) if generation == 1 else with_crc(0x201, bytes(data[:-1])))
     assert rig.enabled() == (ALL - {"brake"} if generation == 1 else set())
 
 

@@ -47,16 +47,16 @@ def test_what_is_broken_is_not_enabled(generation: int, name: str) -> None:
         ("reverse", ReleaseReason.LOCKOUT_REVERSE),
     ],
 )
-def test_what_hinders_generation_2(name: str, reason: ReleaseReason) -> None:
+def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
     """Belt, door and lockouts keep generation 2 in manual, and it says why; while driving it lets go and brakes."""
     rig = Rig(2)
-    rig.kit.hinder(name, rig.now_ns)
+    rig.kit.inhibit(name, rig.now_ns)
     rig.command()
     rig.ask()
     assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), SystemState.MANUAL, reason)
-    rig.kit.hinder(None, rig.now_ns)
+    rig.kit.inhibit(None, rig.now_ns)
     assert rig.enabled() == ALL
-    rig.kit.hinder(name, rig.now_ns)
+    rig.kit.inhibit(name, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.watchdog_brakes) == (set(), True)
 
 
@@ -84,13 +84,13 @@ def test_bus_off_is_silence(generation: int) -> None:
 
 
 @both
-def test_unknown_names_are_refused(generation: int) -> None:
+def test_unknown_names_are_rejected(generation: int) -> None:
     """A fault, hindrance, value or gear that there is not is refused in a sentence that names the known ones."""
     kit = Rig(generation).kit
     with pytest.raises(UserError, match=r"no fault 'brake\.smoke': the known ones are brake"):
         kit.set_fault("brake.smoke", 10**12)
     with pytest.raises(UserError, match="no hindrance 'rain'"):
-        kit.hinder("rain", 10**12)
+        kit.inhibit("rain", 10**12)
     with pytest.raises(UserError, match="no value that can be unknown 'mood'"):
         kit.set_unknown("mood")
     with pytest.raises(UserError, match="no gear of this car 'REVERSE'"):

@@ -32,7 +32,7 @@ def hand_of(generation: int) -> Hand1 | Hand2:
 
 
 def drive(
-    generation: int, looks_each_ms: int, *, asked: Asked, duration_ms: int = 3_000
+    generation: int, looks_each_ms: int, *, requested: Asked, duration_ms: int = 3_000
 ) -> tuple[list[ReceivedCanFrame], GroundTruth, list[VehicleEvent]]:
     """Command every 20 ms, look at the port however often, and tell all that came."""
     port, hand = port_of(generation), hand_of(generation)
@@ -46,7 +46,7 @@ def drive(
         events += new
         if passed_ms % 20 == 0:
             early = passed_ms < 100
-            port.send(hand.commands(Asked(brake=0.5) if early else asked), now_ns)
+            port.send(hand.commands(Asked(brake=0.5) if early else requested), now_ns)
             if early:
                 port.send([*([hand.system(1)] if isinstance(hand, Hand2) else []), hand.gear(4)], now_ns)
     assert truth is not None
@@ -56,8 +56,8 @@ def drive(
 @both
 def test_a_drive_is_the_same_however_often_it_is_looked_at(generation: int) -> None:
     """The same frames at the same times give the same frames back at the same times, the same truth and events."""
-    asked = Asked(throttle=0.5, angle_deg=200.0)
-    seldom, often = drive(generation, 20, asked=asked), drive(generation, 1, asked=asked)
+    requested = Asked(throttle=0.5, angle_deg=200.0)
+    seldom, often = drive(generation, 20, requested=requested), drive(generation, 1, requested=requested)
     assert seldom == often
     _, truth, events = seldom
     assert truth.speed_mps > 1.0

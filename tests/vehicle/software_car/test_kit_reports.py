@@ -191,7 +191,7 @@ def test_what_is_unknown_is_told_as_unknown() -> None:
     assert reports(second)[0x107][:4] == b"\x00\x80\x00\x80"
 
 
-def test_a_refused_gear_is_told() -> None:
+def test_a_rejected_gear_is_told() -> None:
     """Generation 1 tells the refusal: 5, press the brake."""
     rig = Rig(1)
     rig.send(rig.hand.gear(4))

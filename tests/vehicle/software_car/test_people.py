@@ -95,25 +95,25 @@ def test_a_shift_needs_the_brake(generation: int) -> None:
 
 
 @both
-def test_why_gears_are_refused(generation: int) -> None:
+def test_why_gears_are_rejected(generation: int) -> None:
     """Park while moving 5, reverse 6, after the driver's shift 2, with a fault 7, and no gear at all is no request."""
     rig = driving(generation)
 
-    def refusal(gear: int) -> GearRejection:
+    def rejection(gear: int) -> GearRejection:
         rig.command(brake=0.5)
         rig.send(rig.hand.gear(gear))
         return rig.kit.state.gear_reject
 
-    assert [refusal(gear) for gear in (1, 2, 5, 0)] == [
+    assert [rejection(gear) for gear in (1, 2, 5, 0)] == [
         GearRejection.VEHICLE,
         GearRejection.UNSUPPORTED,
         GearRejection.UNSUPPORTED,
         GearRejection.NONE,
     ]
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
-    assert refusal(4) == GearRejection.OVERRIDE
+    assert rejection(4) == GearRejection.OVERRIDE
     rig.kit.set_fault(f"gear.{'FLTBUS' if generation == 1 else 'fault'}", rig.now_ns)
-    assert refusal(4) == GearRejection.FAULT
+    assert rejection(4) == GearRejection.FAULT
     assert rig.kit.state.gear == Gear.NEUTRAL
 
 

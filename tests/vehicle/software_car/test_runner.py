@@ -69,9 +69,9 @@ class Life:
 
     def listen(self) -> list[tuple[str, str]]:
         """Take the news."""
-        news = [(each.kind, each.text) for each in self.runner.take_news()]
-        self.said += news
-        return news
+        events = [(each.kind, each.text) for each in self.runner.take_events()]
+        self.said += events
+        return events
 
     def enable(self) -> None:
         """Enable the kit and shift into drive."""
@@ -102,9 +102,9 @@ def test_the_car_catches_up() -> None:
     wake_ns = life.runner.next_wake_ns()
     life.now_ns += 300 * NS_PER_MS
     life.runner.step(life.now_ns)
-    news = life.runner.take_news()
+    events = life.runner.take_events()
     assert life.now_ns - life.car.simulator.state().mono_ns <= STEP_NS
-    (watchdog,) = [each for each in news if each.kind == "watchdog"]
+    (watchdog,) = [each for each in events if each.kind == "watchdog"]
     assert watchdog.text == "watchdog brakes: no command in time (brake)"
     assert watchdog.mono_ns == life.now_ns - 220 * NS_PER_MS
     assert life.runner.latest_ns == life.now_ns - wake_ns
@@ -180,7 +180,7 @@ def test_the_news_of_the_watchdog() -> None:
     ]
 
 
-def test_a_gear_that_is_refused() -> None:
+def test_a_gear_that_is_rejected() -> None:
     """A gear that cannot be had is told with the reason."""
     life = Life()
     life.come(life.hand.gear(4))
@@ -188,8 +188,8 @@ def test_a_gear_that_is_refused() -> None:
     life.come(life.hand.gear(2))
     life.step_ms()
     assert life.said == [
-        ("refused", "gear 4 refused: the brake is not pressed, or the car moves"),
-        ("refused", "gear 2 refused: this car has no such gear"),
+        ("rejected", "gear 4 refused: the brake is not pressed, or the car moves"),
+        ("rejected", "gear 2 refused: this car has no such gear"),
     ]
 
 
@@ -198,7 +198,7 @@ def test_what_happens_on_the_road_is_news() -> None:
     life = Life()
     life.car.events.append(VehicleEvent(START_NS + 1, "lane_invasion", "to the left"))
     life.runner.step(START_NS + 10 * NS_PER_MS)
-    assert [(each.mono_ns, each.kind, each.text) for each in life.runner.take_news()] == [
+    assert [(each.mono_ns, each.kind, each.text) for each in life.runner.take_events()] == [
         (START_NS + 1, "event", "lane_invasion: to the left")
     ]
     life.step_ms(20)
@@ -211,7 +211,7 @@ def test_words_that_are_none() -> None:
     life.runner.act("   ", life.now_ns)
     assert life.listen() == []
     life.runner.act("jump", life.now_ns)
-    assert life.listen() == [("refused", "there is no word 'jump': help lists them")]
+    assert life.listen() == [("rejected", "there is no word 'jump': help lists them")]
     life.runner.act(" help\n", life.now_ns)
     assert {kind for kind, _ in life.listen()} == {"help"}
 

@@ -93,7 +93,7 @@ def test_a_silent_sender_stops_the_car(generation: int) -> None:
 
 
 @both
-def test_a_command_is_obeyed_from_the_next_step(generation: int) -> None:
+def test_a_command_is_accepted_from_the_next_step(generation: int) -> None:
     """A command that comes between two steps of 1/240 s is obeyed from the next one on."""
     drive = Drive(generation)
     drive.wait_ms(20)

@@ -70,7 +70,7 @@ class _Correction:
     The root distance reaches over the path to that host and beyond, and goes by the best samples; what is told of the
     path goes by the last one: both hold, and the smaller counts.
     """
-    asked_ns: FloatArray
+    requested_ns: FloatArray
     """What the correction can have changed by while the source was asked for it."""
 
     def at(self, reference_ns: IntArray, values: FloatArray) -> FloatArray:
@@ -100,7 +100,7 @@ def by_sources(server: Table, client: Table) -> ClockOffset | None:
         peer_bound_ns = follower.at(moments, follower.peer_bound_ns)
         bound_ns = np.where(np.isfinite(peer_bound_ns), peer_bound_ns, bound_ns)
     for each in (of_server, of_client):
-        bound_ns = bound_ns + each.at(moments, each.asked_ns) + _missed_ns(moments, each)
+        bound_ns = bound_ns + each.at(moments, each.requested_ns) + _missed_ns(moments, each)
     correction_ns = of_client.at(moments, of_client.correction_ns)
     delta_ns = correction_ns - of_server.at(moments, of_server.correction_ns)
     outside = 2 * float(np.max(np.abs(_rates(moments, delta_ns))[[0, -1]])) if len(moments) > 1 else DRIFT_ALLOWANCE
@@ -130,12 +130,12 @@ def _correction(samples: Table, other: Table) -> _Correction | None:
     reference_ns, correction_ns, samples = reference_ns[order], correction_ns[order], _ordered(samples, order)
     half_asking_ns = np.nan_to_num(samples.floats("asking_s")) * NS_PER_S / 2
     rates = np.abs(_rates(reference_ns, correction_ns))
-    asked_ns = half_asking_ns * np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
+    requested_ns = half_asking_ns * np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
     drift_s = samples.floats("skew_ppm") / 1e6 * samples.floats("age_s")
     path_s = samples.floats("peer_delay_s") / 2 + samples.floats("peer_dispersion_s") + drift_s
     own_bound_s = samples.floats("bound_s")
     following_s = np.where(follows(samples, other), np.fmin(path_s, own_bound_s), np.nan)
-    return _Correction(reference_ns, correction_ns, own_bound_s * NS_PER_S, following_s * NS_PER_S, asked_ns)
+    return _Correction(reference_ns, correction_ns, own_bound_s * NS_PER_S, following_s * NS_PER_S, requested_ns)
 
 
 def _ordered(samples: Table, order: IntArray) -> Table:

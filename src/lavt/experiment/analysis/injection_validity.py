@@ -25,8 +25,8 @@ LEAST_SHARE = 0.9
 """Of a constant delay the whole must be there; laws with jitter can have a median below it."""
 
 
-def recorded_reasons(server: Record, client: Record, condition: str, asked_ms: Mapping[str, float]) -> list[str]:
-    """Say what speaks against the injection of a run; `asked_ms` is that of its condition, by flow.
+def recorded_reasons(server: Record, client: Record, condition: str, requested_ms: Mapping[str, float]) -> list[str]:
+    """Say what speaks against the injection of a run; `requested_ms` is that of its condition, by flow.
 
     On the server only samples from the last before the drive to its end count; of the client all do, because its clock
     does not know when the drive was, and it drives under one condition only. Without a condition (empty) none may have
@@ -43,15 +43,17 @@ def recorded_reasons(server: Record, client: Record, condition: str, asked_ms: M
     reasons = []
     for side, table in samples.items():
         others = [each for each in table.texts("condition") if each != condition]
-        doubts = [each for each in table.texts("because") if each]
+        doubts = [each for each in table.texts("reason") if each]
         if len(table) == 0:
             reasons.append(f"the {side} did not say that condition {condition} was in force")
         elif (silent_s := _silent_s(table, ended_ns if side == "server" else None)) > SILENCE_LIMIT_S:
             reasons.append(f"the {side} did not measure condition {condition} for {silent_s:.0f} s")
         elif others or doubts:
-            because = f": {doubts[0]}" if doubts else ""
-            reasons.append(f"condition {condition} was not in force as asked on the {side} all the time{because}")
-    unmeasured = [flow for flow, side in SENT_BY.items() if asked_ms[flow] and not _is_measured(samples[side], flow)]
+            reason = f": {doubts[0]}" if doubts else ""
+            reasons.append(f"condition {condition} was not in force as asked on the {side} all the time{reason}")
+    unmeasured = [
+        flow for flow, side in SENT_BY.items() if requested_ms[flow] and not _is_measured(samples[side], flow)
+    ]
     return reasons + [f"nobody measured the injected delay of {flow}" for flow in unmeasured]
 
 
@@ -71,7 +73,7 @@ def _silent_s(table: Table, ended_ns: int | None) -> float:
     return float(np.max(np.diff(times_ns), initial=0)) / NS_PER_S
 
 
-def absent_reasons(entry: Mapping[str, Any], asked_ms: Mapping[str, float]) -> list[str]:
+def absent_reasons(entry: Mapping[str, Any], requested_ms: Mapping[str, float]) -> list[str]:
     """Say where latencies are too short for what was injected: it was on another path than the video or the control.
 
     `entry` has `tau_v_ms` and `tau_c_ms` with their bounds, as in `result.json`.
@@ -79,9 +81,9 @@ def absent_reasons(entry: Mapping[str, Any], asked_ms: Mapping[str, float]) -> l
     reasons = []
     for flow, key in (("video", "tau_v_ms"), ("control", "tau_c_ms")):
         median_ms, bound_ms = entry[key]["p50"], entry[key]["bound"] or 0.0
-        if median_ms is not None and median_ms + bound_ms < LEAST_SHARE * asked_ms[flow]:
+        if median_ms is not None and median_ms + bound_ms < LEAST_SHARE * requested_ms[flow]:
             reasons.append(
-                f"the {flow} took {median_ms:.1f} ms in the median where {asked_ms[flow]:g} ms were injected: the "
+                f"the {flow} took {median_ms:.1f} ms in the median where {requested_ms[flow]:g} ms were injected: the "
                 "delay is not on its path, look at interface and ports"
             )
     return reasons

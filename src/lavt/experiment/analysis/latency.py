@@ -91,9 +91,9 @@ class AcceptedLoops:
         return self.commands.ints("applied_mono_ns") - self.commands.ints("received_mono_ns")
 
 
-def obeyed(admissions: Table) -> Table:
+def accepted(admissions: Table) -> Table:
     """Commands that were obeyed, in the order in which they came into force."""
-    chosen = np.array([verdict == "obeyed" for verdict in admissions.texts("verdict")], np.bool_)
+    chosen = np.array([verdict == "accepted" for verdict in admissions.texts("verdict")], np.bool_)
     commands = admissions.where(chosen & (admissions.ints("applied_mono_ns") != MISSING))
     order = np.argsort(commands.ints("applied_mono_ns"), kind="stable")
     columns = {name: column[order] for name, column in commands.columns.items()}
@@ -102,7 +102,7 @@ def obeyed(admissions: Table) -> Table:
 
 def loops(frames: Table, admissions: Table, ended_ns: int) -> AcceptedLoops:
     """Pair each of `frames` with the first obeyed command that carries its stamp and was applied by `ended_ns`."""
-    commands = obeyed(admissions)
+    commands = accepted(admissions)
     commands = commands.where(commands.ints("applied_mono_ns") <= ended_ns)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     _, first = np.unique(commands.ints("stamp_ns"), return_index=True)
@@ -142,7 +142,7 @@ def picture_age(frames: Table, admissions: Table, began_ns: int, ended_ns: int) 
 
     `frames` are all frames of the run, because the first command in force may be older than the interval.
     """
-    commands = obeyed(admissions)
+    commands = accepted(admissions)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     starts_ns = np.clip(commands.ints("applied_mono_ns"), began_ns, ended_ns)
     ends_ns = np.append(starts_ns[1:], ended_ns)[: len(starts_ns)]
@@ -158,7 +158,7 @@ def picture_age(frames: Table, admissions: Table, began_ns: int, ended_ns: int) 
 
 def ages_at_actuation_ns(frames: Table, admissions: Table, began_ns: int, ended_ns: int) -> IntArray:
     """How old its picture was when each obeyed command was applied, whether or not an earlier one was made from it."""
-    commands = obeyed(admissions)
+    commands = accepted(admissions)
     applied_ns = commands.ints("applied_mono_ns")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), commands.ints("stamp_ns"))
     known = (stamped_ns != MISSING) & (applied_ns >= began_ns) & (applied_ns <= ended_ns)

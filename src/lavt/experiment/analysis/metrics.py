@@ -22,7 +22,7 @@ from lavt.experiment.analysis.latency import (
     pictures_of,
     video_latency_ns,
 )
-from lavt.experiment.analysis.stage_latency import hop_percentiles
+from lavt.experiment.analysis.stage_latency import stage_percentiles
 from lavt.experiment.analysis.steering import steering
 from lavt.experiment.analysis.tracking import cross_track, distance_m, heading, p95_by_10m, per_km, route_length_m
 from lavt.recording.record import Record
@@ -120,7 +120,7 @@ def _latencies(
         "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, admissions, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
-        "hops_ms": hop_percentiles(server, client, frames, tau_c_ns, on_one_scale.offset),
+        "stages_ms": stage_percentiles(server, client, frames, tau_c_ns, on_one_scale.offset),
         "frames_sent": len(frames),
         "frames_decoded": len(pictures),
         "frames_unreadable": int(np.sum(~pictures.flags("readable"))),

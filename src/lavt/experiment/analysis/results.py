@@ -10,7 +10,7 @@ from typing import Any
 from lavt.errors import WorkError
 from lavt.experiment.analysis.injection_validity import absent_reasons
 from lavt.experiment.analysis.metrics import measure
-from lavt.experiment.analysis.validity import invalid_because
+from lavt.experiment.analysis.validity import invalid_reasons
 from lavt.recording.json_payload import without_nan
 from lavt.recording.record import Record
 
@@ -65,7 +65,7 @@ MEASURES = (
     "age_at_actuation_ms",
     "tau_v_ms",
     "tau_c_ms",
-    "hops_ms",
+    "stages_ms",
     "delta",
     "frames_sent",
     "frames_decoded",
@@ -88,7 +88,7 @@ def run_result(
     kept. `reasons` are those against the run that records do not show.
     """
     measured = measure(server, client)
-    against = [*invalid_because(server, client, measured), *reasons]
+    against = [*invalid_reasons(server, client, measured), *reasons]
     if not against and "injected_ms" in identity:  # where clocks are wrong, latencies are
         against = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     further = {key: identity[key] for key in FURTHER if key in identity}
@@ -98,7 +98,7 @@ def run_result(
         "digest": digest,
         "ending": measured.entry["ending"],
         "valid": not against,
-        "invalid_because": against,
+        "invalid_reasons": against,
         **{key: measured.entry[key] for key in MEASURES},
     }
 

@@ -24,7 +24,7 @@ Durations = list[tuple[Hop, IntArray]]
 """For each hop, in order, how long it took for each frame that it was done for."""
 
 
-def hop_percentiles(
+def stage_percentiles(
     server: Record, client: Record, frames: Table, tau_c_ns: IntArray, offset: ClockOffset | None
 ) -> list[dict[str, Any]]:
     """Tell of each hop of the life of `frames`, in order, how long it took: p50 and p95 in ms, and of how many.
@@ -34,34 +34,34 @@ def hop_percentiles(
     pictures = pictures_of(client.table("picture"), frames)
     sent = video_link_ns(server.table("timeline"), pictures, frames, offset) if offset else np.zeros(0, np.int64)
     life = chain(
-        camera_hops(server, frames),
+        camera_stages(server, frames),
         [(("network", "video link"), sent)],
-        client_hops(client, frames),
+        client_stages(client, frames),
         [(("network", "control link"), tau_c_ns)],
-        actuator_hops(server, frames),
+        actuator_stages(server, frames),
         [(TO_WHEEL, wheel_ns(server, frames))],
     )
-    return [_entry(hop, durations_ns) for hop, durations_ns in life if len(durations_ns)]
+    return [_entry(stage, durations_ns) for stage, durations_ns in life if len(durations_ns)]
 
 
-def _entry(hop: Hop, durations_ns: IntArray) -> dict[str, Any]:
+def _entry(stage: Hop, durations_ns: IntArray) -> dict[str, Any]:
     p50, p95 = np.percentile(durations_ns / NS_PER_MS, [50, 95])
-    return {"node": hop[0], "hop": hop[1], "p50": float(p50), "p95": float(p95), "n": len(durations_ns)}
+    return {"node": stage[0], "stage": stage[1], "p50": float(p50), "p95": float(p95), "n": len(durations_ns)}
 
 
-def camera_hops(server: Record, frames: Table) -> Durations:
+def camera_stages(server: Record, frames: Table) -> Durations:
     """Time the camera's hops. What happened before the frame was stamped is left out: the loop begins there."""
     return _timed(server.table("timeline"), "camera", frames, from_stamp=True)
 
 
-def client_hops(client: Record, frames: Table) -> Durations:
+def client_stages(client: Record, frames: Table) -> Durations:
     """Time the receiver, as one hop, and the driver's hops."""
     timelines = client.table("timeline")
     received_ns = _receiver_ns(timelines, client.table("picture"), frames)
     return [(("receiver", "reorder and depacketize"), received_ns), *_timed(timelines, "driver", frames)]
 
 
-def actuator_hops(server: Record, frames: Table) -> Durations:
+def actuator_stages(server: Record, frames: Table) -> Durations:
     """Time the actuator's hops for the first command made from each frame."""
     return _timed(server.table("timeline"), "actuator", frames)
 
@@ -80,7 +80,7 @@ def video_link_ns(timelines: Table, pictures: Table, frames: Table, offset: Cloc
     `timelines` are the server's.
     """
     camera = timelines.where(np.array([node == "camera" for node in timelines.texts("node")], np.bool_))
-    left_ns = np.array([hops[-1][1] if hops else MISSING for hops in camera.objects("hops")], np.int64)
+    left_ns = np.array([stages[-1][1] if stages else MISSING for stages in camera.objects("stages")], np.int64)
     stamps = pictures.ints("stamp_ns")
     left_ns = look_up(camera.ints("stamp_ns"), left_ns, stamps)
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
@@ -112,21 +112,21 @@ def _timed(timelines: Table, node: str, frames: Table, *, from_stamp: bool = Fal
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), stamps)
     durations_ns: dict[str, list[int]] = {}
     seen: set[tuple[str, int]] = set()
-    for channel, stamp_ns, start_ns, arrived_ns, hops in zip(
+    for channel, stamp_ns, start_ns, arrived_ns, stages in zip(
         timelines.texts("channel"),
         stamps.tolist(),
         stamped_ns.tolist(),
         timelines.ints("arrived_mono_ns").tolist(),
-        timelines.objects("hops"),
+        timelines.objects("stages"),
         strict=True,
     ):
         if start_ns == MISSING or (channel, stamp_ns) in seen:
             continue
         seen.add((channel, stamp_ns))
         before_ns = max(arrived_ns, start_ns) if from_stamp else arrived_ns
-        for name, end_ns in hops or []:
+        for name, end_ns in stages or []:
             if end_ns > before_ns or not from_stamp:
                 shown = f"wait for {channel}" if name == "wait" else name
                 durations_ns.setdefault(shown, []).append(end_ns - before_ns)
                 before_ns = end_ns
-    return [((node, hop), np.array(each, np.int64)) for hop, each in durations_ns.items()]
+    return [((node, stage), np.array(each, np.int64)) for stage, each in durations_ns.items()]

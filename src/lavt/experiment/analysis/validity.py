@@ -19,7 +19,7 @@ INJECTION_LIMIT_MS = 1.0
 """How far the injected delay may be from what was asked."""
 
 
-def invalid_because(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
+def invalid_reasons(server: Record, client: Record, measured: RunMeasurement) -> list[str]:
     """Say why a run must not count, one sentence a reason; an empty list is a valid run."""
     return [
         *_record_reasons("server", server),
@@ -86,10 +86,10 @@ def lateness_reasons(late_ms: Mapping[str, float | None]) -> list[str]:
     return reasons
 
 
-def injection_reasons(asked_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]) -> list[str]:
+def injection_reasons(requested_ms: Mapping[str, float], measured_ms: Mapping[str, float | None]) -> list[str]:
     """Compare the delay asked for with the median that the relay or netem measured, per direction, in milliseconds."""
     reasons = []
-    for direction, delay_ms in asked_ms.items():
+    for direction, delay_ms in requested_ms.items():
         found_ms = measured_ms.get(direction)
         if found_ms is None:
             reasons.append(f"nobody measured the injected delay of {direction}")

@@ -72,13 +72,15 @@ def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
     base = config.model_dump(mode="json", exclude=set(SEARCHED))
     searches = []
     for repetition, route, preset in itertools.product(range(config.repetitions), config.routes, config.presets):
-        asked = {
+        requested = {
             **base,
             "vehicle": {**base["vehicle"], "route": route},
             "controller": {**base["controller"], "preset": preset},
             "repetition": repetition,
         }
-        planned = plan_run(parse_config(RunConfig, asked, "the boundary"), name=f"{route} {preset} {repetition:02d}")
+        planned = plan_run(
+            parse_config(RunConfig, requested, "the boundary"), name=f"{route} {preset} {repetition:02d}"
+        )
         searches.append(BoundarySearch(planned, config.longest_delay_ms, config.grid_ms, config.within_ms))
     return searches
 
@@ -105,13 +107,13 @@ def not_completed(drive: MonitoredRun) -> bool:
     return drive.ending != "completed"
 
 
-def search(asked: BoundarySearch) -> dict[str, Any]:
+def search(requested: BoundarySearch) -> dict[str, Any]:
     """Find the boundaries of one seed, and give its entry of `boundary.json`."""
-    config, identity = asked.planned.config, asked.planned.identity
+    config, identity = requested.planned.config, requested.planned.identity
 
     @functools.cache
     def drive(delay_ms: float) -> MonitoredRun:
-        return watch_drive(plan_run(with_video_delay(config, delay_ms), name=asked.name))
+        return watch_drive(plan_run(with_video_delay(config, delay_ms), name=requested.name))
 
     added_ms: list[float] = []
 
@@ -120,7 +122,7 @@ def search(asked: BoundarySearch) -> dict[str, Any]:
         added_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
-    grid_ms = _grid(asked.longest_delay_ms, asked.grid_ms)
+    grid_ms = _grid(requested.longest_delay_ms, requested.grid_ms)
     first_total_ms = drive(0.0).total_delay_ms
     if math.isnan(first_total_ms):
         raise WorkError("nothing is driven even without added delay: look at lavt run with the same config")
@@ -130,11 +132,11 @@ def search(asked: BoundarySearch) -> dict[str, Any]:
         return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # pictures too old to be obeyed
 
     theory_ms = theoretical_ms(config)
-    guess_ms = asked.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
-    onset = zero_bracket(functools.cache(growth), guess_ms, asked.longest_delay_ms, asked.within_ms)
+    guess_ms = requested.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
+    onset = zero_bracket(functools.cache(growth), guess_ms, requested.longest_delay_ms, requested.within_ms)
     begun_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
-    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, asked.within_ms)
-    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, asked.within_ms)
+    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, requested.within_ms)
+    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, requested.within_ms)
     found: dict[str, tuple[Bracket, Totals]] = {
         "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
         "departure": (departure, total_ms),
@@ -203,15 +205,15 @@ class _SearchProgress:
         broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
-            asked = futures.pop(future)
+            requested = futures.pop(future)
             try:
-                self.found[asked.name] = future.result()
+                self.found[requested.name] = future.result()
             except BrokenExecutor:
-                broken.add(asked.name)
+                broken.add(requested.name)
             except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                self.fail(asked, in_words(error))
+                self.fail(requested, in_words(error))
             else:
-                self._tell(f"{asked.name}: {_sentence(self.found[asked.name])}")
+                self._tell(f"{requested.name}: {_sentence(self.found[requested.name])}")
 
         try:
             for future in as_completed(list(futures)):
@@ -223,10 +225,10 @@ class _SearchProgress:
             raise
         return [each for each in todo if each.name in broken]
 
-    def fail(self, asked: BoundarySearch, why: str) -> None:
+    def fail(self, requested: BoundarySearch, why: str) -> None:
         """Note that a search failed."""
-        self.failed.append({"name": asked.name, "why": why})
-        self._tell(f"{asked.name}: failed: {why}")
+        self.failed.append({"name": requested.name, "why": why})
+        self._tell(f"{requested.name}: failed: {why}")
 
 
 def _search_in_processes(work: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:

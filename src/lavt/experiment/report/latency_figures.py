@@ -215,35 +215,37 @@ def _draw_injected(
     above.margins(x=0.15)
 
 
-def hops_figure(hops: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """Where the time of the median loop goes: a bar a condition, a colour a node, a shade a hop of `hops_ms`."""
-    figure = new_figure(0.42 * len(hops) + 1.6)
+def stages_figure(stages: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Where the time of the median loop goes: a bar a condition, a colour a node, a shade a hop of `stages_ms`."""
+    figure = new_figure(0.42 * len(stages) + 1.6)
     axes = figure.subplots()
-    colours = _hop_colours(hops)
-    for row, every in enumerate(hops.values()):
+    colours = _stage_colours(stages)
+    for row, every in enumerate(stages.values()):
         left_ms = 0.0
         for share in every:
-            colour = colours[share["node"], share["hop"]]
+            colour = colours[share["node"], share["stage"]]
             axes.barh(row, share["p50"] or 0.0, left=left_ms, color=colour, edgecolor="white", linewidth=0.3)
             left_ms += share["p50"] or 0.0
         text: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": SMALL}
         axes.annotate(f"{left_ms:.0f} ms", (left_ms, row), **text)
-    axes.set_yticks(range(len(hops)), list(hops))
+    axes.set_yticks(range(len(stages)), list(stages))
     axes.invert_yaxis()
     axes.margins(x=0.1)
     tidy(axes, "median of each hop, one after the other (ms)", "")
     axes.grid(visible=False, axis="y")
-    legend = {hop if node == "network" else node: colour for (node, hop), colour in colours.items()}
+    legend = {stage if node == "network" else node: colour for (node, stage), colour in colours.items()}
     legend_below(figure, [Patch(color=colour, label=name) for name, colour in legend.items()])
     return figure
 
 
-def _hop_colours(every_condition: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
+def _stage_colours(every_condition: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[tuple[str, str], Any]:
     """Give each hop a shade of its node's colour."""
-    names = list(dict.fromkeys((hop["node"], hop["hop"]) for hops in every_condition.values() for hop in hops))
+    names = list(
+        dict.fromkeys((stage["node"], stage["stage"]) for stages in every_condition.values() for stage in stages)
+    )
     colours = {}
-    for node, hop in names:
-        hops = [name for of, name in names if of == node]
+    for node, stage in names:
+        stages = [name for of, name in names if of == node]
         shades = colormaps[NODE_COLOURS.get(node, OTHER_COLOURS)]
-        colours[node, hop] = shades(0.35 + 0.45 * hops.index(hop) / max(len(hops) - 1, 1))
+        colours[node, stage] = shades(0.35 + 0.45 * stages.index(stage) / max(len(stages) - 1, 1))
     return colours

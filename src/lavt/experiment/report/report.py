@@ -33,10 +33,10 @@ from lavt.experiment.report.sections import (
     difference_parts,
     group_parts,
     head,
-    hop_parts,
     injected_parts,
     route_parts,
     run_parts,
+    stage_parts,
     survival_parts,
 )
 from lavt.experiment.statistics.summary import summarize
@@ -68,7 +68,7 @@ def write_report(
         run_dirs = sorted(path for path in (sweep_dir / "runs").glob("*") if path.is_dir())
     results, unfinished = _read_results(run_dirs, sweeps or {})
     known = {each["run"] for each in failed}
-    left_out = [*failed, *({"run": name, "because": "it has no result"} for name in unfinished if name not in known)]
+    left_out = [*failed, *({"run": name, "reason": "it has no result"} for name in unfinished if name not in known)]
     if not results:
         raise WorkError(f"there is no finished run in {sweep_dir}: a run leaves a result.json in its directory")
     summary_path = sweep_dir / "summary.json"
@@ -101,7 +101,7 @@ def _sections(
         ("Driving against latency", degradation_parts(report)),
         ("How far the runs came", survival_parts(report)),
         ("Boundaries", boundary_parts(boundaries, report.directory)),
-        ("Where the latency comes from", hop_parts(report, captured_ms(sets))),
+        ("Where the latency comes from", stage_parts(report, captured_ms(sets))),
         ("Presets and settings compared", group_parts(report)),
         ("Axes of the sweep", axis_parts(report)),
         ("Route by route", route_parts(report)),

@@ -13,7 +13,7 @@ from lavt.experiment.report import html_page
 from lavt.experiment.report.figure_style import Colours, Conditions
 from lavt.experiment.report.files import link_table, save_figure, save_table
 from lavt.experiment.report.groups import Group, axes_of, differing, in_order, short, title_of
-from lavt.experiment.report.latency_figures import degradation_figure, hops_figure, injected_figure, presets_figure
+from lavt.experiment.report.latency_figures import degradation_figure, injected_figure, presets_figure, stages_figure
 from lavt.experiment.report.sentences import differences, equal_totals, headline, what_was_driven
 from lavt.experiment.report.sweep_figures import axis_figure, incidence_figure, routes_with_survival, survival_figure
 from lavt.experiment.report.tables import (
@@ -22,13 +22,13 @@ from lavt.experiment.report.tables import (
     driving_table,
     error_table,
     group_table,
-    hop_table,
     how_it_was_driven,
     latency_table,
     paper_beside,
     route_overview,
     route_table,
     run_table,
+    stage_table,
     survival_table,
 )
 
@@ -57,7 +57,7 @@ ERRORS_NOTE = (
     "to the farthest place that all runs of a route and repetition reached; and of all runs in order, one that ended "
     "early being last: median (quartiles). docs/metrics.md defines every number."
 )
-HOPS_NOTE = (
+STAGES_NOTE = (
     "The first row, from capture to stamp, is of one run of each condition, the others of all its runs; it is before "
     "the loop, and what the actuator reports is after it: both are in no bar."
 )
@@ -129,7 +129,7 @@ def head(report: ReportContext) -> Parts:
         parts.append(
             html_page.paragraph(f"{len(failed)} of the runs asked for failed and are in no number of this page:")
         )
-        parts.append(html_page.bullets([f"{each['run']}: {each['because']}" for each in failed]))
+        parts.append(html_page.bullets([f"{each['run']}: {each['reason']}" for each in failed]))
     return parts
 
 
@@ -253,36 +253,38 @@ def survival_parts(report: ReportContext) -> Parts:
     return parts
 
 
-def hop_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
+def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, float | None]]) -> Parts:
     """Show where the loop's time goes; `captured_ms` is by kind of time and condition."""
     parts = []
     for kind, conditions in report.kinds.items():
-        known = {name: entry for name, entry in conditions.items() if entry.get("hops_ms")}
+        known = {name: entry for name, entry in conditions.items() if entry.get("stages_ms")}
         if not known:
             continue
         loops = {name: _loop_of(entry) for name, entry in known.items()}
-        hops = {name: [*loops[name], *filter(_is_after_loop, entry["hops_ms"])] for name, entry in known.items()}
+        stages = {name: [*loops[name], *filter(_is_after_loop, entry["stages_ms"])] for name, entry in known.items()}
         caption = (
             "Where the median loop goes, in the order of a frame's life: of each hop the median over all runs. The "
             "number is the sum of these medians, which need not be the median loop exactly. "
             f"{kind.capitalize()} time{report.which(kind)}."
         )
-        parts.append(save_figure(report.directory, f"hops_{kind}", hops_figure(loops), "latency of each hop", caption))
-        parts.append(save_table(report.directory, f"hops_{kind}", hop_table(hops, captured_ms.get(kind))))
-        parts.append(html_page.paragraph(HOPS_NOTE, note=True))
+        parts.append(
+            save_figure(report.directory, f"hops_{kind}", stages_figure(loops), "latency of each hop", caption)
+        )
+        parts.append(save_table(report.directory, f"hops_{kind}", stage_table(stages, captured_ms.get(kind))))
+        parts.append(html_page.paragraph(STAGES_NOTE, note=True))
     return parts
 
 
-def _is_after_loop(hop: Mapping[str, Any]) -> bool:
-    return (hop["node"], hop["hop"]) in AFTER_LOOP
+def _is_after_loop(stage: Mapping[str, Any]) -> bool:
+    return (stage["node"], stage["stage"]) in AFTER_LOOP
 
 
 def _loop_of(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Give the hops that make a condition's loop, and what is left of its median: every wait for a next tick."""
-    hops, loop_ms = [hop for hop in entry["hops_ms"] if not _is_after_loop(hop)], entry["loop_ms"]["p50"]
-    rest_ms = 0.0 if loop_ms is None else loop_ms - sum(hop["p50"] or 0.0 for hop in hops)
-    rest = {"node": "rest", "hop": "waiting, and what medians do not add up to", "p50": rest_ms}
-    return [*hops, rest] if rest_ms > LEAST_REST_MS else hops
+    stages, loop_ms = [stage for stage in entry["stages_ms"] if not _is_after_loop(stage)], entry["loop_ms"]["p50"]
+    rest_ms = 0.0 if loop_ms is None else loop_ms - sum(stage["p50"] or 0.0 for stage in stages)
+    rest = {"node": "rest", "stage": "waiting, and what medians do not add up to", "p50": rest_ms}
+    return [*stages, rest] if rest_ms > LEAST_REST_MS else stages
 
 
 def group_parts(report: ReportContext) -> Parts:

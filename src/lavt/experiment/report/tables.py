@@ -332,7 +332,7 @@ def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
             run["loop_ms"]["p50"],
             run["p95_m"],
             (run.get("picture_age_ms") or {}).get("mean"),
-            "valid" if run["valid"] else "not valid: " + "; ".join(run["invalid_because"]),
+            "valid" if run["valid"] else "not valid: " + "; ".join(run["invalid_reasons"]),
         ]
         for run in runs
     ]
@@ -362,22 +362,25 @@ def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     return TableData(columns, rows)
 
 
-def hop_table(
-    hops: Mapping[str, Sequence[Mapping[str, Any]]], captured_ms: Mapping[str, float | None] | None = None
+def stage_table(
+    stages: Mapping[str, Sequence[Mapping[str, Any]]], captured_ms: Mapping[str, float | None] | None = None
 ) -> TableData:
     """One row a hop in the order of a frame's life, one column a condition: medians in ms.
 
     `captured_ms` is how long a frame's stamp came after its exposure: the first row, though the loop begins after it.
     """
-    names = list(dict.fromkeys((hop["node"], hop["hop"]) for every in hops.values() for hop in every))
-    durations = [{(hop["node"], hop["hop"]): hop["p50"] for hop in every} for every in hops.values()]
+    names = list(dict.fromkeys((stage["node"], stage["stage"]) for every in stages.values() for stage in every))
+    durations = [{(stage["node"], stage["stage"]): stage["p50"] for stage in every} for every in stages.values()]
     known = captured_ms or {}
-    before: list[Any] = [known.get(name) for name in hops]
+    before: list[Any] = [known.get(name) for name in stages]
     show = numbers("", 2).show
-    columns = [words("hop, median ms"), *(Column(name, show) for name in hops)]
+    columns = [words("hop, median ms"), *(Column(name, show) for name in stages)]
     rows = [
-        [f"{node}: {hop}{AFTERWARDS if (node, hop) in AFTER_LOOP else ''}", *(of.get((node, hop)) for of in durations)]
-        for node, hop in names
+        [
+            f"{node}: {stage}{AFTERWARDS if (node, stage) in AFTER_LOOP else ''}",
+            *(of.get((node, stage)) for of in durations),
+        ]
+        for node, stage in names
     ]
     return TableData(columns, [["camera: capture to stamp, before the loop", *before], *rows])
 

@@ -46,7 +46,7 @@ def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
 
 def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
     """Give the config of the run that two sides have driven, as if it had been one machine's."""
-    asked = client.injection
+    requested = client.injection
     return RunConfig(
         vehicle=server.vehicle,
         controller=client.controller,
@@ -56,9 +56,9 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
             | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client's is the one in force
         ),
         network=NetworkConfig(
-            condition=asked.condition or "L0",
-            injection="netem" if asked.condition else "none",
-            state_delay=asked.state_delay,
+            condition=requested.condition or "L0",
+            injection="netem" if requested.condition else "none",
+            state_delay=requested.state_delay,
         ),
         safety=server.safety,
         record=server.record,
@@ -68,7 +68,7 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
 
 
 def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]:
-    asked = condition(run.network.condition)
+    requested = condition(run.network.condition)
     return {
         "run": name,
         "time": "real",
@@ -82,7 +82,7 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
         "driver": run.controller.kind,
         "repetition": 0,
         "seed": run.seed,
-        **injected_entry(asked),
+        **injected_entry(requested),
     }
 
 

@@ -73,8 +73,8 @@ def watched(payloads: dict[str, list[Any]]) -> MonitoredRun:
     ended = next(((each.mono_ns, each.detail) for each in payloads["event"] if each.kind == "ending"), None)
     ended_ns, ending = ended or (payloads["truth"][-1].mono_ns, None)
     within = [truth for truth in payloads["truth"] if began_ns <= truth.mono_ns <= ended_ns]
-    obeyed = [each for each in payloads["admission"] if each.verdict == "obeyed" and each.mode == "drive"]
-    obeyed = [each for each in obeyed if began_ns <= each.applied_mono_ns <= ended_ns]
+    accepted = [each for each in payloads["admission"] if each.verdict == "accepted" and each.mode == "drive"]
+    accepted = [each for each in accepted if began_ns <= each.applied_mono_ns <= ended_ns]
 
     def since_began_s(times_ns: list[int]) -> FloatArray:
         return np.asarray((np.array(times_ns, np.int64) - began_ns) / NS_PER_S, np.float64)
@@ -83,19 +83,19 @@ def watched(payloads: dict[str, list[Any]]) -> MonitoredRun:
     return MonitoredRun(
         ending=ending,
         lane_invasions=sum(event.kind == "lane_invasion" for event in events),
-        total_delay_ms=_total_delay_ms(payloads["frame"], obeyed),
+        total_delay_ms=_total_delay_ms(payloads["frame"], accepted),
         time_s=since_began_s([truth.mono_ns for truth in within]),
         cross_track_m=np.array([truth.cross_track_m for truth in within], np.float64),
         speed_mps=np.array([truth.speed_mps for truth in within], np.float64),
-        limited_s=since_began_s([each.applied_mono_ns for each in obeyed if each.limited]),
+        limited_s=since_began_s([each.applied_mono_ns for each in accepted if each.limited]),
     )
 
 
-def _total_delay_ms(frames: list[FrameWritten], obeyed: list[Admission]) -> float:
+def _total_delay_ms(frames: list[FrameWritten], accepted: list[Admission]) -> float:
     """Give the median time from the middle of exposure to the first obeyed command that was made from the frame."""
     captured_ns = {frame.stamp_ns: frame.capture_ns for frame in frames if frame.capture_ns is not None}
     first_ns: dict[int, int] = {}
-    for command in obeyed:
+    for command in accepted:
         if command.applied_mono_ns is not None:
             first_ns.setdefault(command.stamp_ns, command.applied_mono_ns)
     delays_ns = [applied_ns - captured_ns[stamp] for stamp, applied_ns in first_ns.items() if stamp in captured_ns]

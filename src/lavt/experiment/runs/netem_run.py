@@ -48,7 +48,7 @@ class NetemRun:
 
     def __init__(self, planned: PlannedRun, netem: NetemInterface | None = None) -> None:
         self._network = planned.config.network
-        self._asked = planned.asked
+        self._requested = planned.requested
         self._netem = netem or NetemInterface(LOOPBACK, seed=planned.seed)
         self._flows: list[ImpairedFlow] = []
         self._restored: list[str] = []
@@ -67,7 +67,7 @@ class NetemRun:
         """Hold the flows of the condition from now on, and measure what happens to them."""
         network = self._network
         self._flows = netem_flows(
-            self._asked, "both", video_port=video_port, control_port=control_port,
+            self._requested, "both", video_port=video_port, control_port=control_port,
             state_delay=network.state_delay,
         )  # fmt: skip
         commands = self._netem.apply(self._flows, condition=network.condition)

@@ -63,9 +63,9 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0
     if inherent is not None:
-        video_ms = inherent.video_ms - costs.links_us["video"] / US_PER_MS - _hops_ms(costs, STAMP_TO_STAMP)
+        video_ms = inherent.video_ms - costs.links_us["video"] / US_PER_MS - _stages_ms(costs, STAMP_TO_STAMP)
         jitter = inherent.video_jitter
-        control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _hops_ms(costs, SENT_TO_RECEIVED)
+        control_ms = inherent.control_ms - costs.links_us["control"] / US_PER_MS - _stages_ms(costs, SENT_TO_RECEIVED)
     state_ms = condition.video_ms if state_delay == "with_video" else 0.0
     video = injected("video", condition.video_ms, condition.video, seed)
     control = injected("control", condition.control_ms, condition.control, seed)
@@ -79,14 +79,14 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     )
 
 
-def virtual_network(asked: NetworkDelays, costs: Costs) -> NetworkDelays:
+def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
     """Add what a real loopback has by itself, as measured."""
     return replace(
-        asked,
-        video=_later(asked.video, costs.links_us["video"]),
-        control=_later(asked.control, costs.links_us["control"]),
-        state=_later(asked.state, costs.links_us["state"]),
-        unheld=_later(asked.unheld, costs.links_us["state"]),
+        requested,
+        video=_later(requested.video, costs.links_us["video"]),
+        control=_later(requested.control, costs.links_us["control"]),
+        state=_later(requested.state, costs.links_us["state"]),
+        unheld=_later(requested.unheld, costs.links_us["state"]),
     )
 
 
@@ -94,5 +94,5 @@ def _later(law: DelayLaw, by_us: float) -> DelayLaw:
     return DelayLaw(law.constant_ms + by_us / US_PER_MS, law.jitter, law.seed, law.name)
 
 
-def _hops_ms(costs: Costs, hops: tuple[tuple[str, str], ...]) -> float:
-    return sum(costs.hops_us.get(node, {}).get(hop, 0.0) for node, hop in hops) / US_PER_MS
+def _stages_ms(costs: Costs, stages: tuple[tuple[str, str], ...]) -> float:
+    return sum(costs.stages_us.get(node, {}).get(stage, 0.0) for node, stage in stages) / US_PER_MS

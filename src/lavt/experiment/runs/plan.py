@@ -29,16 +29,16 @@ class PlannedRun:
     config: RunConfig
     identity: Mapping[str, Any]
     seed: int
-    asked: Condition
+    requested: Condition
     """What is asked of the network."""
 
 
 def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
     """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
-    asked = config.network.asked(condition(config.network.condition))
+    requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
-    _check_injection(config, asked)
-    nothing = config.network.inherent == "loopback" and asked == NO_CONDITION
+    _check_injection(config, requested)
+    nothing = config.network.inherent == "loopback" and requested == NO_CONDITION
     if config.time == "real" and config.network.injection == "none" and not nothing:
         raise UserError(
             "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
@@ -65,26 +65,26 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
         "order": config.study.order,
         "repetition": config.repetition,
         "seed": seed,
-        **injected_entry(asked),
+        **injected_entry(requested),
         **({"axes": dict(axes)} if axes else {}),
         **({"changes": config.network.changes} if config.network.changes else {}),
     }
-    return PlannedRun(name, config, identity, seed, asked)
+    return PlannedRun(name, config, identity, seed, requested)
 
 
-def injected_entry(asked: Condition) -> dict[str, Any]:
+def injected_entry(requested: Condition) -> dict[str, Any]:
     """Say what is injected (None: a trace's) and, where that is not all, how much of it there must be at least."""
-    least = {} if asked.least_ms == asked.constant_ms else {"injected_least_ms": asked.least_ms}
-    return {"injected_ms": asked.constant_ms, **least}
+    least = {} if requested.least_ms == requested.constant_ms else {"injected_least_ms": requested.least_ms}
+    return {"injected_ms": requested.constant_ms, **least}
 
 
-def _check_injection(config: RunConfig, asked: Condition) -> None:
+def _check_injection(config: RunConfig, requested: Condition) -> None:
     """Raise `UserError` where what injects cannot do what the condition or the profile asks, or nobody could."""
     network = config.network
-    if network.state_delay == "with_video" and asked.video.trace:
+    if network.state_delay == "with_video" and requested.video.trace:
         raise UserError(
             "network.state_delay with_video delays the state by the video's constant delay, and cannot follow its "
-            f"trace {asked.video.trace!r}: choose none, or a condition without a trace"
+            f"trace {requested.video.trace!r}: choose none, or a condition without a trace"
         )
     if config.time == "real" and network.injection == "netem":
         if network.inherent != "loopback":
@@ -92,10 +92,10 @@ def _check_injection(config: RunConfig, asked: Condition) -> None:
                 f"netem cannot do the lognormal part of network.inherent {network.inherent}: choose loopback, or "
                 "network.injection relay"
             )
-        check_flows(netem_flows(asked, "both", video_port=1, control_port=2, state_delay=network.state_delay))
+        check_flows(netem_flows(requested, "both", video_port=1, control_port=2, state_delay=network.state_delay))
     else:
-        injected("video", asked.video_ms, asked.video, seed=0)
-        injected("control", asked.control_ms, asked.control, seed=0)
+        injected("video", requested.video_ms, requested.video, seed=0)
+        injected("control", requested.control_ms, requested.control, seed=0)
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:

@@ -130,8 +130,8 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
-                    asked = {"asked_ms": _asked_ms(planned), "traces": trace_digests(planned.asked)}
-                    write_json(out / RELAY, {**asked, **loop.relay.last_line()})
+                    requested = {"requested_ms": _requested_ms(planned), "traces": trace_digests(planned.requested)}
+                    write_json(out / RELAY, {**requested, **loop.relay.last_line()})
                 if netem is not None:
                     write_json(out / NETEM, netem.report())
         finally:
@@ -157,7 +157,7 @@ def _wait_for_the_end(processes: Processes, loop: LoopProcesses, clock: Clock, p
         raise WorkError(f"the server failed: {loop.server.said()}")
 
 
-def _asked_ms(planned: PlannedRun) -> dict[str, float | None]:
+def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
     """Tell the median delay asked of the relay in each direction, that of the inherent profile included.
 
     None where more than a constant delay is asked: its median depends on what else is sent.
@@ -174,19 +174,19 @@ def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
 
     Where more than a constant delay was asked, the times at which packets left are compared with what the law gave.
     """
-    asked_ms = relay.get("asked_ms", {"video": 0.0, "control": 0.0})
-    constant = {flow: delay_ms for flow, delay_ms in asked_ms.items() if delay_ms is not None}
+    requested_ms = relay.get("requested_ms", {"video": 0.0, "control": 0.0})
+    constant = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
     held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
     return [
         *injection_reasons(constant, {flow: held.get(WAYS[flow]) for flow in constant}),
-        *lateness_reasons({flow: late.get(WAYS[flow]) for flow in asked_ms if flow not in constant}),
+        *lateness_reasons({flow: late.get(WAYS[flow]) for flow in requested_ms if flow not in constant}),
     ]
 
 
 def _injected(planned: PlannedRun) -> NetworkDelays:
     network = planned.config.network
     return injected_network(
-        network.inherent, planned.asked, read_costs(), planned.seed, state_delay=network.state_delay
+        network.inherent, planned.requested, read_costs(), planned.seed, state_delay=network.state_delay
     )
 
 
@@ -203,12 +203,12 @@ def _start_router(
 
 
 def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> RelayConfig:
-    injected, asked = _injected(planned), planned.asked
+    injected, requested = _injected(planned), planned.requested
     return RelayConfig(
         video_server=f"127.0.0.1:{video_port}",
         control_server=f"127.0.0.1:{control_port}",
-        video=_delay(injected.video, asked.video_ms, asked.video),
-        control=_delay(injected.control, asked.control_ms, asked.control),
+        video=_delay(injected.video, requested.video_ms, requested.video),
+        control=_delay(injected.control, requested.control_ms, requested.control),
         state=_delay(injected.state),
         seed=planned.seed,
     )
@@ -217,9 +217,9 @@ def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> Re
 def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: ImpairmentConfig = NOTHING) -> DelayConfig:
     link = LinkConfig()
     if impairment != NOTHING:
-        asked = impairment.model_dump()
-        asked["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
-        link = LinkConfig(delay_ms=delay_ms, **asked)
+        requested = impairment.model_dump()
+        requested["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
+        link = LinkConfig(delay_ms=delay_ms, **requested)
     if law.jitter is None:
         return DelayConfig(constant_ms=law.constant_ms, link=link)
     return DelayConfig(

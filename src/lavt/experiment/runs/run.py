@@ -42,7 +42,7 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
         drive(loop, progress=None if progress is None else lambda _: progress(loop.tap.status(), {}))
         digest = loop.digest.hexdigest()
         if not loop.tap.began:
-            raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.because}")
+            raise WorkError(f"{planned.name}: the vehicle was never armed: {loop.client.driver.session.reason}")
     else:
         prepare_directory(out)
         _write_config(planned, out)
@@ -71,8 +71,8 @@ def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Driv
         relay = read_json(out / RELAY) if (out / RELAY).is_file() else {}
         reasons = relay_reasons(relay)
     elif identity["inherent"] == NETWORK:
-        asked = identity["condition"] if identity["injection"] == "netem" else ""
-        reasons = recorded_reasons(server, client, asked, identity["injected_ms"])
+        requested = identity["condition"] if identity["injection"] == "netem" else ""
+        reasons = recorded_reasons(server, client, requested, identity["injected_ms"])
     elif identity["injection"] == "netem":
         reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)

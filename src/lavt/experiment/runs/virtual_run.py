@@ -101,7 +101,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
     """
     config, seed, costs = planned.config, planned.seed, read_costs()
-    asked = planned.asked
+    requested = planned.requested
     server_clock, client_clock = clocks or host_clocks(config)
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
@@ -125,13 +125,15 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
             "model",
             {
                 "costs": costs.model_dump_json(),
-                "condition": asked.model_dump_json(),
-                "traces": json.dumps(trace_digests(asked)),
+                "condition": requested.model_dump_json(),
+                "traces": json.dumps(trace_digests(requested)),
             },
         )
     tap = EndingTap(writers[0])
     costs_ns = {
-        (node, hop): round(cost_us * NS_PER_US) for node, hops in costs.hops_us.items() for hop, cost_us in hops.items()
+        (node, stage): round(cost_us * NS_PER_US)
+        for node, stages in costs.stages_us.items()
+        for stage, cost_us in stages.items()
     }
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
     hosts = [
@@ -147,7 +149,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     ]  # fmt: skip
     injected = injected_network(
         config.network.inherent,
-        asked,
+        requested,
         costs,
         seed,
         state_delay=config.network.state_delay,

@@ -66,7 +66,7 @@ def condition_summary(all_runs: Sequence[Run], places: Places) -> dict[str, Any]
         "loop_ms": _latency([run["loop_ms"] for run in runs]),
         "picture_age_ms": _picture_age_ms(runs),
         "age_at_actuation_ms": _latency([run.get("age_at_actuation_ms") or {"n": 0} for run in runs]),
-        "hops_ms": _hops_ms(runs),
+        "stages_ms": _stages_ms(runs),
         "survival": {name: curve for name, curve in curves.items() if curve},
     }
 
@@ -132,8 +132,8 @@ def _per_km(runs: Sequence[Run], name: str) -> float | None:
 
 def _injected_ms(runs: Sequence[Run]) -> dict[str, Any]:
     """Say what was asked of the network; the runs of a condition were all asked the same."""
-    asked: Mapping[str, Any] = next((run["injected_ms"] for run in runs if run.get("injected_ms")), {})
-    return {"video": asked.get("video"), "control": asked.get("control")}
+    requested: Mapping[str, Any] = next((run["injected_ms"] for run in runs if run.get("injected_ms")), {})
+    return {"video": requested.get("video"), "control": requested.get("control")}
 
 
 def _latency(entries: Sequence[Mapping[str, Any]], *, bounded: bool = False) -> dict[str, Any]:
@@ -154,10 +154,10 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
     return {name: float(np.median([age[name] for age in known])) if known else None for name in ("mean", "p95")}
 
 
-def _hops_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Median over runs of each hop's median, in the order of a frame's life."""
     p50_ms: dict[tuple[str, str], list[float]] = {}
-    for run in sorted(runs, key=lambda run: -len(run.get("hops_ms") or [])):  # the fullest tells the order
-        for entry in run.get("hops_ms") or []:
-            p50_ms.setdefault((entry["node"], entry["hop"]), []).append(entry["p50"])
-    return [{"node": node, "hop": hop, "p50": float(np.median(each))} for (node, hop), each in p50_ms.items()]
+    for run in sorted(runs, key=lambda run: -len(run.get("stages_ms") or [])):  # the fullest tells the order
+        for entry in run.get("stages_ms") or []:
+            p50_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
+    return [{"node": node, "stage": stage, "p50": float(np.median(each))} for (node, stage), each in p50_ms.items()]

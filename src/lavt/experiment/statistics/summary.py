@@ -30,7 +30,7 @@ def summarize(
 
     `base` names keys of a run (or of its `axes`) and the value each has in the sweep's base config; `conditions` holds
     the virtual runs that have them all. Without it every virtual run belongs to the base config. `failed` says which
-    runs have no result (`run`), and why (`because`).
+    runs have no result (`run`), and why (`reason`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
     wanted = dict(base or {})

@@ -180,7 +180,7 @@ def sweep(
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
     driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell, cluster_at=cluster_at)
-    failed = [{"run": name, "because": why} for name, why in driven.failed]
+    failed = [{"run": name, "reason": why} for name, why in driven.failed]
     write_json(out / FAILED, failed)
     if not driven.results:
         raise WorkError("no run was finished: " + "; ".join(f"{name}: {why}" for name, why in driven.failed))
@@ -218,8 +218,8 @@ def _check_sweep(config: SweepConfig, out: Path) -> None:
     """Raise `UserError` where another sweep was begun in `out`: the report would mix the runs of both."""
     if not (out / SWEEP).is_file():
         return
-    begun, asked = (each.model_dump(mode="json") for each in (load_config(SweepConfig, out / SWEEP), config))
-    different = [key for key in asked if asked[key] != begun[key]]
+    begun, requested = (each.model_dump(mode="json") for each in (load_config(SweepConfig, out / SWEEP), config))
+    different = [key for key in requested if requested[key] != begun[key]]
     if different:
         raise UserError(
             f"{out} was begun with another config ({', '.join(different)}): resume with that one, or name another --out"

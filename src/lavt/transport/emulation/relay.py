@@ -275,12 +275,12 @@ class _OpenFlow:
         """Let clients go that are silent and, where there are too many, the one that has been silent for longest."""
         now_ns = self._relay.now_ns()
         if len(self._clients) >= MOST_CLIENTS:
-            self._let_go(min(self._clients, key=lambda address: self._clients[address].heard_ns))
+            self._release(min(self._clients, key=lambda address: self._clients[address].heard_ns))
         for address, client in list(self._clients.items()):
             if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
-                self._let_go(address)
+                self._release(address)
 
-    def _let_go(self, address: Address) -> None:
+    def _release(self, address: Address) -> None:
         client = self._clients.pop(address)
         self.gone["upstream"].update(_counted([client.up]))
         self.gone["downstream"].update(_counted([client.down]))

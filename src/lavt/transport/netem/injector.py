@@ -40,7 +40,7 @@ class InjectionResult:
     """What became of an order."""
 
     number: int
-    because: str
+    reason: str
     """Why it is not in force; empty: it is."""
     doubts: str
     """What was measured to be otherwise than asked."""

@@ -321,14 +321,14 @@ class NetemInterface:
 
     def _change(self, flows: Sequence[ImpairedFlow], qdiscs: Sequence[Qdisc]) -> list[Command]:
         """Bring our queues from what they are to what is asked."""
-        asked = {flow.name: flow for flow in flows}
+        requested = {flow.name: flow for flow in flows}
         found = set(self._filters()) if qdiscs else set()
         wanted = {expected_filter(each): each for flow in flows for each in filters(flow)}
         commands = []
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
-            if exists or name in asked:
-                law = asked[name].law if name in asked else Impairment()
+            if exists or name in requested:
+                law = requested[name].law if name in requested else Impairment()
                 verb = "change" if exists else "add"
                 commands.append(set_law(self.interface, name, law, verb=verb, tables=self._tables))  # type: ignore[arg-type]
         commands += [delete_filter(self.interface, *each[:2]) for each in sorted(found - set(wanted), key=str)]

@@ -102,7 +102,7 @@ def probes(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> l
 
 def measure(
     interface: str,
-    asked: Sequence[ProbeSpec],
+    requested: Sequence[ProbeSpec],
     *,
     count: int = 50,
     period_ns: int = PERIOD_NS,
@@ -113,7 +113,7 @@ def measure(
     Raises `UserError` without root, and for an interface that is not there or not up.
     """
     try:
-        return _measure(interface, asked, count, period_ns, clock or MachineClock())
+        return _measure(interface, requested, count, period_ns, clock or MachineClock())
     except OSError as error:
         raise UserError(
             f"{interface} cannot be measured ({error.strerror}): name an interface that is up (`ip link`)"
@@ -121,23 +121,23 @@ def measure(
 
 
 def _measure(
-    interface: str, asked: Sequence[ProbeSpec], count: int, period_ns: int, clock: Clock
+    interface: str, requested: Sequence[ProbeSpec], count: int, period_ns: int, clock: Clock
 ) -> dict[str, ProbeResult]:
     with _open(interface) as receiver, _open_sender() as sender:
-        seen = _Seen(receiver, asked, clock.now().mono_ns)
+        seen = _Seen(receiver, requested, clock.now().mono_ns)
         link = (interface, _IPV4, 0, 0, _hardware_address(interface))
         begin_ns = clock.now().mono_ns
         for number in range(count):
-            for index, probe in enumerate(asked):
+            for index, probe in enumerate(requested):
                 _send(sender, _frame(probe, seen.mark(number, index, clock.now().wall_ns)), link)
             pause(begin_ns + (number + 1) * period_ns - clock.now().mono_ns)
             seen.take()  # when is the kernel's to say: there is no hurry
-        longest_ns = round(max(probe.law.longest_ms for probe in asked) * NS_PER_MS)
+        longest_ns = round(max(probe.law.longest_ms for probe in requested) * NS_PER_MS)
         limit_ns = clock.now().mono_ns + longest_ns + AFTER_LONGEST_NS
-        while seen.count < count * len(asked) and clock.now().mono_ns < limit_ns:
+        while seen.count < count * len(requested) and clock.now().mono_ns < limit_ns:
             pause(AFTERWARDS_NS)
             seen.take()
-    return {probe.name: summary(probe.law, count, seen.delays[index]) for index, probe in enumerate(asked)}
+    return {probe.name: summary(probe.law, count, seen.delays[index]) for index, probe in enumerate(requested)}
 
 
 def summary(law: Impairment, sent: int, delays: Sequence[tuple[int, float]]) -> ProbeResult:
@@ -212,16 +212,16 @@ def _clumping(law: Impairment) -> float:
 class _Seen:
     """Frames of ours that have left, by probe: (number, delay in milliseconds) in order."""
 
-    def __init__(self, receiver: socket.socket, asked: Sequence[ProbeSpec], who: int) -> None:
+    def __init__(self, receiver: socket.socket, requested: Sequence[ProbeSpec], who: int) -> None:
         self._receiver = receiver
-        self._asked = asked
+        self._requested = requested
         self._who = who
         self.count = 0
-        self.delays: list[list[tuple[int, float]]] = [[] for _ in asked]
+        self.delays: list[list[tuple[int, float]]] = [[] for _ in requested]
 
     def mark(self, number: int, index: int, sent_ns: int) -> bytes:
         """Give what marks a frame of ours."""
-        return _MARK.pack(self._who, number * len(self._asked) + index, sent_ns)
+        return _MARK.pack(self._who, number * len(self._requested) + index, sent_ns)
 
     def take(self) -> None:
         """Take all that has left by now."""
@@ -245,7 +245,7 @@ class _Seen:
         if who != self._who or len(stamp) < 16:
             return
         seconds, nanoseconds = struct.unpack_from("qq", stamp)
-        number, index = divmod(serial, len(self._asked))
+        number, index = divmod(serial, len(self._requested))
         self.count += 1
         self.delays[index].append((number, (seconds * NS_PER_S + nanoseconds - sent_ns) / NS_PER_MS))
 

@@ -276,21 +276,21 @@ def read_law(options: Mapping[str, Any]) -> Impairment:
 
 def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
     """Compare a flow with what was read back, in sentences; an empty list is as asked."""
-    place, asked = PLACES[flow.name], flow.law
+    place, requested = PLACES[flow.name], flow.law
     netem = next((each for each in qdiscs if each.handle == place.handle), None)
     if netem is None or netem.kind != "netem" or netem.parent != place.parent:
         return [f"{flow.words} has no netem"]
     is_ = read_law(netem.options)
-    wanders = bool(asked.jitter_correlation)  # then the delay is where it has got to, and no jitter of netem's
+    wanders = bool(requested.jitter_correlation)  # then the delay is where it has got to, and no jitter of netem's
     reasons = [
         f"{flow.words}: {name} is {there:g} where {wanted:g} was asked"
         for name, there, wanted, step in (
-            ("delay_ms", is_.delay_ms, asked.delay_ms, TC_STEP_MS + 8 * asked.jitter_ms * wanders),
-            ("jitter_ms", is_.jitter_ms, 0.0 if wanders else asked.jitter_ms, TC_STEP_MS),
-            ("loss", is_.loss, asked.loss, 1e-5),
-            ("loss_burst_packets", is_.loss_burst_packets, asked.loss_burst_packets * bursts(asked), 1e-3),
-            ("rate_bps", is_.rate_bps, asked.rate_bps, 8),
-            ("reorder", is_.reorder, asked.reorder, 1e-5),
+            ("delay_ms", is_.delay_ms, requested.delay_ms, TC_STEP_MS + 8 * requested.jitter_ms * wanders),
+            ("jitter_ms", is_.jitter_ms, 0.0 if wanders else requested.jitter_ms, TC_STEP_MS),
+            ("loss", is_.loss, requested.loss, 1e-5),
+            ("loss_burst_packets", is_.loss_burst_packets, requested.loss_burst_packets * bursts(requested), 1e-3),
+            ("rate_bps", is_.rate_bps, requested.rate_bps, 8),
+            ("reorder", is_.reorder, requested.reorder, 1e-5),
         )
         if abs(there - wanted) > step + 1e-5 * wanted
     ]  # fmt: skip

@@ -29,11 +29,11 @@ class AdaptiveHold:
         longest_ns = max(self._longest_ns, self._longest_before_ns)
         return min(max(LEAST_HOLD_NS, longest_ns * 5 // 4), MOST_HOLD_NS)
 
-    def note(self, overtaken_ns: int, now_ns: int) -> None:
+    def note(self, reordered_ns: int, now_ns: int) -> None:
         """A packet came so long after the first sign that it was missing, or was made again then."""
         self._begin_window(now_ns)
-        if overtaken_ns <= MOST_HOLD_NS:
-            self._longest_ns = max(self._longest_ns, overtaken_ns)
+        if reordered_ns <= MOST_HOLD_NS:
+            self._longest_ns = max(self._longest_ns, reordered_ns)
 
     def _begin_window(self, now_ns: int) -> None:
         if self._began_ns is None:

@@ -88,7 +88,7 @@ class JitterBuffer:
             return []
         self.recovered += 1
         if number < self._highest:
-            self._note_overtaken(number, now_ns)
+            self._note_reordered(number, now_ns)
         self._hold(packet, number, now_ns)
         return self._drain() + self.expire(now_ns)
 
@@ -142,7 +142,7 @@ class JitterBuffer:
         else:
             if number < self._highest:
                 self.reordered += 1
-                self._note_overtaken(number, now_ns)
+                self._note_reordered(number, now_ns)
             self._hold(packet, number, now_ns)
 
     def _hold(self, packet: RtpPacket, number: int, now_ns: int) -> None:
@@ -190,7 +190,7 @@ class JitterBuffer:
         if self._adaptive is not None and number in self._given_up:
             self._adaptive.note(now_ns - self._given_up[number], now_ns)
 
-    def _note_overtaken(self, number: int, now_ns: int) -> None:
+    def _note_reordered(self, number: int, now_ns: int) -> None:
         """A packet came, or was made again, in time, but after later ones; the first of these to come was the sign."""
         if self._adaptive is not None:
             sign_ns = min((came_ns for later, (_, came_ns) in self._held.items() if later > number), default=now_ns)

@@ -65,14 +65,14 @@ class Unprotector:
     """Checks and decrypts what one end receives, of any SSRC under the key; for one thread.
 
     `replayed` counts packets whose number was taken before or is `WINDOW_PACKETS` or more behind (libsrtp looks at the
-    number first, so forgeries with an old number count here too); `refused` the others that are not authentic.
+    number first, so forgeries with an old number count here too); `rejected` the others that are not authentic.
     """
 
     def __init__(self, key_and_salt: bytes) -> None:
         self._library = _library()
         self._session = _session(self._library, key_and_salt, self._library.Policy.SSRC_ANY_INBOUND)
         self._replays = frozenset(text for text in self._library.ERRORS if text.startswith("replay check failed"))
-        self.refused = 0
+        self.rejected = 0
         self.replayed = 0
 
     def unprotect(self, packet: bytes) -> bytes | None:
@@ -90,9 +90,9 @@ class Unprotector:
             if str(error) in self._replays:
                 self.replayed += 1
             else:
-                self.refused += 1
+                self.rejected += 1
         except ValueError:  # longer than anything protected can be
-            self.refused += 1
+            self.rejected += 1
         return None
 
 

@@ -101,11 +101,11 @@ class NoVehicleAuthenticator:
         """Give the command in an envelope, unchecked."""
         return data
 
-    def is_from_holder(self, _data: bytes) -> bool:
+    def is_from_active_operator(self, _data: bytes) -> bool:
         """Tell whether a command comes from who holds the vehicle: nobody knows."""
         return True
 
-    def is_next_of_holder(self, _channel: str, _data: bytes) -> bool:
+    def is_next_of_active_operator(self, _channel: str, _data: bytes) -> bool:
         """Tell whether a query is the next of who holds the vehicle: nobody knows."""
         return False
 
@@ -117,11 +117,11 @@ class NoVehicleAuthenticator:
         """Give the query in an envelope."""
         return VerifiedRequest(channel, "", data, b"", b"", b"", is_stale=False)
 
-    def seal_state(self, body: bytes) -> bytes:
+    def sign_state(self, body: bytes) -> bytes:
         """Give the state as it is."""
         return body
 
-    def seal_reply(self, _request: VerifiedRequest, body: bytes) -> bytes:
+    def sign_reply(self, _request: VerifiedRequest, body: bytes) -> bytes:
         """Give the reply as it is."""
         return body
 
@@ -136,11 +136,11 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
         self._operators = dict(operators)
         self._instance = secrets.token_bytes(8)
         self._states = 0
-        self._asked: Counter[tuple[str, str]] = Counter()
+        self._requested: Counter[tuple[str, str]] = Counter()
         """By channel and operator: how many requests were taken."""
         self._agreements: dict[bytes, tuple[bytes, bytes]] = {}
         """By the client's public key: the secret, and the public key of this end."""
-        self._holder = ""
+        self._active_operator = ""
         self._codes = _SessionMacs()
 
     # What comes in.
@@ -149,23 +149,23 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
         """Give the command in an envelope, unchecked."""
         return _signed(data)
 
-    def is_from_holder(self, data: bytes) -> bool:
+    def is_from_active_operator(self, data: bytes) -> bool:
         """Tell by its code, which is cheap, whether a command comes from who holds the vehicle."""
         return self._codes.fit("control", data)
 
-    def is_next_of_holder(self, channel: str, data: bytes) -> bool:
+    def is_next_of_active_operator(self, channel: str, data: bytes) -> bool:
         """Tell by place and code, which is cheap, whether a query is the next of who holds the vehicle."""
-        return data.startswith(self._place(channel, self._holder)) and self._codes.fit(channel, data)
+        return data.startswith(self._place(channel, self._active_operator)) and self._codes.fit(channel, data)
 
     def open_command(self, data: bytes) -> bytes | None:
         """Give the command in an envelope that the holder has signed; of other operators only an emergency stop."""
         body, signature = _signed(data), data[-SIGNATURE_BYTES:]
         said = _context("control", self._vehicle) + body
-        holder = self._operators.get(self._holder)
-        if holder is not None and holder.verifies(signature, said):
+        active_operator = self._operators.get(self._active_operator)
+        if active_operator is not None and active_operator.verifies(signature, said):
             return body
         if self._asks_for_emergency_stop(body) and any(
-            key.verifies(signature, said) for name, key in self._operators.items() if name != self._holder
+            key.verifies(signature, said) for name, key in self._operators.items() if name != self._active_operator
         ):
             return body
         self._counts["commands_forged"] += 1
@@ -192,7 +192,7 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
             self._counts[f"{channel}_requests_forged"] += 1
             return None
         next_in_place = place == self._place(channel, who)
-        self._asked[channel, who] += next_in_place
+        self._requested[channel, who] += next_in_place
         # An emergency stop has a number of its own, and no time to ask twice.
         stale = body == b"" or not (next_in_place or _is_emergency_stop(channel, body))
         self._counts[f"{channel}_requests_of_another_time"] += stale and body != b""
@@ -207,7 +207,7 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
             return False
 
     def _place(self, channel: str, who: str) -> bytes:
-        return self._instance + self._asked[channel, who].to_bytes(8, "big")
+        return self._instance + self._requested[channel, who].to_bytes(8, "big")
 
     def _agree(self, public: bytes) -> tuple[bytes, bytes] | None:
         """Agree on a secret with whoever has this public key: the secret and the public key of this end."""
@@ -223,13 +223,13 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
 
     # What goes out.
 
-    def seal_state(self, body: bytes) -> bytes:
+    def sign_state(self, body: bytes) -> bytes:
         """Sign a state, and number it."""
         self._states += 1
         signed = self._instance + self._states.to_bytes(8, "big") + body
         return signed + self._codes.of("state", signed) + self._key.sign(_context("state", self._vehicle) + signed)
 
-    def seal_reply(self, request: VerifiedRequest, body: bytes) -> bytes:
+    def sign_reply(self, request: VerifiedRequest, body: bytes) -> bytes:
         """Sign the reply to `request`, encrypted for who asked; of a stale one `body` is empty."""
         if not request.is_stale:
             self._note_session(request, body)
@@ -244,9 +244,9 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
             return
         reply, operation = decode(SessionReply, body), decode(SessionRequest, request.body).operation
         if reply.granted and operation == "release":
-            self._holder, self._codes = "", _SessionMacs()
+            self._active_operator, self._codes = "", _SessionMacs()
         elif reply.granted and reply.token:
-            self._holder, self._codes = request.who, _SessionMacs(reply.token)
+            self._active_operator, self._codes = request.who, _SessionMacs(reply.token)
 
 
 @value
@@ -277,39 +277,39 @@ class OperatorAuthenticator:
         self._vehicle_key = vehicle_key
         self._agreement = KeyAgreement()
         self._places: dict[str, bytes] = dict.fromkeys(REQUESTS, bytes(PLACE_BYTES))
-        self._asked: dict[bytes, tuple[str, bytes]] = {}
+        self._requested: dict[bytes, tuple[str, bytes]] = {}
         """By digest: the channel and the body of requests that wait for a reply."""
         self._codes = _SessionMacs()
         self._newest_state = bytes(PLACE_BYTES)
 
     # What goes out.
 
-    def seal_command(self, body: bytes) -> bytes:
+    def sign_command(self, body: bytes) -> bytes:
         """Sign a command."""
         return body + self._codes.of("control", body) + self._key.sign(_context("control", self._vehicle) + body)
 
-    def seal_request(self, channel: str, body: bytes) -> bytes:
+    def sign_request(self, channel: str, body: bytes) -> bytes:
         """Sign a query; an empty one only asks for the place of the next."""
         signed = self._places[channel] + self._agreement.public + self._who + body
         data = signed + self._codes.of(channel, signed) + self._key.sign(_context(channel, self._vehicle) + signed)
-        self._asked[_digest(data)] = channel, body
-        if len(self._asked) > KEPT:
-            self._asked.pop(next(iter(self._asked)))
+        self._requested[_digest(data)] = channel, body
+        if len(self._requested) > KEPT:
+            self._requested.pop(next(iter(self._requested)))
         return data
 
     # What comes in.
 
     def open_reply(self, channel: str, data: bytes) -> VerifiedReply:
         """Give the answer of the vehicle to a request of ours; each is taken once."""
-        digest, because = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
+        digest, reason = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
         at = DIGEST_BYTES + 1
         place, public = data[at : at + PLACE_BYTES], data[at + PLACE_BYTES : at + PLACE_BYTES + PUBLIC_KEY_BYTES]
         signed, signature = data[:-SIGNATURE_BYTES], data[-SIGNATURE_BYTES:]
-        asked = self._asked.get(digest)
+        requested = self._requested.get(digest)
         said = _context(f"{channel} reply", self._vehicle) + signed
         if (
-            asked is None
-            or asked[0] != channel
+            requested is None
+            or requested[0] != channel
             or len(data) > LONGEST_BYTES
             or not self._vehicle_key.verifies(signature, said)
         ):
@@ -322,17 +322,17 @@ class OperatorAuthenticator:
             return self._forged(f"{channel}_replies_forged")
         self._forget(channel, digest)
         self._note_place(channel, place)
-        if because == _AGAIN:
-            return VerifiedReply(None, self.seal_request(channel, asked[1]) if asked[1] else None)
+        if reason == _AGAIN:
+            return VerifiedReply(None, self.sign_request(channel, requested[1]) if requested[1] else None)
         if channel == "session":
             self._note_session(body)
         return VerifiedReply(body, None)
 
     def _forget(self, channel: str, answered: bytes) -> None:
         """Take no reply any more to a request, nor to those of its kind from before it: what they say is older."""
-        for digest in list(self._asked):
-            if self._asked[digest][0] == channel:
-                del self._asked[digest]
+        for digest in list(self._requested):
+            if self._requested[digest][0] == channel:
+                del self._requested[digest]
             if digest == answered:
                 return
 

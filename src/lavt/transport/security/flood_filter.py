@@ -43,13 +43,16 @@ class RateLimiter:
 class FloodFilter:
     """Says whether a command is worth being looked at.
 
-    `in_force` gives the epoch in force and the sequence last obeyed; `is_from_holder` tells it of an envelope, cheaply.
+    `in_force` returns the epoch in force and the sequence number of the last accepted command;
+    `is_from_active_operator` checks an envelope cheaply.
     """
 
-    def __init__(self, in_force: Callable[[], tuple[int, int]], is_from_holder: Callable[[bytes], bool]) -> None:
+    def __init__(
+        self, in_force: Callable[[], tuple[int, int]], is_from_active_operator: Callable[[bytes], bool]
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._in_force = in_force
-        self._is_from_holder = is_from_holder
+        self._is_from_active_operator = is_from_active_operator
         self._newest = (0, -1)
         """Epoch and sequence of the newest command that was let in; of one that the vehicle refuses they do not become
         those in force, and it may come again and again."""
@@ -59,13 +62,13 @@ class FloodFilter:
 
     def passes(self, data: bytes, body: bytes, now_ns: int) -> bool:
         """Tell whether `body`, which came in the envelope `data`, goes on."""
-        from_holder = self._is_from_holder(data)
+        from_active_operator = self._is_from_active_operator(data)
         epoch, sequence = self._in_force()
         if self._newest[0] == epoch:
             sequence = max(sequence, self._newest[1])
-        if from_holder and may_be_obeyed(body, epoch, sequence):
+        if from_active_operator and may_be_accepted(body, epoch, sequence):
             return True
-        if (self._old if from_holder else self._strange).take(now_ns):
+        if (self._old if from_active_operator else self._strange).take(now_ns):
             return True
         self.counts["commands_screened_out"] += 1
         return False
@@ -77,7 +80,7 @@ class FloodFilter:
             self._newest = max(self._newest, head) if self._newest[0] == head[0] else head
 
 
-def may_be_obeyed(body: bytes, epoch: int, sequence: int) -> bool:
+def may_be_accepted(body: bytes, epoch: int, sequence: int) -> bool:
     """Tell from the beginning of a command whether it is of this epoch and newer than `sequence`."""
     head = _head(body)
     return head is not None and head[0] == epoch and head[1] > sequence

@@ -32,7 +32,7 @@ class OpenClientGateway:
     counts: Mapping[str, int] = {}
 
     def __init__(self, deliver: Deliver, carry: Carry) -> None:
-        self.let_in = deliver
+        self.receive = deliver
         self.send = carry
 
 
@@ -40,12 +40,16 @@ class ServerGateway:
     """The vehicle's door. `in_force` gives the epoch in force and the sequence last obeyed."""
 
     def __init__(
-        self, deliver: Deliver, carry: Carry, in_force: Callable[[], tuple[int, int]], seal: NoVehicleAuthenticator
+        self,
+        deliver: Deliver,
+        carry: Carry,
+        in_force: Callable[[], tuple[int, int]],
+        authenticator: NoVehicleAuthenticator,
     ) -> None:
         self._deliver = deliver
         self._carry = carry
-        self._seal = seal
-        self._screen = FloodFilter(in_force, seal.is_from_holder)
+        self._authenticator = authenticator
+        self._screen = FloodFilter(in_force, authenticator.is_from_active_operator)
         self._budgets = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
         self._again: Send | None = None
@@ -56,9 +60,9 @@ class ServerGateway:
     @property
     def counts(self) -> dict[str, int]:
         """What was kept outside."""
-        return {**self._counts, **self._screen.counts, **self._seal.counts}
+        return {**self._counts, **self._screen.counts, **self._authenticator.counts}
 
-    def let_in(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
+    def receive(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
         """Take what the link delivers."""
         with self._turn:
             opened = self._command if channel == "control" else self._request
@@ -70,22 +74,24 @@ class ServerGateway:
             self._deliver(channel, body, arrived, peer)
 
     def _command(self, _channel: str, payload: bytes, now_ns: int, _peer: Peer) -> bytes | None:
-        if not self._screen.passes(payload, self._seal.body(payload), now_ns):
+        if not self._screen.passes(payload, self._authenticator.body(payload), now_ns):
             return None
-        body = self._seal.open_command(payload)
+        body = self._authenticator.open_command(payload)
         if body is not None:
             self._screen.note(body)
         return body
 
     def _request(self, channel: str, payload: bytes, now_ns: int, peer: Peer) -> bytes | None:
-        if not (self._seal.is_next_of_holder(channel, payload) or self._budgets[channel].take(now_ns)):
+        if not (
+            self._authenticator.is_next_of_active_operator(channel, payload) or self._budgets[channel].take(now_ns)
+        ):
             self._counts[f"{channel}_requests_screened_out"] += 1
             return None
-        request = self._seal.open_request(channel, payload)
+        request = self._authenticator.open_request(channel, payload)
         if request is None:
             return None
         if request.is_stale:
-            self._again = Send(f"{channel}_reply", self._seal.seal_reply(request, b""), peer)
+            self._again = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request
         if len(self._requests) > QUERIES_KEPT:
@@ -95,34 +101,38 @@ class ServerGateway:
     def send(self, *sends: Send) -> None:
         """Let messages of this side out."""
         with self._turn:
-            sealed = [each for send in sends if (each := self._sealed(send)) is not None]
-        self._carry(*sealed)
+            signed = [each for send in sends if (each := self._signed(send)) is not None]
+        self._carry(*signed)
 
-    def _sealed(self, send: Send) -> Send | None:
+    def _signed(self, send: Send) -> Send | None:
         if send.channel == "state":
-            return Send("state", self._seal.seal_state(send.payload))
+            return Send("state", self._authenticator.sign_state(send.payload))
         request = self._requests.pop((send.channel.removesuffix("_reply"), send.peer), None)
-        return None if request is None else Send(send.channel, self._seal.seal_reply(request, send.payload), send.peer)
+        return (
+            None
+            if request is None
+            else Send(send.channel, self._authenticator.sign_reply(request, send.payload), send.peer)
+        )
 
 
 class ClientGateway:
     """The operator's door."""
 
-    def __init__(self, deliver: Deliver, carry: Carry, seal: OperatorAuthenticator) -> None:
+    def __init__(self, deliver: Deliver, carry: Carry, authenticator: OperatorAuthenticator) -> None:
         self._deliver = deliver
         self._carry = carry
-        self._seal = seal
+        self._authenticator = authenticator
         self._states = RateLimiter(STATES_PER_S)
         self._counts: Counter[str] = Counter()
-        self._asked_ns: int | None = None
+        self._requested_ns: int | None = None
         self._turn = threading.Lock()
 
     @property
     def counts(self) -> dict[str, int]:
         """What was kept outside."""
-        return {**self._counts, **self._seal.counts}
+        return {**self._counts, **self._authenticator.counts}
 
-    def let_in(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
+    def receive(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
         """Take what the link delivers."""
         with self._turn:
             opened = self._state if channel == "state" else self._reply
@@ -131,33 +141,33 @@ class ClientGateway:
             self._deliver(channel, body, arrived, peer)
 
     def _state(self, _channel: str, payload: bytes, now_ns: int) -> bytes | None:
-        if not (self._seal.is_next_state(payload) or self._states.take(now_ns)):
+        if not (self._authenticator.is_next_state(payload) or self._states.take(now_ns)):
             self._counts["states_screened_out"] += 1
             return None
-        opened = self._seal.open_state(payload)
-        if opened.ask and (self._asked_ns is None or now_ns - self._asked_ns >= ASK_PERIOD_NS):
-            self._asked_ns = now_ns
-            self._send_soon(Send("session", self._seal.seal_request("session", b"")))
+        opened = self._authenticator.open_state(payload)
+        if opened.ask and (self._requested_ns is None or now_ns - self._requested_ns >= ASK_PERIOD_NS):
+            self._requested_ns = now_ns
+            self._send_soon(Send("session", self._authenticator.sign_request("session", b"")))
         return opened.body
 
     def _reply(self, channel: str, payload: bytes, _now_ns: int) -> bytes | None:
         query = channel.removesuffix("_reply")
-        reply = self._seal.open_reply(query, payload)
+        reply = self._authenticator.open_reply(query, payload)
         if reply.again is not None:
             self._send_soon(Send(query, reply.again))
         return reply.body
 
     def _send_soon(self, send: Send) -> None:
         """Send in a thread of its own: in the one that delivers, Zenoh does not allow it."""
-        threading.Thread(target=self._carry, args=(send,), name="door", daemon=True).start()
+        threading.Thread(target=self._carry, args=(send,), name="gateway", daemon=True).start()
 
     def send(self, *sends: Send) -> None:
         """Let messages of this side out."""
         with self._turn:
-            sealed = [Send(send.channel, self._sealed(send), send.peer) for send in sends]
-        self._carry(*sealed)
+            signed = [Send(send.channel, self._signed(send), send.peer) for send in sends]
+        self._carry(*signed)
 
-    def _sealed(self, send: Send) -> bytes:
+    def _signed(self, send: Send) -> bytes:
         if send.channel == "control":
-            return self._seal.seal_command(send.payload)
-        return self._seal.seal_request(send.channel, send.payload)
+            return self._authenticator.sign_command(send.payload)
+        return self._authenticator.sign_request(send.channel, send.payload)

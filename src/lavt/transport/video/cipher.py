@@ -20,11 +20,11 @@ _LABELS: Final = {"server": b"LAVT 1 SRTP server to client", "client": b"LAVT 1 
 class Cipher(Protocol):
     """Both directions of an open path, as one end has them."""
 
-    def seal(self, packet: bytes) -> bytes:
+    def authenticator(self, packet: bytes) -> bytes:
         """Make what is sent of an RTP packet."""
         ...
 
-    def seal_control(self, packet: bytes) -> bytes:
+    def protect_control(self, packet: bytes) -> bytes:
         """Make what is sent of an RTCP packet."""
         ...
 
@@ -44,11 +44,11 @@ NewCipher = Callable[[bytes, bytes], Cipher]
 class NoCipher:
     """Leaves every packet as it is."""
 
-    def seal(self, packet: bytes) -> bytes:
+    def authenticator(self, packet: bytes) -> bytes:
         """Give the packet."""
         return packet
 
-    seal_control = open = open_control = seal
+    protect_control = open = open_control = authenticator
 
 
 class SrtpCipher:
@@ -57,7 +57,7 @@ class SrtpCipher:
     def __init__(self, end: End, token: bytes, challenge: bytes) -> None:
         other: End = "client" if end == "server" else "server"
         protector, unprotector = Protector(_key(end, token, challenge)), Unprotector(_key(other, token, challenge))
-        self.seal, self.seal_control = protector.protect, protector.protect_control
+        self.authenticator, self.protect_control = protector.protect, protector.protect_control
         self.open, self.open_control = unprotector.unprotect, unprotector.unprotect_control
 
 

@@ -53,7 +53,7 @@ _HELLO: Final = _MAGIC + bytes([1, _VERSION])
 _CHALLENGE: Final = _MAGIC + bytes([2, _VERSION])
 _ANSWER: Final = _MAGIC + bytes([3, _VERSION])
 _TIME_BYTES: Final = 8
-_SEAL_BYTES: Final = 16
+_TAG_BYTES: Final = 16
 _PROOF_BYTES: Final = 32
 _CLIENT_PROOF_BYTES: Final = 8
 _CIPHERS_KEPT: Final = 16
@@ -89,7 +89,7 @@ class PathClient:
     def answer(self, challenge_datagram: bytes) -> bytes | None:
         """Write the answer to a challenge, to be sent to the server; None when it is none of the server's, or old."""
         said, proof = challenge_datagram[:-_CLIENT_PROOF_BYTES], challenge_datagram[-_CLIENT_PROOF_BYTES:]
-        if len(said) != len(_CHALLENGE) + _TIME_BYTES + _SEAL_BYTES or not said.startswith(_CHALLENGE):
+        if len(said) != len(_CHALLENGE) + _TIME_BYTES + _TAG_BYTES or not said.startswith(_CHALLENGE):
             return None
         if not hmac.compare_digest(proof, _proof(self._token, said)[:_CLIENT_PROOF_BYTES]):
             return None
@@ -119,9 +119,9 @@ class PathClient:
                 return packet
         return None
 
-    def seal_control(self, packet: bytes) -> bytes:
+    def protect_control(self, packet: bytes) -> bytes:
         """Make what is sent of an RTCP packet."""
-        return self._ciphers[0].seal_control(packet)
+        return self._ciphers[0].protect_control(packet)
 
     def video_arrived(self, now_ns: int) -> None:
         """Note that the path works: no hello is needed for a while."""
@@ -170,7 +170,7 @@ class PathServer:
         """Take a datagram from `address`; return what to send back there, if anything: a challenge to a hello."""
         if datagram.startswith(_HELLO) and len(datagram) == len(_HELLO) + _PROOF_BYTES:
             return self._challenge(address, now_ns) if self._proven(datagram) else None
-        if datagram.startswith(_ANSWER) and len(datagram) == len(_ANSWER) + _TIME_BYTES + _SEAL_BYTES + _PROOF_BYTES:
+        if datagram.startswith(_ANSWER) and len(datagram) == len(_ANSWER) + _TIME_BYTES + _TAG_BYTES + _PROOF_BYTES:
             if self._proven(datagram):
                 self._open(datagram, address, now_ns)
         else:
@@ -205,14 +205,14 @@ class PathServer:
     def _challenge(self, address: Address, now_ns: int) -> bytes:
         """Write the challenge for `address`."""
         issued = now_ns.to_bytes(_TIME_BYTES, "big", signed=True)
-        said = _CHALLENGE + issued + self._seal(issued, address)
+        said = _CHALLENGE + issued + self._tag(issued, address)
         return said + _proof(self._token or b"", said)[:_CLIENT_PROOF_BYTES]
 
     def _open(self, answer: bytes, address: Address, now_ns: int) -> None:
         """Open the path to `address` if `answer`, whose proof is right, is to a challenge sent there just now."""
         issued = answer[len(_ANSWER) : len(_ANSWER) + _TIME_BYTES]
-        seal = answer[len(_ANSWER) + _TIME_BYTES : -_PROOF_BYTES]
-        if not hmac.compare_digest(seal, self._seal(issued, address)):
+        tag = answer[len(_ANSWER) + _TIME_BYTES : -_PROOF_BYTES]
+        if not hmac.compare_digest(tag, self._tag(issued, address)):
             self.wrong_address += 1
             return
         issued_ns = int.from_bytes(issued, "big", signed=True)
@@ -225,11 +225,11 @@ class PathServer:
         self._opened_by_ns = issued_ns
         self._last_report_ns = now_ns
 
-    def _seal(self, issued: bytes, address: Address) -> bytes:
+    def _tag(self, issued: bytes, address: Address) -> bytes:
         """Bind a challenge to its time and to the address it is sent to."""
         host, port = address
-        sealed = issued + port.to_bytes(2, "big") + host.encode()
-        return hmac.digest(self._secret, sealed, "sha256")[:_SEAL_BYTES]
+        signed = issued + port.to_bytes(2, "big") + host.encode()
+        return hmac.digest(self._secret, signed, "sha256")[:_TAG_BYTES]
 
 
 def _proof(token: bytes, said: bytes) -> bytes:

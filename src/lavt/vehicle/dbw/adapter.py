@@ -21,7 +21,7 @@ from lavt.vehicle.dbw.profile import (
 )
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STANDING_BELOW_MPS, Situation, State, following
+from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STATIONARY_BELOW_MPS, Situation, State, following
 from lavt.vehicle.vehicle import ReachedCommand
 
 SHIFT_NS: Final = NS_PER_S
@@ -40,15 +40,15 @@ NO_AXES: Final[frozenset[Axis]] = frozenset()
 class ByWireAdapter:
     """Speaks to one by-wire kit by a profile.
 
-    A tick is a call of `ask`; frames leave only while the newest is at most 60 ms old. `hindrance` is of the
+    A tick is a call of `ask`; frames leave only while the newest is at most 60 ms old. `inhibit_reason` is of the
     installation: where it is not empty, the kit is never engaged.
     """
 
-    def __init__(self, profile: Profile, *, start_ns: int, hindrance: str = "") -> None:
+    def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
         self._profile = profile
         self._reports, self._sender = NewestReports(profile, start_ns), FrameSender(profile, start_ns)
         signless = "the steering's sign is not known: set vehicle.dbw.steering_sign"
-        self._installation = _joined([hindrance, signless if profile.car.steering_sign is None else ""])
+        self._installation = _joined([inhibit_reason, signless if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
         self._entered_ns = self._now_ns = start_ns
         self._why = ""
@@ -60,8 +60,8 @@ class ByWireAdapter:
         """When the car was last reported to move."""
         self._is_shifting = False
         """DRIVE was asked for, and is not reported yet: PARK that is reported is none to rely on."""
-        self._asked = Actuation(0.0, 0.0, 0.0)
-        self._asked_ns: int | None = None
+        self._requested = Actuation(0.0, 0.0, 0.0)
+        self._requested_ns: int | None = None
         self._plan: KitCommands | None = None
         """What the last set said; None: nothing is being said."""
         self._is_late = False
@@ -100,9 +100,9 @@ class ByWireAdapter:
     def ask(self, actuation: Actuation, now_ns: int) -> None:
         """Take what the car is to do: a tick. What is no number is dropped and counted, and is no tick."""
         if not all(map(math.isfinite, (actuation.steering_rad, actuation.throttle, actuation.brake))):
-            self._counts["actuations_refused"] += 1
+            self._counts["actuations_rejected"] += 1
             return
-        self._asked, self._asked_ns = actuation, now_ns
+        self._requested, self._requested_ns = actuation, now_ns
 
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Hear whether somebody wants to drive."""
@@ -119,7 +119,7 @@ class ByWireAdapter:
         still_enabled = NO_AXES if is_silent else self._reports.enabled  # reports may have waited for us
         self._kept &= still_enabled
         self._is_shifting &= self._reports.gear != "drive"
-        if not self._is_standing():
+        if not self._is_stationary():
             self._moved_ns = now_ns
         self._tell(now_ns)
         while True:
@@ -135,8 +135,8 @@ class ByWireAdapter:
                 self._kept = still_enabled
             self._state, self._entered_ns = state, now_ns
 
-    def _is_standing(self) -> bool:
-        return abs(self._reports.speed_mps) < STANDING_BELOW_MPS
+    def _is_stationary(self) -> bool:
+        return abs(self._reports.speed_mps) < STATIONARY_BELOW_MPS
 
     def _situation(self, now_ns: int) -> Situation:
         reports = self._reports
@@ -144,8 +144,8 @@ class ByWireAdapter:
         faults = _joined([reports.foreign(now_ns), *reports.said("fault")])
         return Situation(
             wanted=self._wanted,
-            is_standing=self._is_standing(),
-            hindrance=_joined([self._installation, unheard, faults]),
+            is_stationary=self._is_stationary(),
+            inhibit_reason=_joined([self._installation, unheard, faults]),
             unheard=unheard,
             silent_ns=now_ns - self._sender.sent_ns,
             faults=faults,
@@ -180,24 +180,24 @@ class ByWireAdapter:
             self._is_late = True
             return []
         self._is_late = False
-        asked = self._to_ask()
+        requested = self._to_ask()
         is_new = plan != self._plan
-        if not is_new and now_ns < self._due_ns(asked):
+        if not is_new and now_ns < self._due_ns(requested):
             return []
         self._plan = plan
         self._is_shifting |= plan.gear == "drive"
-        frames = self._sender.frames(plan, asked, self._reports.wheel_deg, now_ns)
+        frames = self._sender.frames(plan, requested, self._reports.wheel_deg, now_ns)
         self._expect_echo(plan)
         return frames
 
     def _is_fresh(self, now_ns: int) -> bool:
-        return self._asked_ns is not None and now_ns - self._asked_ns <= TICK_LIMIT_NS
+        return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
 
-    def _due_ns(self, asked: DriveCommand) -> int:
+    def _due_ns(self, requested: DriveCommand) -> int:
         """Tell when the next set is due: soon where it brings something new."""
         if self._state == "clearing":
             return self._sender.sent_ns + CLEARING_PERIOD_NS
-        return self._sender.sent_ns + (PERIOD_NS if asked == self._sender.sent else LEAST_GAP_NS)
+        return self._sender.sent_ns + (PERIOD_NS if requested == self._sender.sent else LEAST_GAP_NS)
 
     def _planned(self) -> KitCommands | None:
         """Give what each state says to the kit."""
@@ -231,25 +231,25 @@ class ByWireAdapter:
 
     def _to_ask(self) -> DriveCommand:
         """Give how the car is to drive in this state, before the limits."""
-        asked, limits = self._asked, self._profile.limits
-        wheel_deg = self._profile.wheel_deg(asked.steering_rad)
+        requested, limits = self._requested, self._profile.limits
+        wheel_deg = self._profile.wheel_deg(requested.steering_rad)
         if self._state == "engaged":
-            return DriveCommand(wheel_deg, asked.throttle, asked.brake)
+            return DriveCommand(wheel_deg, requested.throttle, requested.brake)
         is_held = self._state in {"enabling", "parking"}
-        return DriveCommand(wheel_deg, 0.0, max(asked.brake, limits.holding_brake) if is_held else asked.brake)
+        return DriveCommand(wheel_deg, 0.0, max(requested.brake, limits.holding_brake) if is_held else requested.brake)
 
     # What has reached the wheels.
 
     def _expect_echo(self, plan: KitCommands) -> None:
-        if "steering" not in plan.enabled or self._asked_ns is None:
+        if "steering" not in plan.enabled or self._requested_ns is None:
             self._echoes.clear()
             self._expected = None
             return
-        while self._echoes and self._asked_ns - self._echoes[0][1] > ECHO_LIMIT_NS:
+        while self._echoes and self._requested_ns - self._echoes[0][1] > ECHO_LIMIT_NS:
             self._echoes.popleft()
         number = round(self._sender.sent.wheel_deg / self._profile.command_step_deg)
         if number != (self._reports.command if self._expected is None else self._expected):
-            self._echoes.append((number, self._asked_ns))
+            self._echoes.append((number, self._requested_ns))
         self._expected = number
 
     def _echo(self, now_ns: int) -> None:
@@ -257,9 +257,9 @@ class ByWireAdapter:
         if not any(number == self._reports.command for number, _ in self._echoes):
             return
         while self._echoes:
-            number, asked_ns = self._echoes.popleft()
+            number, requested_ns = self._echoes.popleft()
             if number == self._reports.command:
-                self._reached.append(ReachedCommand(asked_ns, now_ns))
+                self._reached.append(ReachedCommand(requested_ns, now_ns))
                 return
 
     # What it tells.
@@ -272,15 +272,15 @@ class ByWireAdapter:
             speed_mps=reports.speed_mps,
             steering_rad=self._profile.road_rad(reports.wheel_deg),
             gear=reports.gear or "neutral",
-            hindrance=self._hindrance(),
+            inhibit_reason=self._inhibit_reason(),
             is_engaged=self._state == "engaged",
             is_overridden=self._state == "overridden",
         )
 
-    def _hindrance(self) -> str:
+    def _inhibit_reason(self) -> str:
         now = self._seen
-        said = [self._why if self._state in {"lost", "overridden"} else "", now.hindrance]
-        if self._state == "parking" and now.is_standing and now.since_ns >= ENABLING_LIMIT_NS:
+        said = [self._why if self._state in {"lost", "overridden"} else "", now.inhibit_reason]
+        if self._state == "parking" and now.is_stationary and now.since_ns >= ENABLING_LIMIT_NS:
             said.append(_joined(["the car stands and is not parked", now.reasons]))
         return _joined(said)
 
@@ -305,7 +305,7 @@ class ByWireAdapter:
     @property
     def tick_ns(self) -> int | None:
         """When the newest tick was: no frame may leave later than 60 ms after it."""
-        return self._asked_ns
+        return self._requested_ns
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -17,7 +17,7 @@ from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, OwnBrake, Profile
 from lavt.vehicle.dbw.reports import Kind, NewestReports
-from lavt.vehicle.dbw.states import STANDING_BELOW_MPS
+from lavt.vehicle.dbw.states import STATIONARY_BELOW_MPS
 
 BRAKE: Final = 0.3
 """What is asked of the brake while the kit is enabled."""
@@ -41,7 +41,7 @@ Phase = Literal["looking", "enabling", "watching", "done"]
 class WatchdogObservation:
     """What was seen of a kit that was left alone, in ns after the last frame that it got."""
 
-    let_go_ns: int
+    released_ns: int
     """Its brake was reported not enabled."""
     braked_ns: int
     """It was reported to brake by itself."""
@@ -64,7 +64,7 @@ class WatchdogTest:
         self._phase: Phase = "looking"
         self._since_ns = self._tick_ns = self._last_ns = start_ns
         self._enabled_ns: int | None = None
-        self._let_go_ns: int | None = None
+        self._released_ns: int | None = None
         self._braked_ns: int | None = None
         self._watched = 0
         messages = profile.codec.messages
@@ -121,16 +121,16 @@ class WatchdogTest:
             if passed_ns >= HEAR_LIMIT_NS:
                 self._fail(f"the kit is not heard: {', '.join(missing)}")
             return []
-        self._adapter.ask(self._asked(), now_ns)  # nobody wants to drive yet: nothing leaves
-        hindrance = self._adapter.state().hindrance
+        self._adapter.ask(self._requested(), now_ns)  # nobody wants to drive yet: nothing leaves
+        inhibit_reason = self._adapter.state().inhibit_reason
         if passed_ns < LOOK_NS:
             return []
-        if abs(self._reports.speed_mps) >= STANDING_BELOW_MPS:
+        if abs(self._reports.speed_mps) >= STATIONARY_BELOW_MPS:
             self._fail("the car does not stand: let it stand, its wheels off the ground")
         elif self._reports.gear not in {"park", "neutral"}:
             self._fail(f"the gear is {self.gear}: put it into park or neutral")
-        elif hindrance:
-            self._fail(f"the kit cannot be enabled: {hindrance}")
+        elif inhibit_reason:
+            self._fail(f"the kit cannot be enabled: {inhibit_reason}")
         else:
             self._enter("enabling", now_ns)
             self._adapter.engage(True, now_ns)
@@ -140,7 +140,7 @@ class WatchdogTest:
         """Have the kit enabled, and hold it so for a while."""
         if now_ns - self._tick_ns >= TICK_NS:
             self._tick_ns = now_ns
-            self._adapter.ask(self._asked(), now_ns)
+            self._adapter.ask(self._requested(), now_ns)
         if self._reports.enabled == frozenset(AXES):
             self._enabled_ns = now_ns if self._enabled_ns is None else self._enabled_ns
             if now_ns - self._enabled_ns >= HOLD_NS:
@@ -148,8 +148,8 @@ class WatchdogTest:
                 return []
         frames = [each for each in self._adapter.frames_due(now_ns) if each.identifier != self._gear_command]
         state = self._adapter.state()
-        if state.hindrance or state.is_overridden:
-            self._fail(f"the kit did not stay enabled: {state.hindrance}")
+        if state.inhibit_reason or state.is_overridden:
+            self._fail(f"the kit did not stay enabled: {state.inhibit_reason}")
             return []
         if frames:
             self._last_ns = now_ns
@@ -161,7 +161,7 @@ class WatchdogTest:
             return []
         reports = self._reports
         overrides = reports.said("override")
-        if self._let_go_ns is None:
+        if self._released_ns is None:
             self._fail("the kit did not let go of the brake: somebody else may command it, or its time-out is off")
         elif self._braked_ns is None or self._braked_ns - self._last_ns > BRAKE_WITHIN_NS:
             late = "" if self._braked_ns is None else f", but only after {self._ms(self._braked_ns)} ms"
@@ -173,8 +173,8 @@ class WatchdogTest:
             self._fail(f"the driver braked or steered: {', '.join(overrides)}")
         else:
             words = "; ".join(words for kind in SAID for words in reports.said(kind))
-            let_go_ns, braked_ns = self._let_go_ns - self._last_ns, self._braked_ns - self._last_ns
-            self.seen = WatchdogObservation(let_go_ns, braked_ns, self._watched, words)
+            released_ns, braked_ns = self._released_ns - self._last_ns, self._braked_ns - self._last_ns
+            self.seen = WatchdogObservation(released_ns, braked_ns, self._watched, words)
             self._phase = "done"
         return []
 
@@ -182,8 +182,8 @@ class WatchdogTest:
         self._watched += 1
         if "brake" in self._reports.enabled:
             return
-        if self._let_go_ns is None:
-            self._let_go_ns = now_ns
+        if self._released_ns is None:
+            self._released_ns = now_ns
         if brakes and self._braked_ns is None:
             self._braked_ns = now_ns
         if not brakes and self._braked_ns is not None:
@@ -202,7 +202,7 @@ class WatchdogTest:
         amount = decoded[1][self._watchdog.signal]
         return amount is not None and amount > self._watchdog.above
 
-    def _asked(self) -> Actuation:
+    def _requested(self) -> Actuation:
         """The wheel where it is, and the brake."""
         return Actuation(self._adapter.state().steering_rad, 0.0, BRAKE)
 

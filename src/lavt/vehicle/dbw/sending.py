@@ -37,16 +37,16 @@ class DriveCommand:
     brake: float
 
 
-def limited(limits: ByWireLimits, asked: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
-    """Give what of `asked` is allowed `passed_ns` after `before` was sent; with the brake there is no throttle."""
+def limited(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
+    """Give what of `requested` is allowed `passed_ns` after `before` was sent; with the brake there is no throttle."""
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
-    wheel_deg = _within(asked.wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg)
-    throttle = 0.0 if asked.brake > 0 else asked.throttle
+    wheel_deg = _within(requested.wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg)
+    throttle = 0.0 if requested.brake > 0 else requested.throttle
     return DriveCommand(
         _within(wheel_deg, before.wheel_deg - turn_deg, before.wheel_deg + turn_deg),
         _within(throttle, 0.0, min(limits.throttle, before.throttle + limits.throttle_rate_per_s * passed_s)),
-        _within(asked.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
+        _within(requested.brake, 0.0, min(limits.brake, before.brake + limits.brake_rate_per_s * passed_s)),
     )
 
 
@@ -68,7 +68,7 @@ class FrameSender:
         """How many frames of each message were counted."""
         self._gear_ns: int | None = None
 
-    def frames(self, plan: KitCommands, asked: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
+    def frames(self, plan: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
         """Make a set of frames; `wheel_deg` is where the steering wheel is, from which it turns once it is enabled."""
         profile, passed_ns = self._profile, now_ns - self.sent_ns
         self.sent_ns = now_ns
@@ -76,8 +76,8 @@ class FrameSender:
         if plan.is_clearing:
             self.sent = DriveCommand(wheel_deg, 0.0, 0.0)
             return self._clearing()
-        allowed = limited(profile.limits, asked, self.sent, passed_ns)
-        self._count_limits(asked, allowed, plan.enabled)
+        allowed = limited(profile.limits, requested, self.sent, passed_ns)
+        self._count_limits(requested, allowed, plan.enabled)
         self.sent = DriveCommand(
             allowed.wheel_deg if "steering" in plan.enabled else wheel_deg,
             allowed.throttle if "throttle" in plan.enabled else 0.0,
@@ -140,10 +140,10 @@ class FrameSender:
             data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1], extended=facts.is_extended)])
         return CanFrame(facts.identifier, data, facts.is_extended)
 
-    def _count_limits(self, asked: DriveCommand, allowed: DriveCommand, enabled: frozenset[Axis]) -> None:
+    def _count_limits(self, requested: DriveCommand, allowed: DriveCommand, enabled: frozenset[Axis]) -> None:
         changed: dict[str, tuple[Axis, bool]] = {
-            "limited_wheel_deg": ("steering", asked.wheel_deg != allowed.wheel_deg),
-            "limited_throttle": ("throttle", asked.throttle != allowed.throttle),
-            "limited_brake": ("brake", asked.brake != allowed.brake),
+            "limited_wheel_deg": ("steering", requested.wheel_deg != allowed.wheel_deg),
+            "limited_throttle": ("throttle", requested.throttle != allowed.throttle),
+            "limited_brake": ("brake", requested.brake != allowed.brake),
         }
         self.counts.update(name for name, (axis, is_changed) in changed.items() if is_changed and axis in enabled)

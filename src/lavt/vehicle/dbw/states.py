@@ -11,7 +11,7 @@ from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, Axis, Gear
 
 State = Literal["idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"]
 
-STANDING_BELOW_MPS: Final = 0.1
+STATIONARY_BELOW_MPS: Final = 0.1
 """Ours: below it the car stands."""
 ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
 """Ours: what a kit does not do in so long it does not do."""
@@ -37,8 +37,8 @@ class Situation:
 
     wanted: bool
     """Somebody wants to drive."""
-    is_standing: bool
-    hindrance: str
+    is_stationary: bool
+    inhibit_reason: str
     """Why driving cannot begin; empty: it can."""
     unheard: str
     """Bus gone, or reports missing."""
@@ -69,10 +69,10 @@ class TransitionRow:
     target: State
 
 
-def _let_go(now: Situation) -> str:
+def _release(now: Situation) -> str:
     """Tell which axes do not obey any more."""
     axes = [axis for axis in AXES if axis not in now.enabled]
-    return f"the kit has let go of {' and '.join(axes)}{_because(now)}" if axes else ""
+    return f"the kit has let go of {' and '.join(axes)}{_reason(now)}" if axes else ""
 
 
 def _out_of_gear(now: Situation) -> str:
@@ -93,7 +93,7 @@ def _did_not(what: str) -> Callable[[Situation], str]:
     return case
 
 
-def _because(now: Situation) -> str:
+def _reason(now: Situation) -> str:
     said = "; ".join(filter(None, [now.trips, now.lapses, now.reasons]))
     return f" ({said})" if said else ""
 
@@ -126,10 +126,10 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("enabling", "engaged"),
         "the kit's watchdog has tripped",
-        lambda now: now.trips and now.trips + _because(now),
+        lambda now: now.trips and now.trips + _reason(now),
         "lost",
     ),
-    TransitionRow(("engaged",), "the kit has let go of an axis", _let_go, "lost"),
+    TransitionRow(("engaged",), "the kit has let go of an axis", _release, "lost"),
     TransitionRow(("engaged",), "the kit finds our commands late or wrong", lambda now: now.lapses, "lost"),
     TransitionRow(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
     TransitionRow(
@@ -138,7 +138,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("idle",),
         "driving is wanted, the car stands, and nothing hinders it",
-        lambda now: now.wanted and now.is_standing and not now.hindrance,
+        lambda now: now.wanted and now.is_stationary and not now.inhibit_reason,
         "clearing",
     ),
     TransitionRow(
@@ -176,7 +176,7 @@ TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("overridden",),
         "driving is not wanted any more, and the car stands",
-        lambda now: not now.wanted and now.is_standing and not now.unheard and not now.enabled,
+        lambda now: not now.wanted and now.is_stationary and not now.unheard and not now.enabled,
         "idle",
     ),
 )

@@ -87,7 +87,7 @@ class CarDynamics:
     def __init__(self, parameters: CarParameters, motion: CarMotion, step_s: float) -> None:
         self.parameters, self.motion = parameters, motion
         self._step_s = step_s
-        self._asked: Actuation | None = None
+        self._requested: Actuation | None = None
         self._wanted = Actuation(0.0, 0.0, 0.0)
         self._to_rear_m = parameters.wheelbase_m - parameters.front_axle_to_gravity_m
         weight_n = parameters.mass_kg * GRAVITY_MPS2 / parameters.wheelbase_m
@@ -112,8 +112,8 @@ class CarDynamics:
 
     def step(self, wanted: Actuation) -> None:
         """Live on for one time step under `wanted`; values out of range are taken as the nearest in range."""
-        if wanted is not self._asked:  # the same for many steps
-            self._asked, self._wanted = wanted, self._within_reach(wanted)
+        if wanted is not self._requested:  # the same for many steps
+            self._requested, self._wanted = wanted, self._within_reach(wanted)
         # Everything is read and written once: this is a tenth of what virtual time takes without pixels.
         wanted, parameters, motion, step_s = self._wanted, self.parameters, self.motion, self._step_s
         speed_mps, side_speed_mps, yaw_rate_radps = motion.speed_mps, motion.side_speed_mps, motion.yaw_rate_radps

@@ -96,7 +96,7 @@ class Simulator:
         self._told = None
         while next_ns <= to_ns:
             if (steering and steering[0][0] <= at_ns) or (pedals and pedals[0][0] <= at_ns):
-                self._obey(at_ns)
+                self._accept(at_ns)
             self._index += 1
             at_ns, next_ns = next_ns, grid_ns(self._index + 1)
             if self._wrecked:
@@ -127,7 +127,7 @@ class Simulator:
         """Tell nothing: what is applied is in force after the dead times."""
         return []
 
-    def _obey(self, at_ns: int) -> None:
+    def _accept(self, at_ns: int) -> None:
         """Take over what has become due."""
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
         while self._steering and self._steering[0][0] <= at_ns:

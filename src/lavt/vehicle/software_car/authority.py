@@ -25,12 +25,12 @@ class Authority:
 
     def __init__(self, state: KitState, generation: Generation, *, has_watchdog: bool) -> None:
         self._state, self._generation, self.has_watchdog = state, generation, has_watchdog
-        self.hindrance = ReleaseReason.NONE
+        self.inhibit_reason = ReleaseReason.NONE
         """Why generation 2 is not ready, if nothing in the state says so."""
         self._system_count: int | None = None
-        self._asked_ns: int | None = None
+        self._requested_ns: int | None = None
         """When the newest request to enable came, while they keep coming."""
-        self._is_asked, self._is_spent = False, False
+        self._is_requested, self._is_spent = False, False
         """Whether the system is to become active; whether it was, so that requests have to begin anew."""
 
     def request(self, order: SystemOrder, now_ns: int) -> None:
@@ -39,16 +39,16 @@ class Authority:
             return
         self._system_count = order.count
         if order.request == ENABLE:
-            self._asked_ns, self._is_asked = now_ns, not self._is_spent
+            self._requested_ns, self._is_requested = now_ns, not self._is_spent
             return
-        self._asked_ns, self._is_asked, self._is_spent = None, False, False
+        self._requested_ns, self._is_requested, self._is_spent = None, False, False
         if order.request == DISABLE and self._state.system == SystemState.ACTIVE:
-            self.lose("steering", ReleaseReason.ASKED)
+            self.lose("steering", ReleaseReason.REQUESTED)
 
     def live(self, now_ns: int) -> None:
         """Forget a request to enable that is too old."""
-        if self._asked_ns is not None and self._asked_ns + COMMAND_TIMEOUT_NS <= now_ns:
-            self._asked_ns, self._is_asked, self._is_spent = None, False, False
+        if self._requested_ns is not None and self._requested_ns + COMMAND_TIMEOUT_NS <= now_ns:
+            self._requested_ns, self._is_requested, self._is_spent = None, False, False
 
     def settle(self) -> None:
         """Let go of what may be enabled no longer, enable what may be, and see what comes out."""
@@ -62,7 +62,7 @@ class Authority:
         ready = [
             axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == ReleaseReason.NONE
         ]
-        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_asked):
+        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_requested):
             self._enable(ready)
         state.system = self._system_state()
         state.throttle, state.brake = self._pedals()
@@ -76,7 +76,7 @@ class Authority:
             return ReleaseReason.FAULT
         if state.is_overridden:
             return ReleaseReason.OVERRIDE
-        return ReleaseReason.REMOTE if state.remote_state <= PAUSED else self.hindrance
+        return ReleaseReason.REMOTE if state.remote_state <= PAUSED else self.inhibit_reason
 
     def _system_state(self) -> SystemState:
         if self._state.actuators["steering"].is_enabled:
@@ -96,15 +96,15 @@ class Authority:
         state = self._state
         if not state.actuators[axis].is_enabled:
             return
-        is_wanted = reason in {ReleaseReason.ASKED, ReleaseReason.OVERRIDE} or (
+        is_wanted = reason in {ReleaseReason.REQUESTED, ReleaseReason.OVERRIDE} or (
             reason == ReleaseReason.DISABLED
-            and (self._generation.is_one_system or (state.is_standing and not state.is_in_gear))
+            and (self._generation.is_one_system or (state.is_stationary and not state.is_in_gear))
         )
         is_trip = self.has_watchdog and not is_wanted and not state.is_overridden
         if is_trip:
             state.watchdog, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
         state.disengaged = reason
-        self._is_asked, self._is_spent = False, self._asked_ns is not None
+        self._is_requested, self._is_spent = False, self._requested_ns is not None
         for each in AXES if is_trip or self._generation.is_one_system else (axis,):
             state.actuators[each].is_enabled = False
             if each == "steering":
@@ -127,10 +127,10 @@ class Authority:
 
     def _pedals(self) -> tuple[float, float]:
         """Give throttle and brake: the kit's and the driver's, whichever is more; without a gear nothing drives."""
-        state, asked = self._state, dict.fromkeys(AXES, 0.0)
+        state, requested = self._state, dict.fromkeys(AXES, 0.0)
         for axis, actuator in state.actuators.items():
             if actuator.is_enabled and actuator.order is not None:
-                asked[axis] = actuator.order.target
+                requested[axis] = actuator.order.target
         watchdog = WATCHDOG_BRAKE if state.watchdog_brakes else 0.0
-        throttle = max(asked["throttle"], state.driver_throttle) if state.is_in_gear else 0.0
-        return throttle, max(asked["brake"], state.driver_brake, watchdog)
+        throttle = max(requested["throttle"], state.driver_throttle) if state.is_in_gear else 0.0
+        return throttle, max(requested["brake"], state.driver_brake, watchdog)

@@ -82,13 +82,13 @@ WORDS: Final[dict[str, ConsoleCommand]] = {
         "VALUE", "report it again",
         lambda kit, text, _: kit.set_unknown(text, is_unknown=False),
     ),
-    "hinder": ConsoleCommand(
+    "inhibit": ConsoleCommand(
         "WHAT", "generation 2 is not ready, because of: seat belt, door, speed, acceleration, reverse",
-        lambda kit, text, now_ns: kit.hinder(text, now_ns),
+        lambda kit, text, now_ns: kit.inhibit(text, now_ns),
     ),
     "unhinder": ConsoleCommand(
         "", "it is ready again",
-        lambda kit, _, now_ns: kit.hinder(None, now_ns),
+        lambda kit, _, now_ns: kit.inhibit(None, now_ns),
     ),
     "switch_remote": ConsoleCommand(
         "STATE", f"the remote's switch: {', '.join(SWITCH)}",

@@ -15,7 +15,7 @@ class KitEvent:
 
     mono_ns: int
     kind: str
-    """One of `TOLD`, `event` (of the simulator), `bus`, or what became of a word: `done`, `refused`, `help`."""
+    """One of `TOLD`, `event` (of the simulator), `bus`, or what became of a word: `done`, `rejected`, `help`."""
     text: str
 
 
@@ -30,7 +30,7 @@ REASONS: Final = {
     ReleaseReason.LOCKOUT_SPEED: "locked out by the speed",
     ReleaseReason.LOCKOUT_ACCELERATION: "locked out by the acceleration",
     ReleaseReason.LOCKOUT_REVERSE: "locked out by the reverse gear",
-    ReleaseReason.ASKED: "it was asked to",
+    ReleaseReason.REQUESTED: "it was asked to",
     ReleaseReason.DISABLED: "a command without its enable bit, or none",
     ReleaseReason.FAULT: "a fault",
     ReleaseReason.REMOTE: "the remote's switch",
@@ -70,7 +70,7 @@ def _of_gear(state: KitState, _: Any) -> str:
     return f"gear {state.gear.name}"
 
 
-def _of_refused(state: KitState, _: Any) -> str:
+def _of_rejected(state: KitState, _: Any) -> str:
     why = REJECTS.get(state.gear_reject)
     return f"gear {state.gear_order} refused: {why}" if why else "no gear refused any more"
 
@@ -92,7 +92,7 @@ TOLD: Final[dict[str, tuple[Callable[[KitState], Hashable], Callable[[KitState, 
     "enabled": (enabled, _of_enabled),
     "overridden": (overridden, _of_overridden),
     "gear": (lambda state: state.gear, _of_gear),
-    "refused": (lambda state: (state.gear_reject, state.gear_order if state.gear_reject else 0), _of_refused),
+    "rejected": (lambda state: (state.gear_reject, state.gear_order if state.gear_reject else 0), _of_rejected),
     "watchdog": (lambda state: (state.watchdog, state.watchdog_brakes), _of_watchdog),
     "readiness": (lambda state: state.not_ready, _of_readiness),
 }

@@ -74,12 +74,12 @@ def checksum(identifier: int, data: bytes, *, is_extended: bool = False) -> int:
     return crc8(identifier.to_bytes(4 if is_extended else 2, "big") + data)
 
 
-def sealed(identifier: int, data: bytes) -> bytes:
+def with_crc(identifier: int, data: bytes) -> bytes:
     """Write the checksum into the last byte of a message with an 11-bit identifier."""
     return data[:-1] + bytes([checksum(identifier, data[:-1])])
 
 
-def is_sealed(frame: CanFrame) -> bool:
+def has_crc(frame: CanFrame) -> bool:
     """Tell whether the last byte is the right checksum."""
     return bool(frame.data) and frame.data[-1] == checksum(
         frame.identifier, frame.data[:-1], is_extended=frame.is_extended

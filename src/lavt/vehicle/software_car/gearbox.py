@@ -31,6 +31,6 @@ def reject(state: KitState, gear: int) -> GearRejection:
         return GearRejection.OVERRIDE
     if gear not in GEARS:
         return GearRejection.UNSUPPORTED
-    if state.brake < OVERRIDE_PEDAL or (gear == Gear.PARK and not state.is_standing):
+    if state.brake < OVERRIDE_PEDAL or (gear == Gear.PARK and not state.is_stationary):
         return GearRejection.VEHICLE
     return GearRejection.NONE

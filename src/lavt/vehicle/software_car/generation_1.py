@@ -134,31 +134,31 @@ def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | 
     if frame.is_extended:
         return None
     if frame.identifier == GEAR_COMMAND_ID and len(frame.data) == GEAR_COMMAND.length:
-        asked = unpack(GEAR_COMMAND, frame.data)
-        return GearOrder(is_valid=True, gear=asked["gear"], is_clearing=bool(asked["clear"]))
+        requested = unpack(GEAR_COMMAND, frame.data)
+        return GearOrder(is_valid=True, gear=requested["gear"], is_clearing=bool(requested["clear"]))
     if frame.identifier not in COMMANDS:
         return None
     axis, layout = COMMANDS[frame.identifier]
     if len(frame.data) == CLEARING_LENGTH:
-        asked = unpack(layout, frame.data + bytes(layout.length - CLEARING_LENGTH))
-        return Order(axis, is_valid=True, is_clearing=bool(asked["clear"]))
+        requested = unpack(layout, frame.data + bytes(layout.length - CLEARING_LENGTH))
+        return Order(axis, is_valid=True, is_clearing=bool(requested["clear"]))
     if len(frame.data) != layout.length:
         return None
-    asked = unpack(layout, frame.data)
+    requested = unpack(layout, frame.data)
     target: float | None
     if axis == "steering":
-        target = wheel_angle(asked["command"]) if asked["type"] == 0 else None
+        target = wheel_angle(requested["command"]) if requested["type"] == 0 else None
     else:
-        target = pedal_fraction(axis, asked["type"], asked["command"], mechanics)
+        target = pedal_fraction(axis, requested["type"], requested["command"], mechanics)
     return Order(
         axis,
         is_valid=True,
         target=target or 0.0,
-        is_enabling=bool(asked["enable"]) and target is not None,
-        is_clearing=bool(asked["clear"]),
-        ignores_driver=bool(asked["ignore"]),
-        rate_radps=mechanics.rate_radps(asked.get("rate", 0), mechanics.steering_rate_step_deg),
-        count=asked["count"],
+        is_enabling=bool(requested["enable"]) and target is not None,
+        is_clearing=bool(requested["clear"]),
+        ignores_driver=bool(requested["ignore"]),
+        rate_radps=mechanics.rate_radps(requested.get("rate", 0), mechanics.steering_rate_step_deg),
+        count=requested["count"],
     )
 
 

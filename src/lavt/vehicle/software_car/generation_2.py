@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import is_sealed, pack, sealed, unpack
+from lavt.vehicle.software_car.frames import has_crc, pack, unpack, with_crc
 from lavt.vehicle.software_car.generation_2_layouts import (
     GEAR_COMMAND,
     PEDAL_COMMAND,
@@ -58,8 +58,8 @@ def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | Gear
     if frame.is_extended:
         return None
     if frame.identifier == SYSTEM_COMMAND_ID and len(frame.data) == SYSTEM_COMMAND.length:
-        asked = unpack(SYSTEM_COMMAND, frame.data)
-        return SystemOrder(is_sealed(frame), asked["command"], asked["count"])
+        requested = unpack(SYSTEM_COMMAND, frame.data)
+        return SystemOrder(has_crc(frame), requested["command"], requested["count"])
     part = frame.identifier - (REMOTE_SET if is_remote else USER_SET)
     if not 0 <= part < len(PARTS):
         return None
@@ -67,22 +67,22 @@ def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | Gear
     layout = GEAR_COMMAND if axis is None else STEERING_COMMAND if axis == "steering" else PEDAL_COMMAND
     if len(frame.data) != layout.length:
         return None
-    asked = unpack(layout, frame.data)
+    requested = unpack(layout, frame.data)
     if axis is None:
-        return GearOrder(is_sealed(frame), asked["command"])
+        return GearOrder(has_crc(frame), requested["command"])
     if axis == "steering":
-        is_known, target = asked["type"] == ANGLE, wheel_angle(asked["command"])
+        is_known, target = requested["type"] == ANGLE, wheel_angle(requested["command"])
     else:
-        is_known, target = asked["type"] == PERCENT, within(asked["command"] / FULL_PEDAL[axis], 0.0, 1.0)
+        is_known, target = requested["type"] == PERCENT, within(requested["command"] / FULL_PEDAL[axis], 0.0, 1.0)
     return Order(
         axis,
-        is_valid=is_sealed(frame),
+        is_valid=has_crc(frame),
         target=target,
-        is_enabling=bool(asked["enable"]) and is_known,
-        is_clearing=bool(asked["clear"]),
-        ignores_driver=bool(asked["ignore"]),
-        rate_radps=mechanics.rate_radps(asked.get("rate", 0), 4.0),
-        count=asked["count"],
+        is_enabling=bool(requested["enable"]) and is_known,
+        is_clearing=bool(requested["clear"]),
+        ignores_driver=bool(requested["ignore"]),
+        rate_radps=mechanics.rate_radps(requested.get("rate", 0), 4.0),
+        count=requested["count"],
     )
 
 
@@ -179,7 +179,7 @@ def made(
 
     def report(state: KitState, mechanics: Mechanics) -> bytes:
         count = {"count": state.sent.get(identifier, 0) % 16}
-        return sealed(identifier, pack(layout, values(state, mechanics) | count))
+        return with_crc(identifier, pack(layout, values(state, mechanics) | count))
 
     return report
 

@@ -29,7 +29,7 @@ from lavt.vehicle.software_car.state import (
 
 OVERRIDE_TORQUE_NM: Final = 2.0
 """Ours: from where on hands are an override."""
-HINDRANCES: Final = {
+INHIBIT_REASONS: Final = {
     "seat belt": ReleaseReason.SEAT_BELT,
     "door": ReleaseReason.DOOR,
     "speed": ReleaseReason.LOCKOUT_SPEED,
@@ -183,21 +183,21 @@ class Kit:
         """Put hands on the steering wheel, until told otherwise."""
         self._live(now_ns)
         self.state.driver_torque_nm = torque_nm
-        self._feel("steering", abs(torque_nm) >= OVERRIDE_TORQUE_NM)
+        self._note_driver_input("steering", abs(torque_nm) >= OVERRIDE_TORQUE_NM)
 
     def driver_brakes(self, fraction: float, now_ns: int) -> None:
         """Put a foot on the brake, until told otherwise."""
         self._live(now_ns)
         self.state.driver_brake = within(fraction, 0.0, 1.0)
-        self._feel("brake", fraction >= OVERRIDE_PEDAL)
+        self._note_driver_input("brake", fraction >= OVERRIDE_PEDAL)
 
     def driver_throttles(self, fraction: float, now_ns: int) -> None:
         """Put a foot on the throttle, until told otherwise."""
         self._live(now_ns)
         self.state.driver_throttle = within(fraction, 0.0, 1.0)
-        self._feel("throttle", fraction >= OVERRIDE_PEDAL)
+        self._note_driver_input("throttle", fraction >= OVERRIDE_PEDAL)
 
-    def _feel(self, axis: Axis, acts: bool) -> None:
+    def _note_driver_input(self, axis: Axis, acts: bool) -> None:
         actuator = self.state.actuators[axis]
         actuator.driver_acts = acts
         order = actuator.order
@@ -235,11 +235,11 @@ class Kit:
         known(name, REPORTED, "value that can be unknown")
         (self.state.invalid.add if is_unknown else self.state.invalid.discard)(name)
 
-    def hinder(self, name: str | None, now_ns: int) -> None:
-        """Let generation 2 have a reason not to be ready, one of `HINDRANCES`; None takes it away."""
+    def inhibit(self, name: str | None, now_ns: int) -> None:
+        """Let generation 2 have a reason not to be ready, one of `INHIBIT_REASONS`; None takes it away."""
         self._live(now_ns)
-        self._authority.hindrance = (
-            ReleaseReason.NONE if name is None else HINDRANCES[known(name, set(HINDRANCES), "hindrance")]
+        self._authority.inhibit_reason = (
+            ReleaseReason.NONE if name is None else INHIBIT_REASONS[known(name, set(INHIBIT_REASONS), "inhibit reason")]
         )
         self._authority.settle()
 

@@ -25,12 +25,12 @@ class Runner:
     def __init__(self, car: SoftwareCar, port: BusPort, *, start_ns: int) -> None:
         self._car, self._port = car, port
         self._now_ns = self._told_ns = start_ns
-        self._events = self._events_told = 0
-        """How many events of the car are in the news, and in the truth."""
+        self._events_seen = self._events_told = 0
+        """How many events of the car are in the events, and in the truth."""
         self._sender = TruthSender(start_ns)
-        self._onlooker = StateObserver(car.kit.state)
+        self._observer = StateObserver(car.kit.state)
         self._is_lost, self._lost_ns = False, 0
-        self._news: list[KitEvent] = []
+        self._events: list[KitEvent] = []
         self.counts: Counter[str] = Counter(frames_sent=0, frames_heard=0, frames_lost=0)
         self.latest_ns = 0
         """How late a step was at worst."""
@@ -51,20 +51,20 @@ class Runner:
         return self._car.next_wake_ns()
 
     def act(self, line: str, now_ns: int) -> None:
-        """Do what a line of words says; the news tell what became of it."""
+        """Do what a line of words says; the events tell what became of it."""
         word = line.strip()
         if not word:
             return
         self.step(now_ns)
         if word == HELP:
-            self._news += [KitEvent(now_ns, "help", each) for each in help_lines()]
+            self._events += [KitEvent(now_ns, "help", each) for each in help_lines()]
             return
         try:
             act(self._car.kit, word, now_ns)
         except UserError as error:
-            self._news.append(KitEvent(now_ns, "refused", str(error)))
+            self._events.append(KitEvent(now_ns, "rejected", str(error)))
             return
-        self._news.append(KitEvent(now_ns, "done", word))
+        self._events.append(KitEvent(now_ns, "done", word))
         self._look(now_ns)
 
     def truth(self) -> bytes | None:
@@ -76,10 +76,10 @@ class Runner:
         told, self._events_told = self._events_told, len(self._car.events)
         return self._sender.datagram(truth, self._car.events[told:])
 
-    def take_news(self) -> list[KitEvent]:
+    def take_events(self) -> list[KitEvent]:
         """Take what has happened since the last call."""
-        news, self._news = self._news, []
-        return news
+        events, self._events = self._events, []
+        return events
 
     def _live(self, to_ns: int) -> None:
         """Live on, wake by wake, so that each frame leaves with its time."""
@@ -92,10 +92,10 @@ class Runner:
 
     def _look(self, now_ns: int) -> None:
         """See what has happened."""
-        self._news += self._onlooker.look(self._car.kit.state, now_ns)
-        for event in self._car.events[self._events :]:
-            self._news.append(KitEvent(event.mono_ns, "event", f"{event.kind}: {event.detail}"))
-        self._events = len(self._car.events)
+        self._events += self._observer.look(self._car.kit.state, now_ns)
+        for event in self._car.events[self._events_seen :]:
+            self._events.append(KitEvent(event.mono_ns, "event", f"{event.kind}: {event.detail}"))
+        self._events_seen = len(self._car.events)
 
     def _heard(self, now_ns: int) -> Sequence[ReceivedCanFrame]:
         try:
@@ -116,11 +116,11 @@ class Runner:
 
     def _is_gone(self, why: str, now_ns: int) -> None:
         if not self._is_lost:
-            self._news.append(KitEvent(now_ns, "bus", f"the bus is gone: {why}"))
+            self._events.append(KitEvent(now_ns, "bus", f"the bus is gone: {why}"))
         self._is_lost, self._lost_ns = True, now_ns
 
     def _is_there(self, now_ns: int) -> None:
         """Tell that the bus is there again, once it has been so long enough: a full queue comes and goes."""
         if self._is_lost and now_ns - self._lost_ns >= NS_PER_S:
             self._is_lost = False
-            self._news.append(KitEvent(now_ns, "bus", "the bus is there again"))
+            self._events.append(KitEvent(now_ns, "bus", "the bus is there again"))

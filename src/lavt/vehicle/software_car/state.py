@@ -14,7 +14,7 @@ from lavt.value import value
 Axis = Literal["steering", "brake", "throttle"]
 AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
 
-STANDING_BELOW_MPS = 0.1
+STATIONARY_BELOW_MPS = 0.1
 """Ours: below it the car stands."""
 OVERRIDE_PEDAL: Final = 0.05
 """Ours: from where on a foot is an override. So much brake is also what a shift needs."""
@@ -69,7 +69,7 @@ class ReleaseReason(IntEnum):
     LOCKOUT_SPEED = 7
     LOCKOUT_ACCELERATION = 8
     LOCKOUT_REVERSE = 9
-    ASKED = 11
+    REQUESTED = 11
     DISABLED = 12
     """A command came without its enable bit."""
     FAULT = 13
@@ -178,9 +178,9 @@ class KitState:
     """How often each report was sent."""
 
     @property
-    def is_standing(self) -> bool:
+    def is_stationary(self) -> bool:
         """Whether the car stands."""
-        return abs(self.speed_mps) < STANDING_BELOW_MPS
+        return abs(self.speed_mps) < STATIONARY_BELOW_MPS
 
     @property
     def is_in_gear(self) -> bool:

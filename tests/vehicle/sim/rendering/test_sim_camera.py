@@ -19,7 +19,7 @@ def road() -> Road:
     return load_road("a_key")
 
 
-def test_a_frame_has_the_time_and_the_size_asked_for(road: Road) -> None:
+def test_a_frame_has_the_time_and_the_size_requested_for(road: Road) -> None:
     """A frame carries its number and the time it was asked for, and a picture of the model's size."""
     camera: Camera = camera_on(road, scenery="none")
     frame = camera.capture(3, 1234, pose_at(road, 0.0))

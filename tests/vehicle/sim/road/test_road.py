@@ -107,7 +107,7 @@ def test_projection_looks_only_near_the_last_station(road: Road) -> None:
     assert road.project(x_m, y_m, 20.0)[0] <= 35.0
 
 
-def test_an_unknown_road_is_refused_with_the_known_ones() -> None:
+def test_an_unknown_road_is_rejected_with_the_known_ones() -> None:
     """The error for an unknown name lists what there is, and that a file would do."""
     with pytest.raises(UserError, match=r"a, a_key, b, b_key, c, c_key.*\.yaml file"):
         load_road("nowhere")

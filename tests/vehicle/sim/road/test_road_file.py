@@ -48,7 +48,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 BOMB += "title: x\nsegments: *j\n"
 """Written out it would have a thousand million words."""
 
-REFUSED = {
+REJECTED = {
     "no segments": ("title: x", r"'segments' is missing"),
     "unknown key": (SHORT + "lane: {driven: 0}", r"unknown key 'lane': did you mean 'lanes'\?"),
     "unknown inner key": ("title: x\nsegments: [{lenght_m: 3}]", r"'segments\.0\.lenght_m': did you mean 'length_m'\?"),
@@ -105,16 +105,16 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_wrong_file_is_refused_with_a_sentence(name: str) -> None:
+@pytest.mark.parametrize("name", REJECTED)
+def test_a_wrong_file_is_rejected_with_a_sentence(name: str) -> None:
     """What is wrong in a road's file is refused with the file, the key and what to do."""
-    text, said = REFUSED[name]
+    text, said = REJECTED[name]
     with pytest.raises(UserError, match=rf"(?s)^x\.yaml.*{said}"):
         parse_road(text, source="x.yaml")
 
 
 @pytest.mark.parametrize(("name", "content"), [("missing.yaml", None), ("bytes.yaml", b"\xff\xfe"), ("dir.yaml", "")])
-def test_what_is_no_file_is_refused(name: str, content: bytes | str | None, tmp_path: Path) -> None:
+def test_what_is_no_file_is_rejected(name: str, content: bytes | str | None, tmp_path: Path) -> None:
     """A path that does not exist, is a directory, or holds no text is refused with its name."""
     path = tmp_path / name
     if isinstance(content, bytes):

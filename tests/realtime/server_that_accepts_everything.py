@@ -18,5 +18,5 @@ def number_if_known(written: IssuedStamps, stamp_ns: int) -> int:
     return written._written.get(stamp_ns, (-1, 0))[0]
 
 
-with patch.object(SafetyGate, "_objection", no_objection), patch.object(IssuedStamps, "number", number_if_known):
+with patch.object(SafetyGate, "rejection_reason", no_objection), patch.object(IssuedStamps, "number", number_if_known):
     main()
