@@ -188,7 +188,7 @@ def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without cryptography a sentence says what to install."""
     monkeypatch.delitem(sys.modules, "lavt.transport.security.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    import lavt.transport
+    import lavt.transport.security
 
-    monkeypatch.delattr(lavt.transport, "certificates", raising=False)
+    monkeypatch.delattr(lavt.transport.security, "certificates", raising=False)
     assert "pip install 'lavt[secure]'" in run("keys", "--vehicle", "one").rejected()

@@ -75,7 +75,7 @@ def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
 
 DIGEST = """
 from tests.vehicle.sim.rig import camera_on, digest, picture_of, pose_at
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.road.road import load_road
 road = load_road("a_key")
 print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.3, 0.1), 5)))
 """
