@@ -179,10 +179,10 @@ from pathlib import Path
 from lavt.cli import console
 from lavt.cli.main import app
 from lavt.clock import MachineClock, pause
-from lavt.transport.netem import Flow, Law
-from lavt.transport.netem_control import Netem
-netem = Netem("va", directory=Path(sys.argv[1]))
-netem.apply([Flow("video", "udp", 5600, "source", Law(150))], condition="L2")
+from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
+from lavt.transport.netem.netem import NetemInterface
+netem = NetemInterface("va", directory=Path(sys.argv[1]))
+netem.apply([ImpairedFlow("video", "udp", 5600, "source", Impairment(150))], condition="L2")
 print("held", flush=True)
 pause(60_000_000_000)
 """

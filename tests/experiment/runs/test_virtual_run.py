@@ -156,8 +156,8 @@ from pathlib import Path
 import cv2
 from lavt.config import RunConfig
 from lavt.config_file import load_config, shipped
-from lavt.experiment.plan import plan_run
-from lavt.experiment.virtual_run import build_loop, drive
+from lavt.experiment.runs.plan import plan_run
+from lavt.experiment.runs.virtual_run import build_loop, drive
 cv2.setNumThreads(1)
 loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"))), Path(sys.argv[1]))
 drive(loop, limit_ns=4_000_000_000)
