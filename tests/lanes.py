@@ -55,8 +55,8 @@ LANES = (
     Lane("linters", LINTERS, 10),
     Lane("quick", (pytest(),), 15),
     Lane("interop", (pytest("tests/interop"),), 5),
-    Lane("realtime", (pytest("-m", "realtime"),), 20),
-    Lane("field", (pytest("tests/field"),), 20),
+    Lane("realtime", (pytest("-m", "realtime"),), 35),
+    Lane("field", (pytest("tests/field"),), 35),
     Lane("kernel", ((sys.executable, "tests/kernel/run", *SLOWEST),), 25, meanwhile=FULL),
 )
 

@@ -148,13 +148,24 @@ def test_a_lane_that_fails_fails_the_run(meanwhile: bool) -> None:
     assert said.splitlines()[-1].startswith("2 passed, 1 failed in ")
 
 
+HANGS = """
+import os, pathlib, time
+try:
+    pathlib.Path(os.environ["LAVT_PROGRESS"]).write_text("test_a")
+    time.sleep(600)
+except KeyboardInterrupt:
+    print("failed so far", flush=True)
+    time.sleep(600)
+"""
+
+
 def test_a_lane_ends_with_its_limit() -> None:
-    """A lane that takes too long is ended with all that it started, and says at which test it was."""
-    script = "import os, pathlib, time; pathlib.Path(os.environ['LAVT_PROGRESS']).write_text('test_a'); time.sleep(600)"
-    hangs = Lane("hangs", ((sys.executable, "-c", script), shell("echo never")), 1 / 60)
+    """A lane that takes too long is interrupted, so that it tells what has failed, and says at which test it was."""
+    hangs = Lane("hangs", ((sys.executable, "-c", HANGS), shell("echo never")), 1 / 12)
     code, said = run(hangs, Lane("next", (shell("echo came"),), 1))
     assert code == 1
-    assert "took longer than 0.0166667 min, and was at: test_a" in said
+    assert "took longer than 0.0833333 min, and was at: test_a" in said
+    assert "failed so far" in said
     assert "never" not in said
     assert "came" in said
 

@@ -69,8 +69,9 @@ class Measured:
     to_standstill_s: float | None
     to_driving_s: float | None
     """From the end of the outage."""
-    silence_s: tuple[float, ...]
-    """From the last fresh command to degraded and, where it came, to the safe stop."""
+    silence_to_degraded_s: float | None
+    """From the last fresh command."""
+    silence_to_safe_stop_s: float | None
     stopping_s: float | None
     """From the safe stop to standstill."""
     stopped_from_mps: float | None
@@ -120,7 +121,8 @@ class _Seen:
             _since(begin_ns, stop),
             None if stationary_since_ns is None else (stationary_since_ns - begin_ns) / NS_PER_S,
             _since(outage.end.mono_ns, again),
-            tuple(self._silence_s(each) for each in (left, stop) if each is not None),
+            None if left is None else self._silence_s(left),
+            None if stop is None else self._silence_s(stop),
             None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
             None if stop is None else float(self.speed_mps[np.searchsorted(self.truth_ns, stop.at.mono_ns)]),
             len(heard),

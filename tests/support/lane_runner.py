@@ -95,17 +95,18 @@ class RunningLane:
             )  # fmt: skip
 
     def end(self) -> None:
-        """End it and all that it has started."""
+        """End it and all that it has started, at first as Ctrl-C does, so that pytest says what has failed by then."""
         self.running = False
         self._left.clear()
         if self._process is None:
             return
         group, clock = self._process.pid, MachineClock()
         with suppress(ProcessLookupError):
-            os.killpg(group, signal.SIGTERM)
-            limit_ns = clock.now().mono_ns + GRACE_NS
-            while self._process.poll() is None and clock.now().mono_ns < limit_ns:
-                pause(POLL_NS)
+            for number, process in ((signal.SIGINT, group), (signal.SIGTERM, -group)):
+                os.kill(process, number)
+                limit_ns = clock.now().mono_ns + GRACE_NS
+                while self._process.poll() is None and clock.now().mono_ns < limit_ns:
+                    pause(POLL_NS)
             os.killpg(group, signal.SIGKILL)
         self._process.wait()
 
