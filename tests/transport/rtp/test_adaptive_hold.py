@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.transport.rtp.adaptive_hold import AdaptiveHold
 
-LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
+MIN_HOLD_NS, MAX_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
 """The limits that docs/video.md states."""
 
 
@@ -27,10 +27,10 @@ def test_it_forgets_after_30_to_60_s() -> None:
     hold.note(0, 0)
     hold.note(40 * NS_PER_MS, WINDOW_NS - 1)
     assert hold.at(2 * WINDOW_NS - 1) == 50 * NS_PER_MS
-    assert hold.at(2 * WINDOW_NS) == LEAST_HOLD_NS
+    assert hold.at(2 * WINDOW_NS) == MIN_HOLD_NS
     hold.note(40 * NS_PER_MS, 2 * WINDOW_NS)
     assert hold.at(4 * WINDOW_NS - 1) == 50 * NS_PER_MS
-    assert hold.at(4 * WINDOW_NS) == LEAST_HOLD_NS
+    assert hold.at(4 * WINDOW_NS) == MIN_HOLD_NS
 
 
 @given(st.lists(st.tuples(st.integers(0, 60 * NS_PER_S), st.integers(0, 2 * NS_PER_S))))
@@ -40,4 +40,4 @@ def test_it_is_within_bounds(notes: list[tuple[int, int]]) -> None:
     for pause_ns, reordered_ns in notes:
         now_ns += pause_ns
         hold.note(reordered_ns, now_ns)
-        assert LEAST_HOLD_NS <= hold.at(now_ns) <= MOST_HOLD_NS
+        assert MIN_HOLD_NS <= hold.at(now_ns) <= MAX_HOLD_NS

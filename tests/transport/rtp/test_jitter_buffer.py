@@ -11,7 +11,7 @@ from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import RtpPacket
 
 CAPACITY, MAX_JUMP = 1024, 3000
-LEAST_HOLD_NS, MOST_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
+MIN_HOLD_NS, MAX_HOLD_NS, WINDOW_NS = 10 * NS_PER_MS, 300 * NS_PER_MS, 30 * NS_PER_S
 """The design's limits, in numbers of our own: whoever changes the code's must change these."""
 HOLD_NS = 10 * NS_PER_MS
 STARTED_NS = HOLD_NS
@@ -299,12 +299,12 @@ def hold_of(buffer: JitterBuffer, number: int, now_ns: int) -> int:
 def test_the_hold_follows_the_network() -> None:
     """Who has seen packets overtaken by 40 ms waits for the next ones a quarter longer, until that is long ago."""
     buffer = started(hold_ns=None)
-    assert hold_of(buffer, 1, STARTED_NS) == LEAST_HOLD_NS
+    assert hold_of(buffer, 1, STARTED_NS) == MIN_HOLD_NS
     came_ns = STARTED_NS + 40 * NS_PER_MS
     assert buffer.push(packet(1), came_ns) == []
     assert (buffer.late, hold_of(buffer, 3, came_ns)) == (1, 50 * NS_PER_MS)
     assert hold_of(buffer, 5, came_ns + WINDOW_NS) == 50 * NS_PER_MS
-    assert hold_of(buffer, 7, came_ns + 3 * WINDOW_NS) == LEAST_HOLD_NS
+    assert hold_of(buffer, 7, came_ns + 3 * WINDOW_NS) == MIN_HOLD_NS
 
 
 def test_the_hold_follows_what_closes_a_gap_in_time() -> None:
@@ -337,15 +337,15 @@ def test_what_was_not_given_up_changes_no_hold() -> None:
     assert buffer.push(packet(9), STARTED_NS + 50 * NS_PER_MS) == []
     assert buffer.push_recovered(packet(10), STARTED_NS + 50 * NS_PER_MS) == []
     assert (buffer.late, buffer.recovered) == (1, 0)
-    assert hold_of(buffer, 11, STARTED_NS + 50 * NS_PER_MS) == LEAST_HOLD_NS
+    assert hold_of(buffer, 11, STARTED_NS + 50 * NS_PER_MS) == MIN_HOLD_NS
 
 
 def test_nobody_waits_for_ever() -> None:
     """What is overtaken by more than makes sense to wait for changes nothing."""
     buffer = started(hold_ns=None)
     hold_of(buffer, 1, STARTED_NS)
-    buffer.push(packet(1), STARTED_NS + MOST_HOLD_NS + 1)
-    assert hold_of(buffer, 3, STARTED_NS + MOST_HOLD_NS + 1) == LEAST_HOLD_NS
+    buffer.push(packet(1), STARTED_NS + MAX_HOLD_NS + 1)
+    assert hold_of(buffer, 3, STARTED_NS + MAX_HOLD_NS + 1) == MIN_HOLD_NS
 
 
 def test_a_loss_does_not_make_what_was_only_swapped_long_reordered() -> None:
@@ -358,7 +358,7 @@ def test_a_loss_does_not_make_what_was_only_swapped_long_reordered() -> None:
             now_ns += NS_PER_MS // 5
             buffer.push(packet(each), now_ns)
     assert buffer.reordered > 900
-    assert hold_of(buffer, 2001, now_ns + NS_PER_S) == LEAST_HOLD_NS
+    assert hold_of(buffer, 2001, now_ns + NS_PER_S) == MIN_HOLD_NS
 
 
 def test_the_hold_stays_what_repairs_need() -> None:
@@ -383,7 +383,7 @@ def test_any_arrivals_with_a_hold_that_follows(arrivals: list[tuple[int, int]]) 
         now_ns += pause_ns
         left += len(buffer.push(packet(number), now_ns))
         wake_ns = buffer.next_wake_ns()
-        assert wake_ns is None or now_ns < wake_ns <= now_ns + MOST_HOLD_NS
-    left += len(buffer.expire(now_ns + MOST_HOLD_NS))
+        assert wake_ns is None or now_ns < wake_ns <= now_ns + MAX_HOLD_NS
+    left += len(buffer.expire(now_ns + MAX_HOLD_NS))
     assert buffer.next_wake_ns() is None
     assert left + buffer.late + buffer.duplicate == len(arrivals)

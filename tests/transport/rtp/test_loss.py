@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, Picture
 from lavt.streams import stream
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer, parse_packet
 from lavt.transport.video.h264 import Decoder, Encoder
@@ -57,7 +57,7 @@ def test_reordered(sent: Sent) -> None:
     random = stream(1, "delay")
     arrivals = []
     for number, datagrams in enumerate(sent.datagrams):
-        delays_ns = random.integers(0, LEAST_HOLD_NS - NS_PER_MS, len(datagrams))
+        delays_ns = random.integers(0, MIN_HOLD_NS - NS_PER_MS, len(datagrams))
         arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
     buffer, depacketizer, decoder = JitterBuffer(), Depacketizer(), Decoder()
     ordered: Ordered = []

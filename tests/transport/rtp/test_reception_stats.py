@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.ntp_time import ntp_of_elapsed, short_time
 from lavt.transport.rtp.reception_stats import Reception, ReceptionSample
@@ -38,7 +38,7 @@ class Stream:
         """Let the first packets come in order, and their hold be over."""
         for number in range(first, first + count):
             self.arrive(number, 0)
-        self.reorder.expire(LEAST_HOLD_NS)
+        self.reorder.expire(MIN_HOLD_NS)
 
 
 def losses(stream: Stream, at_ns: int) -> tuple[int, float, int]:
@@ -72,7 +72,7 @@ def test_loss_without_repair() -> None:
     """A packet that never comes is lost before and after repair, when its hold is over."""
     stream = Stream()
     stream.start(100, 5)
-    assert losses(stream, LEAST_HOLD_NS) == (104, 0.0, 0)
+    assert losses(stream, MIN_HOLD_NS) == (104, 0.0, 0)
     for number in (105, 107, 108):
         stream.arrive(number, 20 * NS_PER_MS)
     assert losses(stream, 20 * NS_PER_MS) == (108, 0.0, 0)
@@ -214,7 +214,7 @@ def test_sequence_numbers_wrap() -> None:
     """The highest sequence number counts the wraps."""
     stream = Stream()
     stream.start(65_534, 4)
-    assert losses(stream, LEAST_HOLD_NS) == (65_537, 0.0, 0)
+    assert losses(stream, MIN_HOLD_NS) == (65_537, 0.0, 0)
 
 
 def test_sender_report_comes_back() -> None:

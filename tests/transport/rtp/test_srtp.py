@@ -122,7 +122,7 @@ def test_other_key() -> None:
     """What was protected under another key is refused."""
     unprotector = Unprotector(OTHER_KEY)
     assert unprotector.unprotect(Protector(KEY).protect(packet(1))) is None
-    assert unprotector.unprotect_control(Protector(KEY).protect_control(CONTROL)) is None
+    assert unprotector.unprotect_rtcp(Protector(KEY).protect_rtcp(CONTROL)) is None
     assert counters(unprotector) == (2, 0)
 
 
@@ -130,7 +130,7 @@ def test_plain_packets() -> None:
     """Packets that were not protected at all are refused."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(packet(1, bytes(100))) is None
-    assert unprotector.unprotect_control(CONTROL) is None
+    assert unprotector.unprotect_rtcp(CONTROL) is None
     assert counters(unprotector) == (2, 0)
 
 
@@ -140,7 +140,7 @@ def test_bytes_from_outside(garbage: bytes) -> None:
     """Whatever bytes arrive, nothing comes out, nothing is raised, and each is counted."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(garbage) is None
-    assert unprotector.unprotect_control(garbage) is None
+    assert unprotector.unprotect_rtcp(garbage) is None
     assert sum(counters(unprotector)) == 2
 
 
@@ -156,17 +156,17 @@ def test_garbage_between() -> None:
 def test_control() -> None:
     """RTCP packets come out as they were, encrypted on the way, each once, and a changed bit anywhere is refused."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
-    first, second = protector.protect_control(CONTROL), protector.protect_control(CONTROL)
+    first, second = protector.protect_rtcp(CONTROL), protector.protect_rtcp(CONTROL)
     assert len(first) == len(CONTROL) + 20
     assert first != second  # each has a number of its own
     assert CONTROL[8:] not in first
     for place in range(8 * len(first)):
         changed = bytearray(first)
         changed[place // 8] ^= 1 << place % 8
-        assert unprotector.unprotect_control(bytes(changed)) is None
-    assert [unprotector.unprotect_control(each) for each in (second, first)] == [CONTROL, CONTROL]
+        assert unprotector.unprotect_rtcp(bytes(changed)) is None
+    assert [unprotector.unprotect_rtcp(each) for each in (second, first)] == [CONTROL, CONTROL]
     assert counters(unprotector) == (8 * len(first), 0)
-    assert unprotector.unprotect_control(first) is None
+    assert unprotector.unprotect_rtcp(first) is None
     assert counters(unprotector) == (8 * len(first), 1)
 
 

@@ -70,13 +70,13 @@ def test_opening() -> None:
     challenge = server.receive(client.hello(T0), HOME, T0)
     assert challenge is not None
     assert server.open_address(T0) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
     answer = client.answer(challenge)
     assert answer is not None
     assert server.receive(answer, HOME, T0 + 1) is None
     assert server.open_address(T0 + 1) == HOME
-    assert server.rtcp_admitted(HOME)
-    assert not server.rtcp_admitted(OTHER_PORT)
+    assert server.accepts_rtcp_from(HOME)
+    assert not server.accepts_rtcp_from(OTHER_PORT)
     assert rejected(server) == {}
 
 
@@ -170,7 +170,7 @@ def test_new_address() -> None:
     assert server.open_address(T0 + 1) == HOME
     server.receive(answer, ELSEWHERE, T0 + 1)
     assert server.open_address(T0 + 1) == ELSEWHERE
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
 
 
 def test_replay_after_a_move() -> None:
@@ -199,7 +199,7 @@ def test_no_reports() -> None:
     server.report(HOME, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS) == HOME
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS + 1) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
 
 
 def test_report_too_late() -> None:
@@ -257,33 +257,33 @@ def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
     """What either end seals the other opens, and nothing of a picture can be read in between."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    signed = server.cipher.authenticator(RTP)
+    signed = server.cipher.protect(RTP)
     assert b"a picture" not in signed
-    assert client.open(signed) == RTP
-    assert client.open(signed) is None
-    assert client.open(RTP) is None
-    assert client.open_control(server.cipher.protect_control(RTCP)) == RTCP
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
-    assert server.cipher.open_control(RTCP) is None
+    assert client.unprotect(signed) == RTP
+    assert client.unprotect(signed) is None
+    assert client.unprotect(RTP) is None
+    assert client.unprotect_rtcp(server.cipher.protect_rtcp(RTCP)) == RTCP
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
+    assert server.cipher.unprotect_rtcp(RTCP) is None
 
 
 def test_each_opening_has_keys_of_its_own() -> None:
     """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    before = server.cipher.authenticator(RTP)
-    late = server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    before = server.cipher.protect(RTP)
+    late = server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
     reopened(server, client, ELSEWHERE, T0 + 1)
-    after = server.cipher.authenticator(RTP)
+    after = server.cipher.protect(RTP)
     assert after != before
-    assert client.open(after) == RTP
-    assert client.open(late) is not None
-    assert client.open(before) == RTP
-    assert client.open(before) is None
-    assert server.cipher.open_control(client.protect_control(RTCP)) is None  # the last that came was under the old keys
-    server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
-    assert client.open(server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
+    assert client.unprotect(after) == RTP
+    assert client.unprotect(late) is not None
+    assert client.unprotect(before) == RTP
+    assert client.unprotect(before) is None
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) is None  # the last that came was under the old keys
+    server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.unprotect(server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
 
 
 def test_answers_that_are_lost_do_no_harm() -> None:
@@ -293,8 +293,8 @@ def test_answers_that_are_lost_do_no_harm() -> None:
     for later_ns in range(1, 4):
         challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
         assert client.answer(challenge or b"") is not None
-    assert client.open(server.cipher.authenticator(RTP)) == RTP
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
+    assert client.unprotect(server.cipher.protect(RTP)) == RTP
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
 
 
 @pytest.mark.parametrize("token", [OTHER_TOKEN, TOKEN, None])
@@ -304,7 +304,7 @@ def test_new_token(token: bytes | None) -> None:
     before = answer_for(server, HOME, T0 + 1)
     server.set_token(token)
     assert server.open_address(T0 + 1) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
     server.receive(before, HOME, T0 + 1)
     assert server.open_address(T0 + 1) is None
 

@@ -25,7 +25,7 @@ def repairs(sender: StreamSender, at_ns: int) -> int:
 
 
 def hear(sender: StreamSender, highest: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
-    sender.hear(Feedback((ReceptionReport(ssrc, highest, 0.0, lost, 0),)), at(at_ns).mono_ns)
+    sender.receive_feedback(Feedback((ReceptionReport(ssrc, highest, 0.0, lost, 0),)), at(at_ns).mono_ns)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -68,7 +68,7 @@ def test_another_receiver_begins_anew() -> None:
     sender = stream()
     hear(sender, 100, 0, 0)
     hear(sender, 200, 50, 1)
-    sender.hear(Feedback(limits=(BitRateLimit(SSRC, 10**6, 0),)), at(1).mono_ns)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 0),)), at(1).mono_ns)
     sender.forget_receiver()
     hear(sender, 100, 60, 2)
     assert repairs(sender, 3) == 0
@@ -78,9 +78,9 @@ def test_another_receiver_begins_anew() -> None:
 def test_a_limit_is_of_this_stream_and_of_its_payload() -> None:
     """A limit on another stream is not ours; headers that a limit counts are taken off."""
     sender = stream()
-    sender.hear(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
     assert sender.bit_rate_limit_bps is None
-    sender.hear(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
     assert sender.bit_rate_limit_bps == 10**6 * 1188 // 1228
 
 
@@ -93,7 +93,9 @@ def test_sender_reports() -> None:
     """A report every 500 ms says what was sent by then and answers the last reference time once."""
     sender = stream()
     requested_ns = 7 * NS_PER_S
-    sender.hear(Feedback(reference_times=(ReferenceTime(9, short_time(ntp_of_elapsed(requested_ns))),)), at(0).mono_ns)
+    sender.receive_feedback(
+        Feedback(reference_times=(ReferenceTime(9, short_time(ntp_of_elapsed(requested_ns))),)), at(0).mono_ns
+    )
     told = []
     for at_ns in range(0, 1_300 * NS_PER_MS, 100 * NS_PER_MS):
         packets = sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns))

@@ -6,17 +6,17 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 
-LEAST_HOLD_NS: Final = 10 * NS_PER_MS
+MIN_HOLD_NS: Final = 10 * NS_PER_MS
 """Of a network that keeps packets in order: what is missing there is lost, and waiting for it is delay."""
-MOST_HOLD_NS: Final = 300 * NS_PER_MS
+MAX_HOLD_NS: Final = 300 * NS_PER_MS
 """A picture that comes later than this by itself is of no use: keyframes are asked for instead."""
 WINDOW_NS: Final = 30 * NS_PER_S
 
 
 class AdaptiveHold:
-    """A quarter longer than any packet of the last 30 to 60 s was overtaken by; within `LEAST_` and `MOST_HOLD_NS`.
+    """A quarter longer than any packet of the last 30 to 60 s was overtaken by; within `LEAST_` and `MAX_HOLD_NS`.
 
-    Packets that were overtaken by more than `MOST_HOLD_NS` count for nothing.
+    Packets that were overtaken by more than `MAX_HOLD_NS` count for nothing.
     """
 
     def __init__(self) -> None:
@@ -27,12 +27,12 @@ class AdaptiveHold:
         """Give the hold of a gap that is noticed at `now_ns`."""
         self._begin_window(now_ns)
         longest_ns = max(self._longest_ns, self._longest_before_ns)
-        return min(max(LEAST_HOLD_NS, longest_ns * 5 // 4), MOST_HOLD_NS)
+        return min(max(MIN_HOLD_NS, longest_ns * 5 // 4), MAX_HOLD_NS)
 
     def note(self, reordered_ns: int, now_ns: int) -> None:
         """A packet came so long after the first sign that it was missing, or was made again then."""
         self._begin_window(now_ns)
-        if reordered_ns <= MOST_HOLD_NS:
+        if reordered_ns <= MAX_HOLD_NS:
             self._longest_ns = max(self._longest_ns, reordered_ns)
 
     def _begin_window(self, now_ns: int) -> None:

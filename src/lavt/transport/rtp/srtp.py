@@ -46,7 +46,7 @@ class Protector:
         """
         return self._protected(self._session.protect, packet)
 
-    def protect_control(self, packet: bytes) -> bytes:
+    def protect_rtcp(self, packet: bytes) -> bytes:
         """Make an SRTCP packet of a compound RTCP packet, 20 bytes longer; errors as of `protect`."""
         return self._protected(self._session.protect_rtcp, packet)
 
@@ -79,7 +79,7 @@ class Unprotector:
         """Give the RTP packet of an SRTP packet, or None for anything that is not authentic or came before."""
         return self._taken(self._session.unprotect, packet)
 
-    def unprotect_control(self, packet: bytes) -> bytes | None:
+    def unprotect_rtcp(self, packet: bytes) -> bytes | None:
         """Give the RTCP packet of an SRTCP packet, or None as `unprotect` does."""
         return self._taken(self._session.unprotect_rtcp, packet)
 

@@ -20,19 +20,19 @@ _LABELS: Final = {"server": b"LAVT 1 SRTP server to client", "client": b"LAVT 1 
 class Cipher(Protocol):
     """Both directions of an open path, as one end has them."""
 
-    def authenticator(self, packet: bytes) -> bytes:
+    def protect(self, packet: bytes) -> bytes:
         """Make what is sent of an RTP packet."""
         ...
 
-    def protect_control(self, packet: bytes) -> bytes:
+    def protect_rtcp(self, packet: bytes) -> bytes:
         """Make what is sent of an RTCP packet."""
         ...
 
-    def open(self, packet: bytes) -> bytes | None:
+    def unprotect(self, packet: bytes) -> bytes | None:
         """Give the RTP packet of what came; None where it is not the other end's."""
         ...
 
-    def open_control(self, packet: bytes) -> bytes | None:
+    def unprotect_rtcp(self, packet: bytes) -> bytes | None:
         """Give the RTCP packet of what came; None where it is not the other end's."""
         ...
 
@@ -44,11 +44,11 @@ NewCipher = Callable[[bytes, bytes], Cipher]
 class NoCipher:
     """Leaves every packet as it is."""
 
-    def authenticator(self, packet: bytes) -> bytes:
+    def protect(self, packet: bytes) -> bytes:
         """Give the packet."""
         return packet
 
-    protect_control = open = open_control = authenticator
+    protect_rtcp = unprotect = unprotect_rtcp = protect
 
 
 class SrtpCipher:
@@ -57,8 +57,8 @@ class SrtpCipher:
     def __init__(self, end: End, token: bytes, challenge: bytes) -> None:
         other: End = "client" if end == "server" else "server"
         protector, unprotector = Protector(_key(end, token, challenge)), Unprotector(_key(other, token, challenge))
-        self.authenticator, self.protect_control = protector.protect, protector.protect_control
-        self.open, self.open_control = unprotector.unprotect, unprotector.unprotect_control
+        self.protect, self.protect_rtcp = protector.protect, protector.protect_rtcp
+        self.unprotect, self.unprotect_rtcp = unprotector.unprotect, unprotector.unprotect_rtcp
 
 
 def plain_cipher(_token: bytes, _challenge: bytes) -> Cipher:

@@ -102,13 +102,13 @@ class PathClient:
         answer = _ANSWER + challenge
         return answer + _proof(self._token, answer)
 
-    def open(self, packet: bytes) -> bytes | None:
+    def unprotect(self, packet: bytes) -> bytes | None:
         """Give the RTP packet of what came from the server; None where it is not the server's."""
-        return self._first(lambda cipher: cipher.open(packet))
+        return self._first(lambda cipher: cipher.unprotect(packet))
 
-    def open_control(self, packet: bytes) -> bytes | None:
+    def unprotect_rtcp(self, packet: bytes) -> bytes | None:
         """Give the RTCP packet of what came from the server; None where it is not the server's."""
-        return self._first(lambda cipher: cipher.open_control(packet))
+        return self._first(lambda cipher: cipher.unprotect_rtcp(packet))
 
     def _first(self, opened: Callable[[Cipher], bytes | None]) -> bytes | None:
         for cipher in self._ciphers:
@@ -119,9 +119,9 @@ class PathClient:
                 return packet
         return None
 
-    def protect_control(self, packet: bytes) -> bytes:
+    def protect_rtcp(self, packet: bytes) -> bytes:
         """Make what is sent of an RTCP packet."""
-        return self._ciphers[0].protect_control(packet)
+        return self._ciphers[0].protect_rtcp(packet)
 
     def video_arrived(self, now_ns: int) -> None:
         """Note that the path works: no hello is needed for a while."""
@@ -190,7 +190,7 @@ class PathServer:
         else:
             self.foreign_reports += 1
 
-    def rtcp_admitted(self, address: Address) -> bool:
+    def accepts_rtcp_from(self, address: Address) -> bool:
         """Tell whether RTCP from `address` counts: the path was open to there when last looked at."""
         return self._address == address
 

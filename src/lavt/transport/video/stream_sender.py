@@ -62,7 +62,7 @@ class StreamSender:
             report.append(self._report(now))
         return FramePackets(media, repair, report)
 
-    def hear(self, feedback: Feedback, now_ns: int) -> None:
+    def receive_feedback(self, feedback: Feedback, now_ns: int) -> None:
         """Take in what the receiver says."""
         ssrc = self._packetizer.ssrc
         for report in feedback.reports:
