@@ -111,11 +111,11 @@ def packets_from(command: str, raw: Path, said: Path) -> list[tuple[RtpPacket, i
 
 def units_of(packets: Sequence[tuple[RtpPacket, int]]) -> list[AccessUnit]:
     """Put packets in order and access units together, as the receiver's node does."""
-    reorder, depacketizer = JitterBuffer(), Depacketizer()
-    ordered = [each for packet, arrived_ns in packets for each in reorder.push(packet, arrived_ns)]
-    ordered += reorder.expire(packets[-1][1] + NS_PER_S)
+    jitter_buffer, depacketizer = JitterBuffer(), Depacketizer()
+    ordered = [each for packet, arrived_ns in packets for each in jitter_buffer.push(packet, arrived_ns)]
+    ordered += jitter_buffer.expire(packets[-1][1] + NS_PER_S)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
-    assert (reorder.lost, reorder.stray, depacketizer.malformed) == (0, 0, 0)
+    assert (jitter_buffer.lost, jitter_buffer.stray, depacketizer.malformed) == (0, 0, 0)
     return units
 
 

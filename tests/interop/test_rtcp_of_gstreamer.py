@@ -11,7 +11,7 @@ from tests.interop.tools import DEBIANS_PYTHON
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
-from lavt.transport.rtp.ntp_time import short_time
+from lavt.transport.rtp.ntp_time import ntp_to_short
 from lavt.transport.rtp.rtcp import (
     ReceptionReport,
     parse_announcement,
@@ -136,7 +136,7 @@ def test_gstreamer_hears_our_sender() -> None:
         (sent,) = parse_announcement(report).reports
         block = heard_with_age(session, highest_sequence=65_539)
         assert block.media_ssrc == OURS
-        assert block.last_report == short_time(sent.ntp_time)
+        assert block.last_report == ntp_to_short(sent.ntp_time)
         assert block.last_report_age_ns < CLOCK.now().mono_ns - told_ns
         session.tell("stats")
         (source,) = (each for each in session.hear("stats") if each["ssrc"] == OURS)
@@ -156,7 +156,7 @@ def test_gstreamer_hears_our_receiver() -> None:
                 break
         (sent,) = reports
         assert (sent.ssrc, sent.packets, sent.octets) == (THEIRS, 5, 20)
-        six_seconds_ago = (short_time(sent.ntp_time) - 6 * 65_536) % 2**32
+        six_seconds_ago = (ntp_to_short(sent.ntp_time) - 6 * 65_536) % 2**32
         report = ReceptionReport(THEIRS, 65_541, 0.25, 3, 17, six_seconds_ago, 5 * NS_PER_S)
         session.tell("rtcp", receiver_report(RECEIVER, report, clock_ns=NS_PER_S))
         session.tell("rtcp", picture_loss(RECEIVER, THEIRS))
