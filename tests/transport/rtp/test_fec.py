@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.rtp.fec import RepairChooser, RepairReceiver, RepairSender
+from lavt.transport.rtp.fec import RedundancyController, RepairReceiver, RepairSender
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer, RtpPacket, parse_packet
 
 REPAIR_PAYLOAD_TYPE, MAX_SYMBOL_BYTES = 97, 1500
@@ -423,17 +423,17 @@ def test_access_unit() -> None:
         ([(1, 40, 0)], 0, 2),
     ],
 )
-def test_chooser(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:
+def test_redundancy_controller(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:
     """A block gets no repair packet before a loss, one for 30 s after it, two while 2.5 % were lost in the last 5 s."""
-    chooser = RepairChooser()
+    controller = RedundancyController()
     for lost, expected, at_s in notes:
-        chooser.note(lost, expected, int(at_s * NS_PER_S))
-    assert chooser.count(int(now_s * NS_PER_S)) == count
+        controller.note_loss(lost, expected, int(at_s * NS_PER_S))
+    assert controller.repair_packets(int(now_s * NS_PER_S)) == count
 
 
-def test_chooser_forgets() -> None:
-    """The chooser keeps only the notes within its window."""
-    chooser = RepairChooser()
+def test_redundancy_controller_forgets() -> None:
+    """The controller keeps only the notes within its window."""
+    controller = RedundancyController()
     for number in range(1000):
-        chooser.note(0, 10, number * 100 * NS_PER_MS)
-    assert len(chooser._notes) == 50
+        controller.note_loss(0, 10, number * 100 * NS_PER_MS)
+    assert len(controller._notes) == 50

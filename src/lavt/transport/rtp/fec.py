@@ -253,7 +253,7 @@ HEAVY_LOSS_PER_MILLE: Final = 25
 """From this loss on, one repair packet leaves more than 2 % of frames damaged (computed: two or more lost of 8 + 1)."""
 
 
-class RepairChooser:
+class RedundancyController:
     """A controller of the number of repair packets for each block, by the loss that the receiver reports."""
 
     def __init__(self) -> None:
@@ -262,7 +262,7 @@ class RepairChooser:
         self._expected = 0
         self._last_loss_ns: int | None = None
 
-    def note(self, lost: int, expected: int, now_ns: int) -> None:
+    def note_loss(self, lost: int, expected: int, now_ns: int) -> None:
         """Note that `lost` of `expected` media packets, before repair, were lost since the previous note."""
         self._notes.append((now_ns, lost, expected))
         self._lost += lost
@@ -271,7 +271,7 @@ class RepairChooser:
             self._last_loss_ns = now_ns
         self._forget(now_ns)
 
-    def count(self, now_ns: int) -> int:
+    def repair_packets(self, now_ns: int) -> int:
         """Return the number of repair packets for each block: 0 without loss, 1 after a loss, 2 during heavy loss."""
         self._forget(now_ns)
         if self._lost > 0 and 1000 * self._lost >= HEAVY_LOSS_PER_MILLE * self._expected:

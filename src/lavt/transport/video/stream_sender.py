@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from lavt.domain import NS_PER_MS, Now
-from lavt.transport.rtp.fec import RepairChooser, RepairSender
+from lavt.transport.rtp.fec import RedundancyController, RepairSender
 from lavt.transport.rtp.rtcp import BitRateLimit, Feedback, ReceptionReport, sender_report
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime
 from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, RTP_HEADER_BYTES, Packetizer
@@ -44,7 +44,7 @@ class StreamSender:
     def forget_receiver(self) -> None:
         """Discard the feedback of the previous receiver, since another one begins."""
         self.bit_rate_limit_bps: int | None = None
-        self._chooser = RepairChooser()
+        self._redundancy = RedundancyController()
         self._reported: ReceptionReport | None = None
         self._reference: tuple[ReferenceTime, int] | None = None
 
@@ -52,7 +52,7 @@ class StreamSender:
         """Return the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
         timestamp = rtp_timestamp(stamp_ns)
         media = self._packetizer.packetize(access_unit, timestamp)
-        count = self._chooser.count(now.mono_ns) if self._repair_packets is None else self._repair_packets
+        count = self._redundancy.repair_packets(now.mono_ns) if self._repair_packets is None else self._repair_packets
         repair = self._repairs.repair(media, count) if count else []
         self._packets += len(media)
         self._octets += sum(map(len, media)) - RTP_HEADER_BYTES * len(media)
@@ -100,7 +100,7 @@ class StreamSender:
         expected = (report.highest_sequence - last.highest_sequence) % 2**32
         if 0 < expected < 2**31:
             lost = min(max(report.cumulative_lost - last.cumulative_lost, 0), expected)
-            self._chooser.note(lost, expected, now_ns)
+            self._redundancy.note_loss(lost, expected, now_ns)
         elif expected:
             self._reported = last
 
