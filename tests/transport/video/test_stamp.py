@@ -10,7 +10,7 @@ from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
 from lavt.transport.video.stamp import (
     STAMP_PX,
-    holds_stamp,
+    has_stamp,
     read_clear_stamp,
     read_stamp,
     rtp_timestamp,
@@ -207,10 +207,10 @@ def test_any_timestamp(stamp_ns: int, timestamp: int) -> None:
 def test_stamped_pictures_are_recognized() -> None:
     """A corner of black and white cells is a stamp; plain and grey corners and tiny pictures have none."""
     picture = np.full((128, 160, 3), 90, dtype=np.uint8)
-    assert not holds_stamp(picture)
-    assert not holds_stamp(np.zeros_like(picture))
-    assert not holds_stamp(np.zeros((40, 40, 3), dtype=np.uint8))
+    assert not has_stamp(picture)
+    assert not has_stamp(np.zeros_like(picture))
+    assert not has_stamp(np.zeros((40, 40, 3), dtype=np.uint8))
     write_stamp(picture, 1_700_000_000_123_456_789)
-    assert holds_stamp(picture)
+    assert has_stamp(picture)
     picture[:64, :64] = picture[:64, :64] // 3 + 80
-    assert not holds_stamp(picture)
+    assert not has_stamp(picture)

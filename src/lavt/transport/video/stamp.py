@@ -128,7 +128,7 @@ def _number(white: NDArray[np.bool_]) -> int:
     return int.from_bytes(np.packbits(white).tobytes(), "big")
 
 
-def holds_stamp(picture_bgr: Picture) -> bool:
+def has_stamp(picture_bgr: Picture) -> bool:
     """Return whether a picture, (height, width, 3), seems to carry a stamp: 64 cells, each black or white."""
     if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
         return False
