@@ -12,7 +12,7 @@ from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
 from lavt.transport.messages import decode, encode
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, Depacketizer, Packetizer, parse_packet, split_nal_units
 from lavt.transport.video.h264 import Decoder, Encoder
@@ -93,7 +93,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     arrived[-1], arrived[-2] = arrived[-2], arrived[-1]
     reorder, depacketizer = JitterBuffer(), Depacketizer()
     ordered = [each for packet in arrived for each in reorder.push(parse_packet(packet), now_ns)]
-    now_ns += LEAST_HOLD_NS  # the first packets of a stream wait for any that were sent before them
+    now_ns += MIN_HOLD_NS  # the first packets of a stream wait for any that were sent before them
     ordered += reorder.expire(now_ns)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
     assert [split_nal_units(unit.data) for unit in units] == [split_nal_units(access_unit)]
@@ -136,7 +136,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 12. The command is admitted: right epoch, newer, and made from a picture that this server took just now.
     picture_age_ns = now_ns - START_NS
-    assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + LEAST_HOLD_NS
+    assert picture_age_ns == round(VIDEO_DELAY_MS + CONTROL_DELAY_MS) * NS_PER_MS + MIN_HOLD_NS
     car.advance(now_ns)
     assert gate.admit(received, car.state(), now_ns).accepted
     assert not gate.admit(received, car.state(), now_ns).accepted, "nothing is obeyed twice"

@@ -188,7 +188,7 @@ def encrypted_video(seed: int) -> Target:
             if challenge is not None:
                 bench.give("rtp", challenge)
         elif send.channel == "feedback":
-            opened = server.cipher.open_control(send.payload)
+            opened = server.cipher.unprotect_rtcp(send.payload)
             expect(opened is not None, "the server cannot decrypt a report")
             parse_feedback(opened or b"")
             reported += 1
@@ -201,13 +201,13 @@ def encrypted_video(seed: int) -> Target:
     encoded = [unit for _, unit in units(seed, 30)]
     corpora = video_corpora(encoded[:10])
     report = sender_report(77, wall_ns=1, rtp_timestamp=5, packets=9, octets=900, cname="x@lavt", answered=[])
-    corpora["rtcp"].heard.append(server.cipher.protect_control(report))
+    corpora["rtcp"].heard.append(server.cipher.protect_rtcp(report))
 
     def true_frame() -> list[bytes]:
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         frame += 1
-        return [server.cipher.authenticator(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
+        return [server.cipher.protect(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
 
     signed = true_frame()
     corpora["rtp"] = Corpus(signed, fields=EVERYWHERE)
@@ -246,7 +246,7 @@ def encrypted_feedback(seed: int) -> Target:
     bench.give("feedback", client.answer(challenge.payload), HOME)
     report, please = rtcp_reports()[0], picture_loss(1, 2)
     corpus = Corpus(
-        [client.protect_control(each) for each in (report, please, report)], fields=tuple((at, 1) for at in range(96))
+        [client.protect_rtcp(each) for each in (report, please, report)], fields=tuple((at, 1) for at in range(96))
     )
     for each in corpus.entries:
         bench.give("feedback", each, HOME)
@@ -258,7 +258,7 @@ def encrypted_feedback(seed: int) -> Target:
         bench.give(channel, data, HOME)
         bench.go(STEP_NS)
         if inputs % 500 == 0:
-            said = client.protect_control(please if inputs % 1000 == 0 else report)
+            said = client.protect_rtcp(please if inputs % 1000 == 0 else report)
             requested += inputs % 1000 == 0
             bench.give("feedback", said, HOME)
             corpus.heard.append(said)

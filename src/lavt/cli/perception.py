@@ -17,7 +17,7 @@ from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.lane_detector import GRID, LANE_WIDTH_M, LaneDetector
 from lavt.perception.panel import panel
-from lavt.transport.video.stamp import holds_stamp
+from lavt.transport.video.stamp import has_stamp
 
 
 def register(app: typer.Typer) -> None:
@@ -51,7 +51,7 @@ def show(
     first = next(found.pictures, None)
     if first is None:
         raise UserError(f"{source} holds no picture: name another")
-    panels = _panels(chain([first], found.pictures), known, lane_width_m, stamped=holds_stamp(first), source=source)
+    panels = _panels(chain([first], found.pictures), known, lane_width_m, stamped=has_stamp(first), source=source)
     if found.moving:
         with console.interruptible():
             count = write_video(out, panels, found.rate_hz)

@@ -174,8 +174,8 @@ class CameraNode:
         sends = [Send("frame", frame)]
         if proven is not None:
             cipher = self._path.cipher
-            sends += [Send("rtp", cipher.authenticator(each), proven) for each in (*packets.media, *packets.repair)]
-            sends += [Send("rtp", cipher.protect_control(each), proven) for each in packets.report]
+            sends += [Send("rtp", cipher.protect(each), proven) for each in (*packets.media, *packets.repair)]
+            sends += [Send("rtp", cipher.protect_rtcp(each), proven) for each in packets.report]
         plain = [*packets.media, *packets.report]
         sends += [Send("rtp", each, address) for address in self._send_to for each in plain]
         return [*sends, Send("video", VideoUnit(encoded.stamp_ns, unit))]
@@ -192,10 +192,10 @@ class CameraNode:
         if not is_rtcp(message.payload):
             answer = self._path.receive(message.payload, message.peer, now.mono_ns)
             return None if answer is None else [Send("rtp", answer, message.peer)]
-        if not self._path.rtcp_admitted(message.peer):
+        if not self._path.accepts_rtcp_from(message.peer):
             self._counts["feedback_from_strangers"] += 1
             return None
-        packet = self._path.cipher.open_control(message.payload)
+        packet = self._path.cipher.unprotect_rtcp(message.payload)
         if packet is None:
             self._counts["feedback_forged"] += 1
             return None
@@ -205,6 +205,6 @@ class CameraNode:
             self._counts["feedback_unreadable"] += 1
             return None
         self._path.report(message.peer, now.mono_ns)
-        self._stream.hear(feedback, now.mono_ns)
+        self._stream.receive_feedback(feedback, now.mono_ns)
         self._keyframe_wanted |= feedback.picture_loss
         return None

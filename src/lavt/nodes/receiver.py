@@ -107,7 +107,7 @@ class ReceiverNode:
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
         control = is_rtcp(message.payload)
         if self._path is not None:
-            datagram = (self._path.open_control if control else self._path.open)(message.payload)
+            datagram = (self._path.unprotect_rtcp if control else self._path.unprotect)(message.payload)
         if datagram is None:
             self._counts["packets_forged"] += 1
             return None
@@ -205,7 +205,7 @@ class ReceiverNode:
         return sends
 
     def _control(self, packet: bytes) -> Send:
-        return self._feedback(packet if self._path is None else self._path.protect_control(packet))
+        return self._feedback(packet if self._path is None else self._path.protect_rtcp(packet))
 
     def _feedback(self, datagram: bytes) -> Send:
         return Send("feedback", datagram, self._port)
