@@ -196,5 +196,5 @@ def test_the_table_says_what_failed() -> None:
     lines = table(outcomes).splitlines()
     assert lines[1].split() == ["quick", "1:01", "5", "0", "0", "0", "1", "0"]
     assert lines[2].split()[-1] == "FAILED"
-    assert lines[3] == "field: because"
+    assert lines[3] == "field: reason"
     assert closing_line(outcomes, 70) == "5 passed, 1 failed, 1 rerun in 70s"
