@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavt.domain import FloatArray
-from lavt.perception.calibration import ALONG_RAY, CalibratedCamera, _bent, ground_to_camera
+from lavt.perception.calibration import RAY_STEPS, CalibratedCamera, _distort, ground_to_camera
 
 
 def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
@@ -25,11 +25,11 @@ def straightened(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
     if not camera.distortion:
         return straight
     rays, step = np.zeros_like(straight), 1e-6
-    for part in np.linspace(1 / ALONG_RAY, 1.0, ALONG_RAY):  # outwards from the axis, so that it finds the inner root
+    for part in np.linspace(1 / RAY_STEPS, 1.0, RAY_STEPS):  # outwards from the axis, so that it finds the inner root
         target = camera.middle_px + part * (pixels - camera.middle_px)
         for _ in range(4):
-            here = _bent(camera, rays)
-            (a, c), (b, d) = (((_bent(camera, rays + each) - here) / step).T for each in np.eye(2) * step)
+            here = _distort(camera, rays)
+            (a, c), (b, d) = (((_distort(camera, rays + each) - here) / step).T for each in np.eye(2) * step)
             u, v = (here - target).T
             rays = rays - np.column_stack([d * u - b * v, a * v - c * u]) / (a * d - b * c)[:, None]
     return rays

@@ -39,11 +39,11 @@ def test_pitch_down_lifts_the_road() -> None:
 def test_a_painted_cell_lands_in_its_own_place() -> None:
     """A spot painted into the picture where a ground point is seen comes out in that point's cell."""
     model, grid = CameraModel(), GroundGrid()
-    view = bird_eye(calibrated(model), grid)
+    mapping = bird_eye(calibrated(model), grid)
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     u, v = seen_at(model, 8.0, -1.5)
     picture[round(v) - 1 : round(v) + 2, round(u) - 1 : round(u) + 2] = 255
-    rows, columns = np.nonzero(view.from_above(view.region(picture)))
+    rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
     assert np.mean(grid.row_x_m()[rows]) == pytest.approx(8.0, abs=0.1)
     assert np.mean(grid.column_y_m()[columns]) == pytest.approx(-1.5, abs=0.03)
 
@@ -53,10 +53,10 @@ def test_a_painted_cell_lands_in_its_own_place() -> None:
 )
 def test_the_stamp_is_never_looked_at(model: CameraModel) -> None:
     """Of a picture that is white where the stamp is and black elsewhere, nothing is seen from above."""
-    view = bird_eye(calibrated(model), GroundGrid())
+    mapping = bird_eye(calibrated(model), GroundGrid())
     picture = np.zeros((model.height_px, model.width_px), dtype=np.uint8)
     picture[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = 255
-    assert not view.from_above(view.region(picture)).any()
+    assert not mapping.from_above(mapping.region(picture)).any()
 
 
 def test_without_a_stamp_its_corner_is_road_too() -> None:

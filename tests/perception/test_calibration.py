@@ -59,7 +59,7 @@ def test_what_the_picture_shows_is_where_it_was(camera: CalibratedCamera) -> Non
 def test_a_point_of_the_ground_lands_in_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
     """Painted into the distorted picture where it is seen, a ground point comes out in its own bird's-eye cell."""
     grid = GroundGrid()
-    view = bird_eye(camera, grid, stamped=False)
+    mapping = bird_eye(camera, grid, stamped=False)
     pixels = picture_points(camera, GROUND)
     for (x_m, y_m), (u, v) in zip(GROUND[inside(camera, pixels)], pixels[inside(camera, pixels)], strict=True):
         picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
@@ -67,7 +67,7 @@ def test_a_point_of_the_ground_lands_in_its_cell_through_any_lens(camera: Calibr
         picture[round(v) - 1 : round(v) + 2, round(u) - beside : round(u) + beside + 1] = 255
         # How much ground the spot is decides how well its place can be known.
         near, left = ground_points(camera, np.array([[u, v + 2], [u - beside, v]]))
-        rows, columns = np.nonzero(view.from_above(view.region(picture)))
+        rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
         if len(rows) == 0:
             assert abs(x_m - near[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
             continue

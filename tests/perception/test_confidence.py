@@ -13,8 +13,18 @@ from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector
 from lavt.streams import stream
 
-CLEAN = ("as it is", "solid lines", "tar seams", "tree shadows", "worn by half", "overcast", "gamma 0.5", "gamma 2",
-         "noise 15", "h264 200 kbit/s")  # fmt: skip
+CLEAN = (
+    "as it is",
+    "solid lines",
+    "tar seams",
+    "tree shadows",
+    "worn by half",
+    "overcast",
+    "gamma 0.5",
+    "gamma 2",
+    "noise 15",
+    "h264 200 kbit/s",
+)
 HALF = ("left line missing", "right line missing")
 CROSSED = ("old yellow line", "old white line", "diagonal", "arrow")
 Found = dict[str, list[tuple[Judged, Judged]]]

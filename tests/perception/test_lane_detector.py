@@ -143,12 +143,12 @@ def test_the_sight_says_what_was_done(scene: Scene) -> None:
     """The first picture is searched with windows, the next is followed without; both leave their steps to look at."""
     detector = LaneDetector(MODEL)
     detector.detect(scene.picture())
-    assert detector.sight is not None
-    assert detector.sight.windows
+    assert detector.trace is not None
+    assert detector.trace.windows
     detector.detect(scene.picture())
-    assert not detector.sight.windows
-    assert detector.sight.fit is not None
-    assert detector.sight.mask.shape == (164, 280)
+    assert not detector.trace.windows
+    assert detector.trace.fit is not None
+    assert detector.trace.mask.shape == (164, 280)
 
 
 @pytest.mark.parametrize(

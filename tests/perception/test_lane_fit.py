@@ -111,7 +111,7 @@ def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert error_m(fit, CURVE) < 0.04
     assert fit is not None
-    assert fit.fitting < 0.97
+    assert fit.on_line_share < 0.97
 
 
 def test_too_few_points_are_no_lane() -> None:

@@ -260,8 +260,9 @@ def test_a_file_that_vanishes_comes_back(tmp_path: Path, opens: Opens, caplog: p
     assert (camera.counts["times_lost"], camera.counts["times_back"]) == (1, 1)
     camera.close()
     assert [record.getMessage().split(path.name)[1][:21] for record in caplog.records] == [
-        " gives no pictures an", " gives pictures again",
-    ]  # fmt: skip
+        " gives no pictures an",
+        " gives pictures again",
+    ]
 
 
 def test_a_stream_that_breaks_off_is_connected_again(tmp_path: Path, opens: Opens) -> None:

@@ -18,15 +18,15 @@ from lavt.perception.calibration import CalibratedCamera, ground_to_picture, pic
 
 STAMP_SIDE_PX = 64
 """The top left square of this side carries the time stamp, and is never looked at where there is one."""
-STAMP_BESIDE_PX = 12
+STAMP_MARGIN_PX = 12
 """Beside the stamp, at a focal length of 320 px or less: its edges speak for that much (half of `MARK_PX`)."""
-BentMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
+DistortionMaps = tuple[NDArray[np.int16], NDArray[np.uint16]]
 """OpenCV's maps in fixed point: where in the picture each cell is seen."""
 MARGIN_PX = 3
 """Rows beyond the ground looked at, for interpolation and the 5 rows of smoothing."""
-LANE_AHEAD_M = 3.5
+CENTRAL_HALF_WIDTH_M = 3.5
 """To either side: the ground ahead that matters most."""
-SEES_AT_LEAST = 0.4
+MIN_VISIBLE_SHARE = 0.4
 """Share of the ground ahead that a camera must see to be of use."""
 
 
@@ -79,7 +79,7 @@ class BirdEye:
     grid: GroundGrid
     top_px: int
     bottom_px: int
-    region_from_grid: FloatArray | BentMaps
+    region_from_grid: FloatArray | DistortionMaps
     """From the grid to the rows cut out: a homography, or maps for a lens that bends lines."""
     hidden: NDArray[np.uint8] | None
     """0 for the cells that the time stamp covers, else 255; None when it covers none."""
@@ -92,13 +92,13 @@ class BirdEye:
         """Map a cut-out, grey or in colour, to the grid: (grid.rows, grid.columns), black where nothing is seen."""
         size = (self.grid.columns, self.grid.rows)
         if isinstance(self.region_from_grid, tuple):
-            seen = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)
+            visible = cv2.remap(region, *self.region_from_grid, cv2.INTER_LINEAR)
         else:
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            seen = cv2.warpPerspective(region, self.region_from_grid, size, flags=flags)
+            visible = cv2.warpPerspective(region, self.region_from_grid, size, flags=flags)
         if self.hidden is not None:
-            seen = cv2.bitwise_and(seen, seen, mask=self.hidden)
-        return np.asarray(seen, dtype=np.uint8)
+            visible = cv2.bitwise_and(visible, visible, mask=self.hidden)
+        return np.asarray(visible, dtype=np.uint8)
 
 
 def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True) -> BirdEye:
@@ -110,11 +110,11 @@ def bird_eye(camera: CalibratedCamera, grid: GroundGrid, *, stamped: bool = True
     u_px, v_px = pixels[..., 0], pixels[..., 1]
     with np.errstate(invalid="ignore"):
         inside = (u_px >= 0) & (u_px <= camera.width_px - 1) & (v_px >= 0) & (v_px <= camera.height_px - 1)
-        beside_px = STAMP_BESIDE_PX * max(camera.scale, 1.0)
-        stamp = inside & (u_px < STAMP_SIDE_PX + beside_px) & (v_px < STAMP_SIDE_PX + MARGIN_PX) & stamped
-    ahead = np.abs(grid.column_y_m()) < LANE_AHEAD_M
-    seen = inside & ~stamp
-    if seen[:, ahead].mean() < SEES_AT_LEAST or not seen[: grid.rows // 2, ahead].any():
+        margin_px = STAMP_MARGIN_PX * max(camera.scale, 1.0)
+        stamp = inside & (u_px < STAMP_SIDE_PX + margin_px) & (v_px < STAMP_SIDE_PX + MARGIN_PX) & stamped
+    ahead = np.abs(grid.column_y_m()) < CENTRAL_HALF_WIDTH_M
+    visible = inside & ~stamp
+    if visible[:, ahead].mean() < MIN_VISIBLE_SHARE or not visible[: grid.rows // 2, ahead].any():
         raise UserError(
             f"the camera does not see the road {grid.near_m} to {grid.far_m} m ahead of the rear axle; "
             "correct its place, yaw, pitch, roll, lens or picture size"

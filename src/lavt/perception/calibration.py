@@ -19,7 +19,7 @@ from lavt.domain import CameraModel, FloatArray
 REFERENCE_FOCAL_PX = 320.0
 """Of the camera for which sizes in pixels are given here: 640 columns over 90 degrees."""
 
-ALONG_RAY = 8
+RAY_STEPS = 8
 """Steps from the lens's axis to a ray in which the picture must go outwards all the way.
 
 A polynomial of distortion turns back at some angle and puts what lies beyond, which the lens does not see, into the
@@ -51,7 +51,7 @@ class CalibratedCamera:
     fisheye: bool = False
 
     @property
-    def lens(self) -> FloatArray:
+    def camera_matrix(self) -> FloatArray:
         """The 3 x 3 camera matrix."""
         (fx, fy), (cx, cy) = self.focal_px, self.middle_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
@@ -84,12 +84,12 @@ def axes(camera: CalibratedCamera) -> FloatArray:
     ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     down = np.array([0.0, 0.0, -1.0])
-    deep, down = (
+    forward, down = (
         math.cos(pitch) * ahead + math.sin(pitch) * down,
         math.cos(pitch) * down - math.sin(pitch) * ahead,
     )
     right, down = math.cos(roll) * right + math.sin(roll) * down, math.cos(roll) * down - math.sin(roll) * right
-    return np.stack([right, down, deep])
+    return np.stack([right, down, forward])
 
 
 def ground_to_camera(camera: CalibratedCamera) -> FloatArray:
@@ -103,7 +103,7 @@ def ground_to_picture(camera: CalibratedCamera) -> FloatArray:
 
     The third component is the depth along the camera's axis; a point with none is not in the picture.
     """
-    return np.asarray(camera.lens @ ground_to_camera(camera), dtype=np.float64)
+    return np.asarray(camera.camera_matrix @ ground_to_camera(camera), dtype=np.float64)
 
 
 def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray:
@@ -115,30 +115,32 @@ def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray
     seen = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
     ahead = seen[:, 2] > 1e-6
     rays = seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    pixels = _bent(camera, rays)
-    pixels[~(ahead & _seen_once(camera, rays))] = np.nan
+    pixels = _distort(camera, rays)
+    pixels[~(ahead & _in_lens_field(camera, rays))] = np.nan
     return pixels
 
 
-def _bent(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
+def _distort(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
     """Send rays, as points of the plane one deep (n, 2), through the lens: pixels (n, 2)."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.middle_px
     if not camera.distortion:
         return rays * (fx, fy) + (cx, cy)
     factors = np.array(camera.distortion)
     if camera.fisheye:
-        return np.asarray(cv2.fisheye.distortPoints(rays[:, None], camera.lens, factors), dtype=np.float64)[:, 0]
-    deep = np.column_stack([rays, np.ones(len(rays))])
-    pixels = cv2.projectPoints(deep[:, None], np.zeros(3), np.zeros(3), camera.lens, factors)[0]
+        return np.asarray(cv2.fisheye.distortPoints(rays[:, None], camera.camera_matrix, factors), dtype=np.float64)[
+            :, 0
+        ]
+    forward = np.column_stack([rays, np.ones(len(rays))])
+    pixels = cv2.projectPoints(forward[:, None], np.zeros(3), np.zeros(3), camera.camera_matrix, factors)[0]
     return np.asarray(pixels, dtype=np.float64)[:, 0]
 
 
-def _seen_once(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
+def _in_lens_field(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
     """Tell which rays lie within the field in which the lens model holds, (n,)."""
     if not camera.distortion:
         return np.ones(len(rays), dtype=np.bool_)
     radii = [
-        np.hypot(*((_bent(camera, rays * step / ALONG_RAY) - camera.middle_px) / camera.focal_px).T)
-        for step in range(ALONG_RAY + 1)
+        np.hypot(*((_distort(camera, rays * step / RAY_STEPS) - camera.middle_px) / camera.focal_px).T)
+        for step in range(RAY_STEPS + 1)
     ]
     return np.asarray(np.all(np.diff(radii, axis=0) > 0, axis=0))

@@ -32,7 +32,7 @@ LANE_WIDTH_M = 3.5
 """Width of the lane where it cannot be measured yet."""
 TRACK_CONFIDENCE = 0.2
 """A fit with less (one line over 40 % of the length) is not followed."""
-REFINED = 2
+REFINEMENTS = 2
 """Times that a lane found is followed once more, as from picture to picture: a curve seen near leads far."""
 FORGET_AFTER = 3
 """Pictures without a lane after which the search begins anew: a tenth of a second."""
@@ -80,11 +80,11 @@ class LaneDetector:
         *,
         stamped: bool = True,
     ) -> None:
-        known = calibrated(camera) if isinstance(camera, CameraModel) else camera
-        self._shape = (known.height_px, known.width_px, 3)
-        self._scale = known.scale
-        self.view = bird_eye(known, grid, stamped=stamped)
-        self.sight: DetectionTrace | None = None
+        calibration = calibrated(camera) if isinstance(camera, CameraModel) else camera
+        self._shape = (calibration.height_px, calibration.width_px, 3)
+        self._scale = calibration.scale
+        self.bird_eye = bird_eye(calibration, grid, stamped=stamped)
+        self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER
@@ -97,28 +97,28 @@ class LaneDetector:
         """Give the lane in the next picture, (height, width, 3) as the camera's model says; else ValueError."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
-        mask = self.view.from_above(lane_pixels(self.view.region(picture_bgr), self._scale))
-        points = mark_points(mask, self.view.grid)
+        mask = self.bird_eye.from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
+        points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER
-        self.sight = self._near_last(mask, points) if tracked else self._anywhere(mask, points)
-        fit = self.sight.fit
+        self.trace = self._follow(mask, points) if tracked else self._search(mask, points)
+        fit = self.trace.fit
         if fit is None or fit.confidence < TRACK_CONFIDENCE:
             self._misses += 1
             self._lane = replace(self._lane, confidence=0.0 if fit is None else fit.confidence)
         else:
             self._misses = 0
-            self._lane = averaged(self._lane, fit) if tracked else averaged(None, fit)
-            if has_been_left(self._lane):
+            self._lane = average_lane(self._lane, fit) if tracked else average_lane(None, fit)
+            if car_has_left(self._lane):
                 self.forget()
         return self._lane
 
-    def _near_last(self, mask: Mask, points: Points) -> DetectionTrace:
+    def _follow(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
-        fit = fit_lane(points, sides, self.view.grid, self._lane.width_m, self._lane.centre)
+        fit = fit_lane(points, sides, self.bird_eye.grid, self._lane.width_m, self._lane.centre)
         return DetectionTrace(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
-    def _anywhere(self, mask: Mask, points: Points) -> DetectionTrace:
-        grid = self.view.grid
+    def _search(self, mask: Mask, points: Points) -> DetectionTrace:
+        grid = self.bird_eye.grid
         start = start_line(points, grid, self._lane_width_m)
         if start is None:
             return DetectionTrace(
@@ -127,39 +127,39 @@ class LaneDetector:
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
         # The windows follow any curve, also that of a line which leads aside; the start is rough, but of all the paint.
         fits = (
-            self._refined(points, fit_lane(points, sides, grid, self._lane_width_m)),
-            self._refined(points, self._followed(points, start, self._lane_width_m)),
+            self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
+            self._refine(points, self._fit_near(points, start, self._lane_width_m)),
         )
-        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and stands_in(fit)]
+        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and contains_car(fit)]
         found = max(lanes, key=lambda fit: fit.confidence, default=None)
         return DetectionTrace(mask, points, sides, start, self._lane_width_m, windows, found)
 
-    def _followed(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
-        return fit_lane(points, sides_near(points, centre, width_m), self.view.grid, width_m, centre)
+    def _fit_near(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
+        return fit_lane(points, sides_near(points, centre, width_m), self.bird_eye.grid, width_m, centre)
 
-    def _refined(self, points: Points, fit: LaneFit | None) -> LaneFit | None:
-        for _ in range(REFINED):
+    def _refine(self, points: Points, fit: LaneFit | None) -> LaneFit | None:
+        for _ in range(REFINEMENTS):
             if fit is not None:
-                fit = self._followed(points, fit.centre, fit.width_m)
+                fit = self._fit_near(points, fit.centre, fit.width_m)
         return fit
 
 
-def stands_in(lane: LaneFit) -> bool:
+def contains_car(lane: LaneFit) -> bool:
     """Tell whether the car stands in a lane, as far as a fit can tell; on a line it stands in both."""
-    return _aside_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
+    return _lateral_distance_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
 
 
-def has_been_left(lane: Lane) -> bool:
+def car_has_left(lane: Lane) -> bool:
     """Tell whether the car is so far beside a lane that it is in the middle of the next one, or beyond."""
-    return _aside_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
+    return _lateral_distance_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
 
 
-def _aside_m(centre: tuple[float, float, float]) -> float:
+def _lateral_distance_m(centre: tuple[float, float, float]) -> float:
     c0, c1, _ = centre
     return abs(c0) / math.hypot(1.0, c1)
 
 
-def averaged(before: Lane | None, fit: LaneFit | Lane) -> Lane:
+def average_lane(before: Lane | None, fit: LaneFit | Lane) -> Lane:
     """Move the lane seen before towards the newest one; the first fit after a loss stands alone."""
     if before is None:
         return Lane(fit.centre, fit.width_m, fit.near_m, fit.far_m, fit.confidence)

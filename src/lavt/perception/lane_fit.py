@@ -66,14 +66,14 @@ class LaneFit:
     left_seen: float
     """Share of the length looked at in which the left line is seen, 0 to 1."""
     right_seen: float
-    fitting: float
+    on_line_share: float
     """Share of the paint in and beside the lane that lies on its lines, 0 to 1."""
 
     @property
     def confidence(self) -> float:
         """Mean share of the two lines seen, times how much better than by chance the lines explain the paint."""
         by_chance = 4 * OUTLIER_M / (self.width_m + 2 * CORRIDOR_M)
-        return (self.left_seen + self.right_seen) / 2 * max(self.fitting - by_chance, 0.0) / (1 - by_chance)
+        return (self.left_seen + self.right_seen) / 2 * max(self.on_line_share - by_chance, 0.0) / (1 - by_chance)
 
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:
@@ -85,7 +85,7 @@ def mark_points(mask: Mask, grid: GroundGrid) -> Points:
 
 def sides_near(points: Points, centre: tuple[float, float, float], width_m: float) -> Sides:
     """Tell which points lie near the lines of a lane that is known from before."""
-    middle, slope_factor = _along(points.x_m, centre)
+    middle, slope_factor = _centre_y(points.x_m, centre)
     offset = points.y_m - middle
     line = width_m / 2 * slope_factor
     sides = np.where(offset > 0, 1, -1)
@@ -127,7 +127,7 @@ def sides_by_windows(
     pair, its near end (x) and how far left of `start` its middle is, in metres.
     """
     length_m, half_width_m = WINDOW_M
-    offset_m = points.y_m - _along(points.x_m, start)[0]
+    offset_m = points.y_m - _centre_y(points.x_m, start)[0]
     off_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
     places = []
@@ -154,8 +154,8 @@ def fit_lane(
     `width_m` is the width expected; it is used where only one line is seen, or where what is seen is not a lane's.
     `expected` is the centre expected, where one is.
     """
-    of_lane = np.flatnonzero(sides)
-    chosen, side = Points(points.x_m[of_lane], points.y_m[of_lane]), sides[of_lane]
+    lane_indices = np.flatnonzero(sides)
+    chosen, side = Points(points.x_m[lane_indices], points.y_m[lane_indices]), sides[lane_indices]
     fit = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
     for doubted_m in DOUBTED_FROM_M:
         if fit is None:
@@ -164,15 +164,15 @@ def fit_lane(
         fit = _fit_once(chosen, side, width_m, slopes_of=fit[0], trust=trust)
     if fit is None:
         return None
-    fits = np.abs(_residual_m(chosen, side, *fit)) < OUTLIER_M
-    kept, kept_side = Points(chosen.x_m[fits], chosen.y_m[fits]), side[fits]
+    is_on_line = np.abs(_residual_m(chosen, side, *fit)) < OUTLIER_M
+    kept, kept_side = Points(chosen.x_m[is_on_line], chosen.y_m[is_on_line]), side[is_on_line]
     fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
     if fit is None or abs(fit[0][1]) > SLOPE_AT_MOST or 2 * abs(fit[0][2]) > CURVATURE_AT_MOST_PER_M:
         return None
     centre, measured_m = fit
-    across = _across_m(points, centre)
-    beyond = np.abs(across) - measured_m / 2
-    near_line = np.abs(beyond)
+    across = _lateral_offset_m(points, centre)
+    outside_m = np.abs(across) - measured_m / 2
+    near_line = np.abs(outside_m)
     return LaneFit(
         centre=centre,
         width_m=measured_m,
@@ -180,7 +180,8 @@ def fit_lane(
         far_m=float(kept.x_m.max()),
         left_seen=_share_seen(points.x_m[across > 0], near_line[across > 0], grid),
         right_seen=_share_seen(points.x_m[across < 0], near_line[across < 0], grid),
-        fitting=float(np.count_nonzero(near_line < OUTLIER_M)) / max(int(np.count_nonzero(beyond < CORRIDOR_M)), 1),
+        on_line_share=float(np.count_nonzero(near_line < OUTLIER_M))
+        / max(int(np.count_nonzero(outside_m < CORRIDOR_M)), 1),
     )
 
 
@@ -189,25 +190,25 @@ def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
     seen = [side for side, share in ((1, fit.left_seen), (-1, fit.right_seen)) if share >= PARALLEL_SEEN_AT_LEAST]
     if len(seen) != 1:
         return len(seen) == 2
-    off = np.abs(_across_m(points, fit.centre) - seen[0] * 1.5 * fit.width_m)
+    off = np.abs(_lateral_offset_m(points, fit.centre) - seen[0] * 1.5 * fit.width_m)
     return _share_seen(points.x_m, off, grid) >= PARALLEL_SEEN_AT_LEAST
 
 
-def _along(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
+def _centre_y(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
     """Give y of a centre line at x, and how much farther its parallels lie along y than across."""
     c0, c1, c2 = centre
     slope = c1 + 2 * c2 * x_m
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
 
 
-def _across_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
+def _lateral_offset_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
     """Give how far left of a centre line points lie."""
-    middle, slope_factor = _along(points.x_m, centre)
+    middle, slope_factor = _centre_y(points.x_m, centre)
     return (points.y_m - middle) / slope_factor
 
 
 def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
-    return _across_m(points, centre) - side * width_m / 2
+    return _lateral_offset_m(points, centre) - side * width_m / 2
 
 
 def _fit_once(
@@ -223,7 +224,7 @@ def _fit_once(
     if max(left, right) < POINTS_AT_LEAST:
         return None
     x, y = points.x_m, points.y_m
-    half_lane = side * _along(x, slopes_of)[1] / 2
+    half_lane = side * _centre_y(x, slopes_of)[1] / 2
     curve = [np.ones_like(x), x]
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
         curve.append(x * x)

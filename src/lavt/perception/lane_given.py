@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lavt.domain import Lane, SeenLane
-from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, TRACK_CONFIDENCE, averaged
+from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, TRACK_CONFIDENCE, average_lane
 
 
 class GivenLane:
@@ -29,6 +29,6 @@ class GivenLane:
             self._misses += 1
             self._lane = replace(self._lane, confidence=seen.confidence)
         else:
-            self._lane = averaged(self._lane if self._misses < FORGET_AFTER else None, seen)
+            self._lane = average_lane(self._lane if self._misses < FORGET_AFTER else None, seen)
             self._misses = 0
         return self._lane

@@ -190,7 +190,7 @@ def test_a_rail_takes_the_motion_into_it_and_gives_none(
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
     ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)
     before_j = energy_j(car)
-    car.slide(Contact(ahead_m, left_m, 0.02, out_rad))
+    car.resolve_contact(Contact(ahead_m, left_m, 0.02, out_rad))
     motion = car.motion
     assert (motion.x_m, motion.y_m) == pytest.approx((0.02 * math.cos(out_rad), 0.02 * math.sin(out_rad)))
     assert energy_j(car) <= before_j + 1e-6
@@ -206,7 +206,7 @@ def test_a_car_along_a_rail_is_slowed_by_friction() -> None:
     """Pressed sideways into a rail at its centre of gravity it loses friction times the speed that was stopped."""
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.0, 8.0, 0.5, 0.0), STEP_S)
     at_gravity_m = CAR.wheelbase_m - CAR.front_axle_to_gravity_m
-    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    car.resolve_contact(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
     assert (car.motion.speed_mps, car.motion.side_speed_mps) == pytest.approx((8.0 - RAIL_FRICTION * 0.5, 0.0))
-    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    car.resolve_contact(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
     assert car.motion.speed_mps == pytest.approx(8.0 - RAIL_FRICTION * 0.5)

@@ -24,8 +24,7 @@ from lavt.transport.video.frame_codec import VideoSender
 from lavt.transport.video.h264 import Encoder
 from lavt.transport.video.path_validation import PathServer
 from lavt.transport.video.stream_sender import StreamSender
-from lavt.vehicle.sim.rendering.camera import SimCamera
-from lavt.vehicle.sim.rendering.camera import pose_at as pose_between
+from lavt.vehicle.sim.rendering.camera import SimCamera, interpolate_pose
 from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import grid_ns
 
@@ -115,13 +114,13 @@ def test_an_exposure_of_nothing_is_the_moment(road: Road) -> None:
 def test_poses_are_read_between_those_known() -> None:
     """Between two poses the car is between them, after the last it goes on for 20 ms, before all it is nowhere."""
     poses = [Pose(0, 0.0, 0.0, 3.1), Pose(4_000_000, 4.0, 2.0, -3.1)]
-    assert pose_between(poses, -1) is None
-    assert pose_between(poses[:1], 9) == poses[0]
-    middle = pose_between(poses, 2_000_000)
+    assert interpolate_pose(poses, -1) is None
+    assert interpolate_pose(poses[:1], 9) == poses[0]
+    middle = interpolate_pose(poses, 2_000_000)
     assert middle is not None
     assert (middle.x_m, middle.y_m) == (2.0, 1.0)
     assert abs(middle.heading_rad) == pytest.approx(np.pi, abs=0.05)
-    ahead = pose_between(poses, 6_000_000)
+    ahead = interpolate_pose(poses, 6_000_000)
     assert ahead is not None
     assert (ahead.x_m, ahead.y_m) == pytest.approx((6.0, 3.0))
-    assert pose_between(poses, 24_000_000) == pose_between(poses, 900_000_000)
+    assert interpolate_pose(poses, 24_000_000) == interpolate_pose(poses, 900_000_000)

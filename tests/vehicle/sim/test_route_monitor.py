@@ -28,12 +28,12 @@ def motion_at(
     return CarMotion(x_m, y_m, float(road.point(s_m)[2]) + turned_rad, speed_mps=speed_mps)
 
 
-def judged(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
+def events_along(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
     """Judge a car that is moved from place to place (station, lateral offset)."""
-    judge = RouteMonitor(road, CAR, near_s_m=places[0][0])
+    monitor = RouteMonitor(road, CAR, near_s_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
-        events += judge.judge(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
+        events += monitor.update(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
     return events
 
 
@@ -43,7 +43,7 @@ def kinds(events: list[VehicleEvent]) -> list[EventKind]:
 
 def test_a_drive_along_the_lane_is_only_completed(road: Road) -> None:
     """A car that keeps the centre of its lane to the end completes the route and nothing else happens, and once."""
-    events = judged(road, [(s_m / 2, 0.0) for s_m in range(270)])
+    events = events_along(road, [(s_m / 2, 0.0) for s_m in range(270)])
     assert kinds(events) == ["completed"]
     assert events[0].mono_ns == 246 * 1000  # 123.0 m is the first place beyond 122.933 m
 
@@ -67,69 +67,69 @@ def test_heading_error_is_the_short_way_round(road: Road) -> None:
 def test_each_edge_that_changes_its_lane_is_an_invasion(road: Road) -> None:
     """To the left and back: the left edge goes and comes; a whole change of lane is left edge, then right edge."""
     away = [(5.0, 0.0), (5.1, 0.80), (5.2, 0.83)]
-    events = judged(road, [*away, (5.3, 0.0)])
+    events = events_along(road, [*away, (5.3, 0.0)])
     assert kinds(events) == ["lane_invasion", "lane_invasion"]
     assert [event.detail for event in events] == [
         "left edge from lane 2 to 3 from the right",
         "left edge from lane 3 to 2 from the right",
     ]
-    events = judged(road, [(5.0, 0.0), (5.1, -1.0), (5.2, -3.5)])
+    events = events_along(road, [(5.0, 0.0), (5.1, -1.0), (5.2, -3.5)])
     assert [event.detail.split()[0] for event in events] == ["right", "left"]
 
 
 def test_the_edge_of_the_body_counts_not_the_axle(road: Road) -> None:
     """With 0.82 m to either side of a body of 1.86 m in a lane of 3.5 m, 0.81 m is in the lane and 0.83 m is not."""
-    assert judged(road, [(5.0, 0.0), (5.0, 0.81), (5.0, -0.81)]) == []
-    assert kinds(judged(road, [(5.0, 0.0), (5.0, 0.83)])) == ["lane_invasion"]
+    assert events_along(road, [(5.0, 0.0), (5.0, 0.81), (5.0, -0.81)]) == []
+    assert kinds(events_along(road, [(5.0, 0.0), (5.0, 0.83)])) == ["lane_invasion"]
 
 
 def test_where_a_drive_begins_is_no_invasion(road: Road) -> None:
     """The first look only notes the lanes."""
-    assert judged(road, [(5.0, 1.5)]) == []
+    assert events_along(road, [(5.0, 1.5)]) == []
 
 
 @pytest.mark.parametrize(("lateral_m", "word"), [(-8.25, "rail"), (11.35, "barrier")])
 def test_a_corner_at_a_rail_is_a_collision_once(road: Road, lateral_m: float, word: str) -> None:
     """The body's side 0.93 m from the axle reaches the rail 9.15 m right, the barrier 12.25 m left; it happens once."""
     before = lateral_m - math.copysign(0.1, lateral_m)
-    assert "collision" not in kinds(judged(road, [(5.0, before)]))
-    events = [event for event in judged(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
+    assert "collision" not in kinds(events_along(road, [(5.0, before)]))
+    events = [event for event in events_along(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
     assert len(events) == 1
     assert word in events[0].detail
 
 
 def test_the_front_reaches_the_rail_before_the_axle(road: Road) -> None:
     """A car turned to the rail hits it with its front corner though its axle is more than 2 m away."""
-    assert "collision" in kinds(judged(road, [(5.0, -7.0)], turned_rad=-0.5))
-    assert "collision" not in kinds(judged(road, [(5.0, -7.0)]))
+    assert "collision" in kinds(events_along(road, [(5.0, -7.0)], turned_rad=-0.5))
+    assert "collision" not in kinds(events_along(road, [(5.0, -7.0)]))
 
 
 def test_leaving_the_asphalt_where_no_rail_stands_is_off_road(road: Road) -> None:
     """Along the connecting road the right is open: the body's middle beyond the shoulder is off the road, once."""
     place = (SECOND_WITHOUT_RAIL_M, -8.9)
-    assert kinds(judged(road, [place, place])) == ["off_road"]
-    assert judged(road, [(SECOND_WITHOUT_RAIL_M, -8.4)]) == []
+    assert kinds(events_along(road, [place, place])) == ["off_road"]
+    assert events_along(road, [(SECOND_WITHOUT_RAIL_M, -8.4)]) == []
 
 
 def test_the_time_of_a_drive_counts_from_its_first_movement(road: Road) -> None:
     """The limit is the route at 10 km/h plus 30 s, 74.3 s here, once the car exceeds 0.1 m/s; waiting is free."""
-    judge = RouteMonitor(road, CAR, near_s_m=0.0)
+    monitor = RouteMonitor(road, CAR, near_s_m=0.0)
     standing, moving = motion_at(road, 1.0), motion_at(road, 1.0, speed_mps=0.2)
     began_ns = 500 * NS_PER_S
-    assert judge.judge(standing, 0) == []
-    assert judge.judge(standing, began_ns - 1) == []
-    assert judge.judge(moving, began_ns) == []
+    assert monitor.update(standing, 0) == []
+    assert monitor.update(standing, began_ns - 1) == []
+    assert monitor.update(moving, began_ns) == []
     limit_ns = round((road.length_m / (30 / 3.6 / 3) + 30) * NS_PER_S)
-    assert judge.judge(standing, began_ns + limit_ns) == []
-    assert kinds(judge.judge(standing, began_ns + limit_ns + 1)) == ["timeout"]
-    assert judge.judge(standing, began_ns + limit_ns + 2) == []
+    assert monitor.update(standing, began_ns + limit_ns) == []
+    assert kinds(monitor.update(standing, began_ns + limit_ns + 1)) == ["timeout"]
+    assert monitor.update(standing, began_ns + limit_ns + 2) == []
 
 
 def test_the_time_limit_can_be_set(road: Road) -> None:
     """A drive may be given a time of its own."""
-    judge = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
+    monitor = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
     moving = motion_at(road, 1.0, speed_mps=0.2)
-    assert [kinds(judge.judge(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
+    assert [kinds(monitor.update(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
 
 
 def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
@@ -137,29 +137,30 @@ def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
     straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
     wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
     for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
-        judge = RouteMonitor(straight, wide, near_s_m=5.0)
-        judge.judge(motion_at(straight, 5.0), 0)
-        assert kinds(judge.judge(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
+        monitor = RouteMonitor(straight, wide, near_s_m=5.0)
+        monitor.update(motion_at(straight, 5.0), 0)
+        assert kinds(monitor.update(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
 
 
 def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
     """A car across its lane invades to both sides in the same step, left edge first."""
-    events = judged(road, [(5.0, 0.0), (5.0, 0.0)])
+    events = events_along(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    judge.judge(motion_at(road, 5.0), 0)
-    events = judge.judge(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor.update(motion_at(road, 5.0), 0)
+    events = monitor.update(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
     assert [event.detail for event in events] == [
-        "left edge from lane 2 to 3 from the right", "right edge from lane 2 to 1 from the right"
-    ]  # fmt: skip
+        "left edge from lane 2 to 3 from the right",
+        "right edge from lane 2 to 1 from the right",
+    ]
 
 
 def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
     """A car that has turned round in its lane has invaded on the way, and at the end is where it was."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     events = []
     for index in range(181):
-        events += judge.judge(motion_at(road, 5.0, 0.0, math.radians(index)), index)
+        events += monitor.update(motion_at(road, 5.0, 0.0, math.radians(index)), index)
     sides = [event.detail.split()[0] for event in events if event.kind == "lane_invasion"]
     assert sides == ["left", "left"]  # the front goes out and comes back; the rear, 1.4 m from the axle, stays in
     assert set(kinds(events)) == {"lane_invasion"}
@@ -168,18 +169,18 @@ def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
 def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
     """A car that goes back from the start is measured there, and only its time runs out."""
     places = [(1.0 - index / 4, 0.0) for index in range(100)]
-    judge = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
+    monitor = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
-        events += judge.judge(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
+        events += monitor.update(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
     assert kinds(events) == ["timeout"]
-    assert judge.track(motion_at(road, -23.75)).progress_m == pytest.approx(-23.75)
+    assert monitor.track(motion_at(road, -23.75)).progress_m == pytest.approx(-23.75)
 
 
 def test_a_route_is_completed_where_it_ends_to_the_step(road: Road) -> None:
     """Steps of a centimetre across the end: the first at or beyond it completes."""
     at_m = [122.0 + index / 100 for index in range(200)]
-    events = judged(road, [(s_m, 0.0) for s_m in at_m])
+    events = events_along(road, [(s_m, 0.0) for s_m in at_m])
     assert kinds(events) == ["completed"]
     assert at_m[events[0].mono_ns // 1000] == pytest.approx(122.94)
 
@@ -194,7 +195,7 @@ rails: [{offset_m: -6, from_m: 40}]
 def test_grass_before_a_rail_is_off_road() -> None:
     """A rail beyond the asphalt does not make the grass before it a road."""
     road = parse_road(OPEN_RAIL, source="x")
-    assert kinds(judged(road, [(60.0, 0.0), (60.0, -2.0), (60.0, -3.0)])) == [
+    assert kinds(events_along(road, [(60.0, 0.0), (60.0, -2.0), (60.0, -3.0)])) == [
         "lane_invasion",
         "lane_invasion",
         "off_road",
@@ -206,47 +207,47 @@ def test_asphalt_counts_where_it_is() -> None:
     paved = "paved: [{left_m: 2.25, right_m: -2.25}, {left_m: -2.25, right_m: -6, from_m: 30, to_m: 60}]"
     road = parse_road(f"title: x\nsegments: [{{length_m: 100}}]\n{paved}", source="x")
     for s_m, off in ((20.0, True), (45.0, False), (70.0, True)):
-        assert ("off_road" in kinds(judged(road, [(s_m, -4.0)]))) == off
+        assert ("off_road" in kinds(events_along(road, [(s_m, -4.0)]))) == off
 
 
 def test_a_car_behind_a_rail_does_not_touch_it() -> None:
     """Where the rail begins, a body that is wholly behind it passes; one that it meets in front has a collision."""
     road = parse_road(OPEN_RAIL, source="x")
-    assert "collision" not in kinds(judged(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
-    assert "collision" in kinds(judged(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
+    assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
+    assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
 
 
 def test_one_contact_is_one_collision(road: Road) -> None:
     """Touching and leaving a rail within half a second is one collision, after more than that it is another."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
     collisions = []
     for at_ms in (0, 10, 20, 500, 1021, 1500):
-        judge.judge(off_rail, at_ms * 1_000_000 - 1)
-        events = judge.judge(at_rail, at_ms * 1_000_000)
+        monitor.update(off_rail, at_ms * 1_000_000 - 1)
+        events = monitor.update(at_rail, at_ms * 1_000_000)
         collisions += [at_ms for event in events if event.kind == "collision"]
     assert collisions == [0, 1021]
 
 
 def test_a_car_that_stands_in_a_rail_stays_in_one_collision(road: Road) -> None:
     """Pressed against a rail for seconds and moved there again, a car has touched it once."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    events = [event for at_s in range(4) for event in judge.judge(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
-    events += judge.judge(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    events = [event for at_s in range(4) for event in monitor.update(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
+    events += monitor.update(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
     assert kinds(events).count("collision") == 1
 
 
 def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> None:
     """The front right corner in the right rail: its place on the body, its depth, and that out is to the left."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    judge.judge(motion_at(road, 5.0, -6.5, -0.5), 0)
-    (contact,) = judge.contacts
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor.update(motion_at(road, 5.0, -6.5, -0.5), 0)
+    (contact,) = monitor.contacts
     assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
     corner_m = -6.5 - 0.93 * math.cos(0.5) - 3.89 * math.sin(0.5)
     assert contact.depth_m == pytest.approx(-9.15 - corner_m)
     assert math.remainder(contact.out_rad - road.start[2] - math.pi / 2, 2 * math.pi) == pytest.approx(0.0)
-    judge.judge(motion_at(road, 5.0), 1)
-    assert judge.contacts == ()
+    monitor.update(motion_at(road, 5.0), 1)
+    assert monitor.contacts == ()
 
 
 WINDING = """
@@ -273,6 +274,6 @@ def test_looking_only_when_needed_changes_no_verdict(
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad
         motion = motion_at(road, s_m, lateral_m, turned_rad)
-        eager._quiet._room_m = 0.0
-        assert lazy.judge(motion, index) == eager.judge(motion, index)
+        eager._quiet._across_margin_m = 0.0
+        assert lazy.update(motion, index) == eager.update(motion, index)
         assert (lazy.contacts == ()) == (eager.contacts == ())

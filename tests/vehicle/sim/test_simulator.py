@@ -213,13 +213,13 @@ rails: [{offset_m: 0.52, from_m: 20, kind: barrier}]
 
 def into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
     """Drive with constant wheel and throttle, collisions not ending it; tell the deepest any corner got into a rail."""
-    simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, goes_on=True)
+    simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, continue_after_collision=True)
     simulator.apply(Actuation(steering_rad, 0.6, 0.0), 0)
     events: list[VehicleEvent] = []
     deepest_m = 0.0
     for _ in range(round(240 * duration_s)):
         events += simulator.advance(simulator.next_wake_ns())
-        deepest_m = max([deepest_m, *(contact.depth_m for contact in simulator._judge.contacts)])
+        deepest_m = max([deepest_m, *(contact.depth_m for contact in simulator._route_monitor.contacts)])
     return simulator, events, deepest_m
 
 
@@ -256,7 +256,7 @@ def test_a_crash_at_a_large_angle_stops_a_car_that_goes_on() -> None:
 def test_a_car_that_runs_against_the_end_of_a_rail_stops_before_it() -> None:
     """It meets the end with its front, stays where it is across the road, and never jumps; that is one collision."""
     road = parse_road(RAIL_AHEAD, source="x")
-    simulator = Simulator(road=road, seed=1, start_mono_ns=0, goes_on=True)
+    simulator = Simulator(road=road, seed=1, start_mono_ns=0, continue_after_collision=True)
     simulator.apply(Actuation(0.0, 0.6, 0.0), 0)
     events, steps_m, before = [], [], simulator.pose()
     for _ in range(240 * 12):

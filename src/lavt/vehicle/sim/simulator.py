@@ -20,7 +20,7 @@ START_HEADING_RAD = math.radians(1.5)
 START_AHEAD_M = 2.0
 """How far the start may lie from the route's: to both sides, in heading, and ahead; drawn by the run's seed."""
 
-AT_REST = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
+INITIAL_ACTUATION = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
 
 
 def grid_ns(index: int) -> int:
@@ -52,10 +52,10 @@ class Simulator:
         seed: int,
         start_mono_ns: int,
         parameters: CarParameters = LINCOLN_MKZ,
-        goes_on: bool = False,
+        continue_after_collision: bool = False,
         limit_s: float | None = None,
     ) -> None:
-        self._parameters, self._goes_on = parameters, goes_on
+        self._parameters, self._continues_after_collision = parameters, continue_after_collision
         self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
         self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
@@ -63,13 +63,13 @@ class Simulator:
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
         self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)
-        self._judge = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
-        self._judge.judge(motion, grid_ns(self._index))
-        self._actuation = AT_REST
+        self._route_monitor = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
+        self._route_monitor.update(motion, grid_ns(self._index))
+        self._actuation = INITIAL_ACTUATION
         self._steering: deque[tuple[int, float]] = deque()
         self._pedals: deque[tuple[int, float, float]] = deque()
-        self._wrecked = False
-        self._told: VehicleState | None = None
+        self._crashed = False
+        self._state: VehicleState | None = None
         """The state at the newest point of the grid, once it was asked for."""
 
     @property
@@ -91,25 +91,25 @@ class Simulator:
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
         events: list[VehicleEvent] = []
-        car, judge, steering, pedals = self._car, self._judge, self._steering, self._pedals
+        car, monitor, steering, pedals = self._car, self._route_monitor, self._steering, self._pedals
         at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
-        self._told = None
+        self._state = None
         while next_ns <= to_ns:
             if (steering and steering[0][0] <= at_ns) or (pedals and pedals[0][0] <= at_ns):
-                self._accept(at_ns)
+                self._apply_due_commands(at_ns)
             self._index += 1
             at_ns, next_ns = next_ns, grid_ns(self._index + 1)
-            if self._wrecked:
+            if self._crashed:
                 continue
             car.step(self._actuation)
-            happened = judge.judge(car.motion, at_ns)
-            if self._goes_on:
-                for contact in judge.contacts:
-                    car.slide(contact)
-            elif happened and any(event.kind == "collision" for event in happened):
-                self._wrecked = True
-                car.stop_dead()
-            events += happened
+            new_events = monitor.update(car.motion, at_ns)
+            if self._continues_after_collision:
+                for contact in monitor.contacts:
+                    car.resolve_contact(contact)
+            elif new_events and any(event.kind == "collision" for event in new_events):
+                self._crashed = True
+                car.stop()
+            events += new_events
         return events
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
@@ -127,7 +127,7 @@ class Simulator:
         """Tell nothing: what is applied is in force after the dead times."""
         return []
 
-    def _accept(self, at_ns: int) -> None:
+    def _apply_due_commands(self, at_ns: int) -> None:
         """Take over what has become due."""
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
         while self._steering and self._steering[0][0] <= at_ns:
@@ -140,14 +140,14 @@ class Simulator:
 
     def state(self) -> VehicleState:
         """Tell speed and road wheel angle at the newest point of the grid."""
-        if self._told is None:
+        if self._state is None:
             motion = self._car.motion
-            self._told = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
-        return self._told
+            self._state = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        return self._state
 
     def ground_truth(self) -> GroundTruth:
         """Tell the truth at the newest point of the grid."""
-        motion, track = self._car.motion, self._judge.track(self._car.motion)
+        motion, track = self._car.motion, self._route_monitor.track(self._car.motion)
         return GroundTruth(
             grid_ns(self._index),
             motion.x_m,

@@ -39,7 +39,7 @@ def test_the_lane_is_where_the_road_has_it(lateral_m: float, turned_rad: float) 
     watching = camera()
     for s_m in range(0, int(ROAD.length_m) - 25, 3):
         pose = pose_at(s_m, lateral_m, turned_rad)
-        lane = watching.lane_from(pose)
+        lane = watching.observe_lane(pose)
         assert lane.confidence > 0.8
         for ahead_m in (6.0, 10.0, 14.0):
             truth_x, truth_y = ROAD.across(s_m + ahead_m, 0.0).tolist()
@@ -52,8 +52,8 @@ def test_the_lane_is_where_the_road_has_it(lateral_m: float, turned_rad: float) 
 
 def test_confidence_is_what_is_in_view() -> None:
     """In the lane it is 1; beside it, or turned, less and less; out of the detector's 7 m, or turned away, 0."""
-    beside = [camera().lane_from(pose_at(S_M, lateral_m)).confidence for lateral_m in (0.0, 2.0, 4.0, 6.0, 10.0)]
-    turned = [camera().lane_from(pose_at(S_M, 0.0, math.radians(deg))).confidence for deg in (0, 20, 40, 90, 180)]
+    beside = [camera().observe_lane(pose_at(S_M, lateral_m)).confidence for lateral_m in (0.0, 2.0, 4.0, 6.0, 10.0)]
+    turned = [camera().observe_lane(pose_at(S_M, 0.0, math.radians(deg))).confidence for deg in (0, 20, 40, 90, 180)]
     for confidences in (beside, turned):
         assert confidences[0] > 0.95
         assert confidences == sorted(confidences, reverse=True)
@@ -76,7 +76,7 @@ def test_confidence_is_what_is_in_view() -> None:
 def test_a_camera_that_looks_aside_sees_less(yaw_deg: float, y_m: float, sees: float) -> None:
     """Half of the lane's lines are left of a camera that looks 46 degrees to one side; behind the car there is none."""
     model = CameraModel(yaw_rad=math.radians(yaw_deg), y_m=y_m)
-    lane = camera(model=model).lane_from(pose_at(S_M))
+    lane = camera(model=model).observe_lane(pose_at(S_M))
     assert lane.confidence == pytest.approx(sees, abs=0.1)
 
 

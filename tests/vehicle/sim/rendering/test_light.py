@@ -13,7 +13,7 @@ from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 from lavt.domain import FloatArray, Picture
 from lavt.vehicle.sim.rendering import renderer
 from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
-from lavt.vehicle.sim.rendering.pinhole import view_from
+from lavt.vehicle.sim.rendering.pinhole import place_camera
 from lavt.vehicle.sim.road.road import Road, load_road
 
 NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
@@ -49,7 +49,7 @@ def test_only_the_sun_throws_shadows() -> None:
 
 
 def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, s_m: float) -> float:
-    u_px, v_px, _ = view_from(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
     return float(picture[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 2 : round(u_px) + 3].mean())
 
 
@@ -75,7 +75,7 @@ def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
 
 DIGEST = """
 from tests.vehicle.sim.rig import camera_on, digest, picture_of, pose_at
-from lavt.vehicle.sim.road import load_road
+from lavt.vehicle.sim.road.road import load_road
 road = load_road("a_key")
 print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.3, 0.1), 5)))
 """

@@ -7,7 +7,7 @@ from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.sim.rendering.ground import Ground
-from lavt.vehicle.sim.rendering.pinhole import horizon_row, row_of_depth, view_from
+from lavt.vehicle.sim.rendering.pinhole import horizon_row, place_camera, row_of_depth
 from lavt.vehicle.sim.rendering.renderer import SceneryKind
 from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M
 from lavt.vehicle.sim.road.road import Road, load_road
@@ -56,7 +56,7 @@ def test_the_seed_moves_only_the_sensors_noise(road: Road) -> None:
 
 def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, stations: FloatArray) -> FloatArray:
     ground = road.across(stations, offset_m)
-    points = view_from(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
+    points = place_camera(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
     inside = (points[:, 0] > 4) & (points[:, 0] < model.width_px - 5) & (points[:, 1] < model.height_px - 2)
     assert inside.sum() >= 3
     return points[inside]
@@ -88,7 +88,7 @@ def test_a_dash_is_bright_and_a_gap_is_not(road: Road) -> None:
     dashes = np.array([9.0]) + DASH_M / 2
     for station, is_dash in [(float(dashes[0]), True), (float(dashes[0] + (DASH_M + GAP_M) / 2), False)]:
         ground = np.append(road.across(station, 1.75), 0.0)
-        u_px, v_px, _ = view_from(MODEL, pose).project(ground)
+        u_px, v_px, _ = place_camera(MODEL, pose).project(ground)
         around = picture[round(v_px), round(u_px) - 25 : round(u_px) + 26]
         assert (picture[round(v_px), round(u_px)] - np.median(around) > 60) == is_dash
 
@@ -97,12 +97,12 @@ def test_yellow_is_yellow_and_white_is_not(road: Road) -> None:
     """The mark at the median is yellow (red far above blue), the one at the shoulder white."""
     pose = pose_at(road, 0.0, 6.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = view_from(MODEL, pose).project(np.append(road.across(10.0, 8.75), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, 8.75), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert red - blue > 60
     pose = pose_at(road, 0.0, -3.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = view_from(MODEL, pose).project(np.append(road.across(10.0, -5.25), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, -5.25), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert abs(red - blue) < 25
     assert blue > 140
@@ -112,16 +112,16 @@ def test_rows_see_the_ground_at_their_depth() -> None:
     """The row for a depth is where the pinhole projects the ground at that depth, also with a pitched camera."""
     for pitch_rad in (0.0, 0.2):
         model = dataclasses.replace(MODEL, pitch_rad=pitch_rad)
-        view = view_from(model, Pose(0, 0.0, 0.0, 0.0))
-        _, v_px, _ = view.project(np.array([model.x_m + 10.0, 0.0, 0.0]))
+        placement = place_camera(model, Pose(0, 0.0, 0.0, 0.0))
+        _, v_px, _ = placement.project(np.array([model.x_m + 10.0, 0.0, 0.0]))
         assert row_of_depth(model, 10.0) - 1 < v_px <= row_of_depth(model, 10.0)
 
 
 def test_the_homography_is_the_inverse_of_the_projection() -> None:
     """A pixel's ground projects back to the pixel."""
-    view = view_from(dataclasses.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
-    ground = view.ground_from_picture() @ np.array([123.0, 400.0, 1.0])
-    assert view.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx([123.0, 400.0])
+    placement = place_camera(dataclasses.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
+    ground = placement.ground_from_picture() @ np.array([123.0, 400.0, 1.0])
+    assert placement.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx([123.0, 400.0])
 
 
 def test_rails_stand_only_with_scenery(road: Road) -> None:
@@ -131,7 +131,7 @@ def test_rails_stand_only_with_scenery(road: Road) -> None:
         kind: picture_of(camera_on(road, scenery=kind), pose).astype(float) for kind in ("full", "light", "none")
     }
     point = np.append(road.across(84.0, 12.25), 0.5)
-    u_px, v_px, _ = view_from(MODEL, pose).project(point)
+    u_px, v_px, _ = place_camera(MODEL, pose).project(point)
     place = np.s_[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 3 : round(u_px) + 4]
     assert np.abs(pictures["light"][place].mean() - pictures["none"][place].mean()) > 25
     assert pictures["full"][place].mean() == pytest.approx(pictures["light"][place].mean(), abs=3)
@@ -150,18 +150,18 @@ TURNED = CameraModel(x_m=1.2, y_m=0.5, z_m=1.6, pitch_rad=0.1, yaw_rad=0.3, roll
 
 def test_the_homography_inverts_the_projection_for_every_pose() -> None:
     """A turned, leaning camera beside the middle sees the ground of a pixel at that pixel."""
-    view = view_from(TURNED, Pose(0, 30.0, -7.0, 2.0))
+    placement = place_camera(TURNED, Pose(0, 30.0, -7.0, 2.0))
     for pixel in ([123.0, 400.0], [600.0, 300.0], [320.0, 470.0]):
-        ground = view.ground_from_picture() @ np.array([*pixel, 1.0])
-        assert view.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx(pixel)
+        ground = placement.ground_from_picture() @ np.array([*pixel, 1.0])
+        assert placement.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx(pixel)
 
 
 def test_signs_of_the_cameras_pose() -> None:
     """Turned left the road ahead is to the right; moved left likewise; leaning right the right horizon is higher."""
     pose, ahead = Pose(0, 0.0, 0.0, 0.0), np.array([40.0, 0.0, 1.4])
     for model in (CameraModel(yaw_rad=0.1), CameraModel(y_m=0.5)):
-        assert view_from(model, pose).project(ahead)[0] > MODEL.width_px / 2
-    leaning = view_from(CameraModel(roll_rad=0.1), pose)
+        assert place_camera(model, pose).project(ahead)[0] > MODEL.width_px / 2
+    leaning = place_camera(CameraModel(roll_rad=0.1), pose)
     right, left = (leaning.project(np.array([40.0, side, 1.4]))[1] for side in (-20.0, 20.0))
     assert right < horizon_row(MODEL) < left
 

@@ -29,9 +29,11 @@ def test_projection_finds_the_station_and_the_offset_a_place_was_made_from(
     s_m = -10.0 + share * (line.last_m + 10.0)
     x_m, y_m, heading_rad, _ = (float(each) for each in line.point(s_m))
     found = line.project(
-        x_m - offset_m * math.sin(heading_rad), y_m + offset_m * math.cos(heading_rad),
-        s_m + beside_m - 13.0, s_m + beside_m + 13.0,
-    )  # fmt: skip
+        x_m - offset_m * math.sin(heading_rad),
+        y_m + offset_m * math.cos(heading_rad),
+        s_m + beside_m - 13.0,
+        s_m + beside_m + 13.0,
+    )
     assert found[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
 
 

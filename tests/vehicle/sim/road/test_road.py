@@ -50,9 +50,7 @@ def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(12.25, -8.75), (33.25, 12.25)]
     assert {mark.offset_m for mark in road.marks if mark.colour == "yellow"} == {8.75, 15.75}
     assert {mark.offset_m for mark in road.marks if mark.kind == "broken"} >= {5.25, 1.75, -1.75}
-    assert {(rail.offset_m, rail.kind) for rail in road.rails} == {
-        (12.25, "barrier"), (-9.15, "rail"), (33.65, "rail")
-    }  # fmt: skip
+    assert {(rail.offset_m, rail.kind) for rail in road.rails} == {(12.25, "barrier"), (-9.15, "rail"), (33.65, "rail")}
 
 
 @pytest.mark.parametrize("name", ROUTES)

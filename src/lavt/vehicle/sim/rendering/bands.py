@@ -14,7 +14,7 @@ from lavt.vehicle.sim.rendering.textures import SCALES_M
 BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
 """How far ahead of the camera each scale of the ground serves."""
 
-_MOST_LINES = 6
+_MAX_LINES = 6
 _TEXELS_A_LINE = 2.5
 
 
@@ -33,17 +33,17 @@ class Band:
         self._tile_m = TILE_M[level]
         # The square is laid around a point ahead of the camera, from which everything in the rows is within reach.
         self._ahead_m = (near_m + far_m) / 2
-        beside_m = far_m * model.width_px / 2 / model.focal_px * math.hypot(1.0, math.tan(model.pitch_rad))
-        reach_m = math.hypot(far_m - self._ahead_m, beside_m)
-        self._around = math.ceil(reach_m / self._tile_m)
+        half_width_m = far_m * model.width_px / 2 / model.focal_px * math.hypot(1.0, math.tan(model.pitch_rad))
+        reach_m = math.hypot(far_m - self._ahead_m, half_width_m)
+        self._tiles_around = math.ceil(reach_m / self._tile_m)
         middle_m = math.sqrt(max(near_m, 2.0) * far_m)
         row_m = middle_m**2 / (model.focal_px * model.z_m)
-        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_A_LINE)), 1), _MOST_LINES)
+        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_A_LINE)), 1), _MAX_LINES)
 
     @property
     def tiles(self) -> int:
         """How many tiles an edge of the square has."""
-        return 2 * self._around + 1
+        return 2 * self._tiles_around + 1
 
     @property
     def picture_from_lines(self) -> FloatArray:
@@ -51,11 +51,11 @@ class Band:
         first = self.first_row + 0.5 / self.lines - 0.5
         return np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / self.lines, first], [0.0, 0.0, 1.0]])
 
-    def low_tile(self, view: CameraPlacement) -> tuple[int, int]:
+    def first_tile(self, placement: CameraPlacement) -> tuple[int, int]:
         """Index (x, y) of the square's first tile."""
-        x_m = view.x_m + self._ahead_m * math.cos(view.heading_rad)
-        y_m = view.y_m + self._ahead_m * math.sin(view.heading_rad)
-        return math.floor(x_m / self._tile_m) - self._around, math.floor(y_m / self._tile_m) - self._around
+        x_m = placement.x_m + self._ahead_m * math.cos(placement.heading_rad)
+        y_m = placement.y_m + self._ahead_m * math.sin(placement.heading_rad)
+        return math.floor(x_m / self._tile_m) - self._tiles_around, math.floor(y_m / self._tile_m) - self._tiles_around
 
     def texel_from_ground(self, low: tuple[int, int]) -> FloatArray:
         """3 x 3 matrix from the world's ground to texels of the square that begins with the tile `low`."""

@@ -11,7 +11,7 @@ from lavt.vehicle.sim.rendering.light import LightName
 from lavt.vehicle.sim.rendering.renderer import Renderer, SceneryKind
 from lavt.vehicle.sim.road.road import Road
 
-LONGEST_GUESS_NS = 20 * NS_PER_MS
+MAX_EXTRAPOLATION_NS = 20 * NS_PER_MS
 """How far beyond the newest pose the car is taken to go on as it did: the physics may lag a little."""
 
 
@@ -78,14 +78,14 @@ class SimCamera:
         """Render frame `number` as seen while the shutter was open; None when no pose is as old as its opening."""
         if self._exposure_ns == 0:
             return self.capture(number, begin_ns, newest_pose(poses, begin_ns))
-        begin, end = pose_at(poses, begin_ns), pose_at(poses, begin_ns + self._exposure_ns)
+        begin, end = interpolate_pose(poses, begin_ns), interpolate_pose(poses, begin_ns + self._exposure_ns)
         if begin is None or end is None:
             return None
         picture = self._renderer.render_exposed(begin, end, number)
         return CapturedFrame(number, begin_ns + self._exposure_ns // 2, picture)
 
 
-def pose_at(poses: Sequence[Pose], at_ns: int) -> Pose | None:
+def interpolate_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:
     """Read the pose at a time between those known (oldest first); None when all are later.
 
     Beyond the newest the motion of the last two goes on, for `LONGEST_GUESS_NS` at most: the physics tells a pose after
@@ -98,7 +98,7 @@ def pose_at(poses: Sequence[Pose], at_ns: int) -> Pose | None:
     first, second = (poses[-2], poses[-1]) if after is None else (before, after)
     if second.mono_ns <= first.mono_ns:
         return before
-    until_ns = min(at_ns, second.mono_ns + LONGEST_GUESS_NS)
+    until_ns = min(at_ns, second.mono_ns + MAX_EXTRAPOLATION_NS)
     share = (until_ns - first.mono_ns) / (second.mono_ns - first.mono_ns)
     turn_rad = math.remainder(second.heading_rad - first.heading_rad, 2 * math.pi)
     return Pose(

@@ -57,7 +57,7 @@ class Light:
         towards = self.towards_sun
         return np.asarray(-towards[:2] / towards[2])
 
-    def upright(self, normals: FloatArray) -> FloatArray:
+    def upright_factors(self, normals: FloatArray) -> FloatArray:
         """Factors (n, 3) for upright faces with level unit normals (n, 2): those turned away are shaded."""
         lit, shade = np.array(self.lit), np.array(self.shade)
         if not self.shadows:

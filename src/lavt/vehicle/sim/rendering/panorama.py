@@ -31,19 +31,19 @@ class Panorama:
     """The horizon for one camera model; a picture of it is a choice of columns."""
 
     def __init__(self, model: CameraModel, rows: int, light: Light, *, plain: bool) -> None:
-        self._words = _painted(rows, horizon_row(model), model.focal_px, light, plain=plain)
+        self._texels = _paint(rows, horizon_row(model), model.focal_px, light, plain=plain)
         across_px = np.arange(model.width_px) - principal_point(model)[0]
         self._azimuth_rad = np.arctan2(across_px, model.focal_px)
 
-    def cut(self, heading_rad: float, out: Picture) -> None:
+    def crop(self, heading_rad: float, out: Picture) -> None:
         """Write what a camera with this heading sees into `out` (rows, columns, 4), the first rows of its picture."""
         turn = (self._azimuth_rad - heading_rad) / (2 * math.pi)
         columns = np.rint((turn - np.floor(turn)) * _COLUMNS).astype(np.intp) % _COLUMNS
-        np.take(self._words, columns, axis=1, out=out.view(np.uint32)[..., 0], mode="clip")
+        np.take(self._texels, columns, axis=1, out=out.view(np.uint32)[..., 0], mode="clip")
 
 
 @lru_cache(maxsize=6)
-def _painted(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
+def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
     """Paint (rows, columns) of blue, green, red and nothing in one word each."""
     # Height above the horizon as a share of the focal length, for each row.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
@@ -52,7 +52,7 @@ def _painted(rows: int, horizon: float, focal_px: float, light: Light, *, plain:
     rise = np.clip(height / 0.75, 0.0, 1.0) ** 0.6
     sky = np.array(light.haze) * (1 - rise[..., None]) + np.array(light.zenith) * rise[..., None]
     picture = np.broadcast_to(sky, (rows, _COLUMNS, 3)).copy()
-    away_rad = _away_from_sun(light, np.arctan(height), -turn)
+    away_rad = _angle_to_sun_rad(light, np.arctan(height), -turn)
     picture += np.exp(-away_rad / 0.35)[..., None] * np.array(light.glow)
     if not plain:
         _add_clouds(picture, height, light)
@@ -60,14 +60,14 @@ def _painted(rows: int, horizon: float, focal_px: float, light: Light, *, plain:
             _add_sun(picture, away_rad)
         for mean, waves, colour, haze in _RIDGES:
             ridge = mean + sum((wave * np.sin(count * turn + phase) for wave, count, phase in waves), np.zeros(1))
-            _add_ridge(picture, height, ridge, _distant(colour, light, haze))
-    _add_ridge(picture, height, 0.020 + 0.0035 * _crowns(), _distant(_WOOD, light, 0.2))
+            _add_ridge(picture, height, ridge, _hazed_colour(colour, light, haze))
+    _add_ridge(picture, height, 0.020 + 0.0035 * _wood_outline(), _hazed_colour(_WOOD, light, 0.2))
     words = np.zeros((rows, _COLUMNS, 4), dtype=np.uint8)
     words[..., :3] = np.clip(np.rint(picture), 0, 255)
     return np.asarray(words.view(np.uint32)[..., 0], dtype=np.uint32)
 
 
-def _away_from_sun(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
+def _angle_to_sun_rad(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
     """Angle between the sun and every direction of the picture."""
     cosine = np.sin(elevation_rad) * math.sin(light.elevation_rad)
     cosine = cosine + np.cos(elevation_rad) * math.cos(light.elevation_rad) * np.cos(azimuth_rad - light.azimuth_rad)
@@ -75,7 +75,7 @@ def _away_from_sun(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatAr
     return angle_rad
 
 
-def _distant(colour: Colour, light: Light, haze: float) -> FloatArray:
+def _hazed_colour(colour: Colour, light: Light, haze: float) -> FloatArray:
     """Colour of something far away that was chosen for the noon light."""
     near, far = np.array(colour) * np.array(light.lit), np.array(light.haze) * 0.85
     return np.asarray(near * (1 - haze) + far * haze)
@@ -112,7 +112,7 @@ def _add_clouds(picture: FloatArray, height: FloatArray, light: Light) -> None:
     picture += cover * np.array(light.cloud) * np.clip(1.0 - 0.13 * thickness + lumps, 0.7, 1.06)[..., None]
 
 
-def _crowns() -> FloatArray:
+def _wood_outline() -> FloatArray:
     """Outline of a distant wood, one value for each column."""
     steps = stream(_WORLD_SEED, "wood").standard_normal(_COLUMNS)
     kernel = np.hanning(9)

@@ -37,7 +37,7 @@ class CameraPlacement:
                 [cosine * pitch_cosine, sine * pitch_cosine, -pitch_sine],
             ]
         )
-        camera_from_world[:2] = rolled(model.roll_rad) @ camera_from_world[:2] * model.focal_px
+        camera_from_world[:2] = roll_matrix(model.roll_rad) @ camera_from_world[:2] * model.focal_px
         points = (points_m - np.array([self.x_m, self.y_m, model.z_m])) @ camera_from_world.T
         depth = points[..., 2:]
         points[..., :2] /= np.where(np.abs(depth) < 1e-6, 1e-6, depth)
@@ -62,12 +62,12 @@ class CameraPlacement:
         )
         u_px, v_px = principal_point(model)
         level_from_picture = np.eye(3)
-        level_from_picture[:2, :2] = rolled(-model.roll_rad)
+        level_from_picture[:2, :2] = roll_matrix(-model.roll_rad)
         level_from_picture[:2, 2] = level_from_picture[:2, :2] @ np.array([-u_px, -v_px])
         return np.asarray(ground_from_level @ level_from_picture)
 
 
-def view_from(model: CameraModel, pose: Pose) -> CameraPlacement:
+def place_camera(model: CameraModel, pose: Pose) -> CameraPlacement:
     """Place the camera of a vehicle at `pose`."""
     cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     x_m = pose.x_m + model.x_m * cosine - model.y_m * sine
@@ -75,13 +75,13 @@ def view_from(model: CameraModel, pose: Pose) -> CameraPlacement:
     return CameraPlacement(model, x_m, y_m, pose.heading_rad + model.yaw_rad)
 
 
-def rolled(roll_rad: float) -> FloatArray:
+def roll_matrix(roll_rad: float) -> FloatArray:
     """Turn picture coordinates (right, down) from a level camera's to those of one that leans right by `roll_rad`."""
     cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
-def levelled(model: CameraModel) -> CameraModel:
+def level_model(model: CameraModel) -> CameraModel:
     """Give a camera without roll, of the same focal length, whose picture holds all that `model` sees."""
     if model.roll_rad == 0.0:
         return model

@@ -87,20 +87,20 @@ class RoadsideObjects:
     walls: Walls
 
 
-def standing(road: Road, *, trees: bool) -> RoadsideObjects:
+def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
     """Place everything along a road; `trees` says whether trees, lamp posts and buildings are there too."""
-    runs = [_stations(road, rail) for rail in road.rails]
-    planted = _plant(road) if trees else np.empty((0, 4))
+    runs = [_rail_stations(road, rail) for rail in road.rails]
+    placed_trees = _place_trees(road) if trees else np.empty((0, 4))
     return RoadsideObjects(
         faces=_join_faces([*_rail_faces(road, runs), *_lamp_faces(road, runs if trees else [])]),
-        poles=_poles(road, runs, lamps=trees),
-        trees=planted,
-        tree_road_rad=_road_heading(road, planted[:, :2]),
-        walls=_build(road) if trees else _NO_WALLS,
+        poles=_place_poles(road, runs, lamps=trees),
+        trees=placed_trees,
+        tree_road_rad=_road_heading(road, placed_trees[:, :2]),
+        walls=_place_buildings(road) if trees else _NO_WALLS,
     )
 
 
-def _stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
+def _rail_stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
     first_m, last_m = max(rail.from_m, road.first_m), min(rail.to_m, road.last_m)
     return rail, np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _POST_SPACING_M) + 1))
 
@@ -115,9 +115,9 @@ def _rail_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Fac
         line = road.across(stations, rail.offset_m)
         # Every piece a little different, so that the eye can see them pass.
         tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
-        normals = _beside(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
+        normals = _left_normals(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
         for low_m, high_m, colour, seen_to_m in _BANDS[rail.kind]:
-            corners = _upright(line[:-1], line[1:], low_m, high_m)
+            corners = _upright_faces(line[:-1], line[1:], low_m, high_m)
             found.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), seen_to_m)))
     return found
 
@@ -129,20 +129,20 @@ def _lamp_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Fac
         if rail.kind == "barrier":
             places = _lamp_stations(stations)
             begin, end = road.across(places, rail.offset_m - 1.8), road.across(places, rail.offset_m + 1.8)
-            corners = _upright(begin, end, 9.35, 9.55)
-            normals = _beside(begin, end)
+            corners = _upright_faces(begin, end, 9.35, 9.55)
+            normals = _left_normals(begin, end)
             found.append(Faces(corners, np.full((len(corners), 3), 104.0), normals, np.full(len(corners), FAR_M)))
     return found
 
 
-def _beside(begin: FloatArray, end: FloatArray) -> FloatArray:
+def _left_normals(begin: FloatArray, end: FloatArray) -> FloatArray:
     """Level unit vectors to the left of the way from `begin` to `end`, (n, 2)."""
     along = end - begin
     left = np.column_stack([-along[:, 1], along[:, 0]])
     return np.asarray(left / np.maximum(np.hypot(left[:, :1], left[:, 1:]), 1e-9))
 
 
-def _upright(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
+def _upright_faces(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
     low, high = np.full(len(begin), low_m), np.full(len(begin), high_m)
     corners = [(begin, low), (end, low), (end, high), (begin, high)]
     return np.stack([np.column_stack(corner) for corner in corners], axis=1)
@@ -157,7 +157,7 @@ def _join_faces(faces: Sequence[Faces]) -> Faces:
     )
 
 
-def _poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
+def _place_poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
     """Place posts of rails and lamp posts on barriers."""
     poles = [np.empty((0, 5))]
     for rail, stations in runs:
@@ -171,7 +171,7 @@ def _poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) 
     return np.concatenate(poles)
 
 
-def _middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
+def _road_middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
     """Points (n, 2) along the middle of the asphalt, the heading (n,) there, and half its width."""
     left_m = max(strip.left_m for strip in road.paved)
     right_m = min(strip.right_m for strip in road.paved)
@@ -180,14 +180,14 @@ def _middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _road_heading(road: Road, places: FloatArray) -> FloatArray:
-    middle, heading_rad, _ = _middle(road)
+    middle, heading_rad, _ = _road_middle(road)
     nearest = ((places[:, None] - middle[None]) ** 2).sum(axis=-1).argmin(axis=1)
     return np.asarray(heading_rad[nearest], dtype=np.float64)
 
 
 def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> FloatArray:
     """Random places around the road, one in `every_m2`, none nearer than `clear_m` to its asphalt."""
-    middle, _, half_width_m = _middle(road)
+    middle, _, half_width_m = _road_middle(road)
     low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
     places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
     distance = np.full(len(places), np.inf)
@@ -196,7 +196,7 @@ def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> Floa
     return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
 
 
-def _plant(road: Road) -> FloatArray:
+def _place_trees(road: Road) -> FloatArray:
     places = _free_places(road, "tree places", _TREE_EVERY_M2, clear_m=6.0)
     random = stream(_WORLD_SEED, "tree shapes")
     kinds = random.integers(0, TREE_KINDS, len(places))
@@ -206,7 +206,7 @@ def _plant(road: Road) -> FloatArray:
     return np.column_stack([places, heights, kinds])
 
 
-def _build(road: Road) -> Walls:
+def _place_buildings(road: Road) -> Walls:
     random = stream(_WORLD_SEED, "building shapes")
     outlines, colours, normals, windows = [], [], [], []
     for place in _free_places(road, "building places", _BUILDING_EVERY_M2, clear_m=24.0):
@@ -223,7 +223,7 @@ def _build(road: Road) -> Walls:
             windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
             whole, height_m = (np.zeros(1), np.ones(1)), (np.zeros(1), np.full(1, _STOREY_M * storeys + 0.5))
             outlines.append(_panels(begin, end, shares=whole, heights_m=height_m)[0])
-            normals.append(-_beside(begin[None], end[None])[0])
+            normals.append(-_left_normals(begin[None], end[None])[0])
             colours.append(colour)
     return Walls(
         np.array(outlines).reshape(-1, 4, 3),

@@ -40,17 +40,17 @@ class Textures:
 @lru_cache(maxsize=1)
 def all_textures() -> tuple[Textures, ...]:
     """Make the patterns, one set for each of `SCALES_M` (about half a second the first time)."""
-    finest = _finest()
+    finest = _make_finest()
     levels = [finest]
     for scale_m in SCALES_M[1:]:
         size = round(PERIOD_M / scale_m)
         last = levels[-1]
-        patterns = (_reduced(pattern, size) for pattern in (last.asphalt, last.grass, last.gravel, last.wear))
+        patterns = (_reduce(pattern, size) for pattern in (last.asphalt, last.grass, last.gravel, last.wear))
         levels.append(Textures(*patterns))
     return tuple(levels)
 
 
-def _reduced(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def _reduce(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
@@ -69,7 +69,7 @@ def seamless_noise(name: str, size: int, cells: int) -> Field:
     return field
 
 
-def _finest() -> Textures:
+def _make_finest() -> Textures:
     size = round(PERIOD_M / SCALES_M[0])
     grain = stream(_WORLD_SEED, "grain").standard_normal((size, size), dtype=np.float32)
     stones = seamless_noise("stones", size, size // 3)

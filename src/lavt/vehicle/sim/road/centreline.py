@@ -39,7 +39,7 @@ class Segment:
     curvature_per_m: float
     end_curvature_per_m: float
 
-    def cut(self) -> list[Segment]:
+    def split(self) -> list[Segment]:
         """Cut a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
         if self.end_curvature_per_m == self.curvature_per_m:
             return [self]
@@ -64,7 +64,7 @@ class _Piece:
         """How far the line has turned `along_m` into the piece."""
         return along_m * (self.curvature_per_m + self.rate_per_m2 * along_m / 2)
 
-    def reached(self, along_m: float) -> tuple[float, float]:
+    def displacement(self, along_m: float) -> tuple[float, float]:
         """Place `along_m` into the piece, ahead and to the left of its beginning."""
         if self.rate_per_m2 == 0.0:
             half_rad = self.curvature_per_m * along_m / 2
@@ -78,7 +78,7 @@ class _Piece:
         return ahead_m * along_m, left_m * along_m
 
 
-_Searched = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
+_SearchRow = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
 
 
 class Centreline:
@@ -89,38 +89,38 @@ class Centreline:
         self._pieces: list[_Piece] = []
         s_m = first_m
         # The straight pieces before and beyond are pieces like others; only where they begin and end is not known.
-        before = Segment(0.0, 0.0, 0.0)
-        for segment in (before, *(part for each in segments for part in each.cut()), before):
+        open_end = Segment(0.0, 0.0, 0.0)
+        for segment in (open_end, *(part for each in segments for part in each.split()), open_end):
             length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
             if abs(curvature_per_m) < _STRAIGHT_PER_M:
                 curvature_per_m = 0.0
             rate = (segment.end_curvature_per_m - curvature_per_m) / length_m if length_m else 0.0
             piece = _Piece(s_m, x_m, y_m, heading_rad, curvature_per_m, rate)
             self._pieces.append(piece)
-            ahead_m, left_m = _turned(*piece.reached(length_m), -heading_rad)
+            ahead_m, left_m = _rotate(*piece.displacement(length_m), -heading_rad)
             s_m += length_m
             x_m += ahead_m
             y_m += left_m
             heading_rad += piece.turn_rad(length_m)
         self.last_m = s_m
-        self._begins = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
+        self._begin_stations_m = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
 
     def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Tell x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, any shape."""
         station = np.asarray(s_m, dtype=np.float64)
         table = self._table
-        piece = table[np.searchsorted(np.array(self._begins), station, side="right") - 1]
+        piece = table[np.searchsorted(np.array(self._begin_stations_m), station, side="right") - 1]
         begin_m, x0_m, y0_m, heading0_rad, curvature0, rate = (piece[..., column] for column in range(6))
         along = station - begin_m
         half_turn = curvature0 * along / 2
         chord = along * np.sinc(half_turn / np.pi)
         ahead, left = chord * np.cos(half_turn), chord * np.sin(half_turn)
-        bent = rate != 0.0
-        if bent.any():
+        clothoid = rate != 0.0
+        if clothoid.any():
             inner = along[..., None] * _SHARES_ARRAY
             turn = inner * (curvature0[..., None] + rate[..., None] * inner / 2)
-            ahead = np.where(bent, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
-            left = np.where(bent, np.sin(turn) @ _WEIGHTS / 2 * along, left)
+            ahead = np.where(clothoid, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
+            left = np.where(clothoid, np.sin(turn) @ _WEIGHTS / 2 * along, left)
         cosine, sine = np.cos(heading0_rad), np.sin(heading0_rad)
         return (
             x0_m + ahead * cosine - left * sine,
@@ -137,9 +137,9 @@ class Centreline:
         """
         best = (first_m, math.inf, 0.0, 0.0)
         best_m = math.inf
-        searched = self._searched
-        for index in range(bisect_right(self._begins, first_m) - 1, len(searched)):
-            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = searched[index]
+        search_table = self._search_table
+        for index in range(bisect_right(self._begin_stations_m, first_m) - 1, len(search_table)):
+            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = search_table[index]
             if begin_m > last_m:
                 break
             low_m = (max(first_m, begin_m)) - s_m
@@ -149,8 +149,8 @@ class Centreline:
             turn_rad = 0.0
             if piece is not None:
                 along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
-                reached_m, turn_rad = piece.reached(along_m), piece.turn_rad(along_m)
-                ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                reached_m, turn_rad = piece.displacement(along_m), piece.turn_rad(along_m)
+                ahead_m, left_m = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
                 curvature_per_m += piece.rate_per_m2 * along_m
             elif curvature_per_m == 0.0:
                 along_m = low_m if ahead_m < low_m else min(ahead_m, high_m)
@@ -163,8 +163,9 @@ class Centreline:
                 ahead_m -= turned_sine / curvature_per_m
                 left_m -= (1.0 - turned_cosine) / curvature_per_m
                 ahead_m, left_m = (
-                    ahead_m * turned_cosine + left_m * turned_sine, left_m * turned_cosine - ahead_m * turned_sine
-                )  # fmt: skip
+                    ahead_m * turned_cosine + left_m * turned_sine,
+                    left_m * turned_cosine - ahead_m * turned_sine,
+                )
             distance_m = math.hypot(ahead_m, left_m)
             if distance_m < best_m:
                 best_m = distance_m
@@ -172,14 +173,16 @@ class Centreline:
         return best
 
     @cached_property
-    def _searched(self) -> list[_Searched]:
+    def _search_table(self) -> list[_SearchRow]:
         """For each piece what a projection needs, as plain numbers; the piece itself where it is a clothoid."""
-        found: list[_Searched] = []
-        for begin_m, end_m, each in zip(self._begins, [*self._begins[1:], math.inf], self._pieces, strict=True):
+        rows: list[_SearchRow] = []
+        for begin_m, end_m, each in zip(
+            self._begin_stations_m, [*self._begin_stations_m[1:], math.inf], self._pieces, strict=True
+        ):
             place = (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m)
-            bent = each if each.rate_per_m2 else None
-            found.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), bent))
-        return found
+            clothoid = each if each.rate_per_m2 else None
+            rows.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), clothoid))
+        return rows
 
     @cached_property
     def _table(self) -> FloatArray:
@@ -196,9 +199,9 @@ def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: 
     along_m = (low_m + high_m) / 2
     for _ in range(_FOOT_STEPS):
         # The foot on the circle that fits the clothoid where we are; its error shrinks with the step's cube.
-        reached_m = piece.reached(along_m)
-        beside = _turned(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
-        step_m = _arc_foot_m(*beside, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
+        reached_m = piece.displacement(along_m)
+        offset = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
+        step_m = _arc_foot_m(*offset, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
         before_m, along_m = along_m, min(max(along_m + step_m, low_m), high_m)
         if abs(along_m - before_m) < _FOOT_M:
             break
@@ -215,7 +218,7 @@ def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m:
     return (middle_rad + math.remainder(turn_rad - middle_rad, 2 * math.pi)) / curvature_per_m
 
 
-def _turned(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
+def _rotate(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
     """Give a vector in a frame that is turned to the left by `turn_rad`."""
     cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
     return ahead_m * cosine + left_m * sine, left_m * cosine - ahead_m * sine

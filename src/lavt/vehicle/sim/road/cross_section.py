@@ -88,6 +88,6 @@ class Rail:
 Along = TypeVar("Along", PavedArea, RoadMark, Rail)
 
 
-def moved_start(each: Along, by_m: float) -> Along:
+def shift_stations(each: Along, by_m: float) -> Along:
     """Count stations from a place `by_m` further on."""
     return replace(each, from_m=each.from_m - by_m, to_m=each.to_m - by_m)

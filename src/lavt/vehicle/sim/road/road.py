@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from lavt.domain import FloatArray
 from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Centreline, Segment
-from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, moved_start
+from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, shift_stations
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
@@ -73,16 +73,18 @@ class Road:
         window_m = PROJECTION_WINDOW_M
         return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
 
-    def part(self, title: str, from_m: float, length_m: float) -> Road:
+    def sub_route(self, title: str, from_m: float, length_m: float) -> Road:
         """Give the same road with a route that begins at station `from_m`: nothing on the ground changes."""
         return replace(
             self,
             title=title,
             first_m=self.first_m - from_m,
             length_m=length_m,
-            paved=tuple(moved_start(each, from_m) for each in self.paved),
-            marks=tuple(replace(moved_start(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks),
-            rails=tuple(moved_start(each, from_m) for each in self.rails),
+            paved=tuple(shift_stations(each, from_m) for each in self.paved),
+            marks=tuple(
+                replace(shift_stations(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks
+            ),
+            rails=tuple(shift_stations(each, from_m) for each in self.rails),
         )
 
     @cached_property
@@ -101,7 +103,7 @@ def load_road(name: str) -> Road:
 
     Raises `UserError` where there is none, and for what is wrong in a file.
     """
-    return parse_road(*_text_of(name))
+    return parse_road(*_read_text(name))
 
 
 def parse_road(text: str, source: str) -> Road:
@@ -111,23 +113,25 @@ def parse_road(text: str, source: str) -> Road:
     """
     read = read_road_file(text, source)
     if isinstance(read, RoadFile):
-        return _whole(read)
+        return _make_road(read)
     try:
-        of_file = read_road_file(*_text_of(_beside(source, read.part_of)))
+        whole_file = read_road_file(*_read_text(_resolve_part_of(source, read.part_of)))
     except UserError as error:
         raise UserError(f"{source} is a part of {read.part_of}: {error}") from error
-    if not isinstance(of_file, RoadFile):
+    if not isinstance(whole_file, RoadFile):
         raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole as part_of")
-    whole = _whole(of_file)
-    room_m = whole.last_m - read.from_m
-    if room_m <= 0.0:
+    whole = _make_road(whole_file)
+    available_m = whole.last_m - read.from_m
+    if available_m <= 0.0:
         raise UserError(f"{source}: {read.part_of} ends at {whole.last_m:.1f} m: from_m must be less")
-    if read.length_m > room_m:
-        raise UserError(f"{source}: {read.part_of} has only {room_m:.1f} m from {read.from_m} m on: shorten length_m")
-    return whole.part(read.title, read.from_m, read.length_m)
+    if read.length_m > available_m:
+        raise UserError(
+            f"{source}: {read.part_of} has only {available_m:.1f} m from {read.from_m} m on: shorten length_m"
+        )
+    return whole.sub_route(read.title, read.from_m, read.length_m)
 
 
-def _whole(read: RoadFile) -> Road:
+def _make_road(read: RoadFile) -> Road:
     x_m, y_m, heading_rad = read.start
     run_in_m = read.run_in_m
     return Road(
@@ -143,7 +147,7 @@ def _whole(read: RoadFile) -> Road:
     )
 
 
-def _text_of(name: str) -> tuple[str, str]:
+def _read_text(name: str) -> tuple[str, str]:
     """Read the file of a road; give its text and what to call it."""
     if name in road_names():
         file = resources.files("lavt") / "data" / "roads" / f"{name}.yaml"
@@ -160,5 +164,5 @@ def _text_of(name: str) -> tuple[str, str]:
         raise UserError(f"the road {name} is not a text file: {error}") from error
 
 
-def _beside(source: str, part_of: str) -> str:
+def _resolve_part_of(source: str, part_of: str) -> str:
     return part_of if part_of in road_names() else str(Path(source).parent / part_of)

@@ -131,14 +131,14 @@ class RoadFile(_Keys):
         return self.origin.x_m, self.origin.y_m, self.origin.heading_rad
 
     @property
-    def laid_m(self) -> float:
+    def segments_length_m(self) -> float:
         """Length of all segments together."""
         return sum(each.length_m for each in self.segments)
 
     @property
     def route_m(self) -> float:
         """Length of the route: as far as the segments go, where the file does not say."""
-        return self.laid_m if self.length_m is None else self.length_m
+        return self.segments_length_m if self.length_m is None else self.length_m
 
     @property
     def all_segments(self) -> tuple[Segment, ...]:
@@ -189,7 +189,7 @@ def read_road_file(text: str, source: str) -> RoadFile | PartFile:
     try:
         read = kind.model_validate(data)
     except ValidationError as error:
-        problems = "; ".join(_sentence(kind, problem) for problem in error.errors())
+        problems = "; ".join(_describe_error(kind, problem) for problem in error.errors())
         raise UserError(f"{source} is not a road: {problems}") from error
     if isinstance(read, RoadFile):
         for problem in _problems(read):
@@ -205,25 +205,26 @@ def _problems(road: RoadFile) -> Iterable[str]:
         return
     if road.paved is not None and road.shoulders is not None:
         yield "paved says where all asphalt is, so leave out shoulders"
+    begin_m, end_m = -road.run_in_m, road.segments_length_m + road.run_out_m
     for name, each in _ranges(road):
         if each.from_m >= each.to_m:
             yield f"{name} goes from {each.from_m} m to {each.to_m} m: from_m must be less than to_m"
-        if each.to_m <= -road.run_in_m or each.from_m >= road.laid_m + road.run_out_m:
-            yield f"{name} is not on the road, which lies from {-road.run_in_m} m to {road.laid_m + road.run_out_m} m"
+        if each.to_m <= begin_m or each.from_m >= end_m:
+            yield f"{name} is not on the road, which lies from {begin_m} m to {end_m} m"
     for index, rail in enumerate(road.rails):
         if abs(rail.offset_m) <= lanes.widths_m[lanes.driven] / 2:
             yield f"rails.{index} stands in the driven lane, at {rail.offset_m} m: move it out"
     for strip in road.all_paved:
         if strip.left_m <= strip.right_m:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
-    if road.laid_m > 20_000:
-        yield f"the segments are {road.laid_m:.0f} m long: 20 km are enough"
+    if road.segments_length_m > 20_000:
+        yield f"the segments are {road.segments_length_m:.0f} m long: 20 km are enough"
     elif road.route_m < SHORTEST_M:
-        yield f"the segments are only {road.laid_m:g} m long: a route has at least {SHORTEST_M:g} m"
-    elif road.route_m > road.laid_m:
-        yield f"length_m is {road.route_m}, but the segments are only {road.laid_m:.3f} m long: add to them"
-    yield from _too_tight(road)
-    yield from _not_paved(road)
+        yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {SHORTEST_M:g} m"
+    elif road.route_m > road.segments_length_m:
+        yield f"length_m is {road.route_m}, but the segments are only {road.segments_length_m:.3f} m long: add to them"
+    yield from _find_tight_curves(road)
+    yield from _find_unpaved(road)
 
 
 def _ranges(road: RoadFile) -> Iterable[tuple[str, _Along]]:
@@ -232,7 +233,7 @@ def _ranges(road: RoadFile) -> Iterable[tuple[str, _Along]]:
             yield f"{name}.{index}", along
 
 
-def _too_tight(road: RoadFile) -> Iterable[str]:
+def _find_tight_curves(road: RoadFile) -> Iterable[str]:
     """In a curve, what lies inside must not reach the circle's middle."""
     offsets = [
         *road.lanes.edges_m,
@@ -241,18 +242,18 @@ def _too_tight(road: RoadFile) -> Iterable[str]:
     ]
     offsets += [edge for strip in road.all_paved for edge in (strip.left_m, strip.right_m)]
     for index, segment in enumerate(road.segments):
-        laid = segment.segment()
-        for curvature in (laid.curvature_per_m, laid.end_curvature_per_m):
-            inside = max(offset * curvature for offset in offsets)
-            if inside > 1.0 - INNER_SHARE:
+        placed = segment.segment()
+        for curvature in (placed.curvature_per_m, placed.end_curvature_per_m):
+            reach = max(offset * curvature for offset in offsets)
+            if reach > 1.0 - INNER_SHARE:
                 yield (
                     f"segments.{index} has a radius of {abs(1 / curvature):.1f} m, but the road reaches "
-                    f"{abs(inside / curvature):.1f} m to the inside of the curve: make one wider or the other narrower"
+                    f"{abs(reach / curvature):.1f} m to the inside of the curve: make one wider or the other narrower"
                 )
                 return
 
 
-def _not_paved(road: RoadFile) -> Iterable[str]:
+def _find_unpaved(road: RoadFile) -> Iterable[str]:
     """The driven lane must lie on asphalt all along the route."""
     half_m = road.lanes.widths_m[road.lanes.driven] / 2
     strips = road.all_paved
@@ -267,23 +268,23 @@ def _not_paved(road: RoadFile) -> Iterable[str]:
             return
 
 
-def _sentence(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
+def _describe_error(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
     """Say in words what is wrong with one value."""
     location = [str(part)[:60] for part in problem["loc"]]
     where = ".".join(location)
     if problem["type"] == "extra_forbidden":
-        known = _known(kind, problem["loc"][:-1])
+        known = _known_keys(kind, problem["loc"][:-1])
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(sorted(known))}"
         return f"unknown key {where!r}: {hint}"
     if problem["type"] == "missing":
         return f"{where!r} is missing: give it"
     if problem["type"] == "model_type":
-        return f"{where!r} must hold keys and values, not {_shown(problem['input'])}"
-    return f"{where!r}: {problem['msg']}, not {_shown(problem['input'])}"
+        return f"{where!r} must hold keys and values, not {_format_value(problem['input'])}"
+    return f"{where!r}: {problem['msg']}, not {_format_value(problem['input'])}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """Show a value, or of what kind it is: lists may be made of themselves, and numbers have thousands of digits."""
     if not isinstance(value, str | int | float | None) or (isinstance(value, int) and value.bit_length() > 64):
         return f"this {type(value).__name__}"
@@ -291,7 +292,7 @@ def _shown(value: Any) -> str:
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
-_INNER: dict[str, type[BaseModel]] = {
+_SECTION_MODELS: dict[str, type[BaseModel]] = {
     "origin": _OriginKeys,
     "segments": _SegmentKeys,
     "lanes": _LaneKeys,
@@ -302,6 +303,6 @@ _INNER: dict[str, type[BaseModel]] = {
 }
 
 
-def _known(kind: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    inner = _INNER[location[0]] if location else kind
+def _known_keys(kind: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
+    inner = _SECTION_MODELS[location[0]] if location else kind
     return [field.alias or name for name, field in inner.model_fields.items()]

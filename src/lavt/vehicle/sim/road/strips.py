@@ -48,9 +48,9 @@ class Strips:
     def fill(self, mask: Grey, square: Square, value: int) -> bool:
         """Paint `value` into the mask of a square wherever these are; tell whether any was near."""
         boxes = self.boxes_m
-        touch = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
-        touch &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
-        near = self.corners_m[touch]
+        overlapping = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
+        overlapping &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
+        near = self.corners_m[overlapping]
         corners_px = (near - np.array([square.left_m, square.low_m])) / square.scale_m - 0.5
         for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
             cv2.fillConvexPoly(mask, polygon, (value,), lineType=cv2.LINE_AA, shift=_SUBPIXEL_BITS)
@@ -62,24 +62,24 @@ class Strips:
         return mask if self.fill(mask, square, 255) and mask.any() else None
 
 
-def strips(corners_m: FloatArray) -> Strips:
+def make_strips(corners_m: FloatArray) -> Strips:
     """Make strips of corners (n, 4, 2)."""
     return Strips(corners_m, np.concatenate([corners_m.min(axis=1), corners_m.max(axis=1)], axis=1))
 
 
-def join(found: Sequence[Strips]) -> Strips:
+def join_strips(found: Sequence[Strips]) -> Strips:
     """Put strips together."""
-    return strips(np.concatenate([np.empty((0, 4, 2)), *(each.corners_m for each in found)]))
+    return make_strips(np.concatenate([np.empty((0, 4, 2)), *(each.corners_m for each in found)]))
 
 
-def along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
+def strip_along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
     """Lay a strip along the road between two lateral offsets, cut into short pieces."""
     first_m, last_m = max(from_m, road.first_m), min(to_m, road.last_m)
     cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / PIECE_M) + 1))
-    return pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
+    return strip_pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
 
 
-def pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
+def strip_pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
     """Quadrilaterals between stations `begin_m` and `end_m` (n,) and two lateral offsets."""
     ends = [(begin_m, left_m), (begin_m, right_m), (end_m, right_m), (end_m, left_m)]
-    return strips(np.stack([road.across(station, offset) for station, offset in ends], axis=1))
+    return make_strips(np.stack([road.across(station, offset) for station, offset in ends], axis=1))

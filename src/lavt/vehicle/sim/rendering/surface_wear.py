@@ -12,7 +12,7 @@ import numpy as np
 from lavt.domain import FloatArray
 from lavt.streams import stream
 from lavt.vehicle.sim.road.road import Road
-from lavt.vehicle.sim.road.strips import Strips, along, join, pieces, strips
+from lavt.vehicle.sim.road.strips import Strips, join_strips, make_strips, strip_along, strip_pieces
 
 _WORLD_SEED = 0
 _REPAIR_EVERY_M = 16.0
@@ -26,22 +26,22 @@ _PAVER_M = 3.5
 class SurfaceWear:
     """Strips of one kind, how wide they are (m), and how many grey levels the asphalt is darker there."""
 
-    places: Strips
+    strips: Strips
     width_m: float
     grey: int
 
 
-def damages(road: Road) -> list[SurfaceWear]:
+def surface_wear(road: Road) -> list[SurfaceWear]:
     """All of one road, in the order of painting."""
     repairs, edges = _repairs(road)
     seams = [
-        along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
+        strip_along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
         for strip in road.paved
         for offset_m in np.arange(strip.right_m + _PAVER_M, strip.left_m - 1.0, _PAVER_M)
     ]
     return [
-        *(SurfaceWear(join(found), 2.0, grey) for grey, found in repairs.items()),
-        SurfaceWear(join(seams), _SEAM_M, 12),
+        *(SurfaceWear(join_strips(found), 2.0, grey) for grey, found in repairs.items()),
+        SurfaceWear(join_strips(seams), _SEAM_M, 12),
         SurfaceWear(edges, 0.05, 30),
         SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
         SurfaceWear(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
@@ -61,11 +61,13 @@ def _repairs(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
         end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
         right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
         left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
-        found[sorted(found)[int(random.integers(len(found)))]].append(along(road, left_m, right_m, begin_m, end_m))
-        edges += [along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]
+        found[sorted(found)[int(random.integers(len(found)))]].append(
+            strip_along(road, left_m, right_m, begin_m, end_m)
+        )
+        edges += [strip_along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]
         cuts = np.array([begin_m, end_m])
-        edges.append(pieces(road, left_m, right_m, cuts - 0.025, cuts + 0.025))
-    return found, join(edges)
+        edges.append(strip_pieces(road, left_m, right_m, cuts - 0.025, cuts + 0.025))
+    return found, join_strips(edges)
 
 
 def _cracks(road: Road, name: str, width_m: float) -> Strips:
@@ -85,7 +87,7 @@ def _cracks(road: Road, name: str, width_m: float) -> Strips:
         inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
         if inside.sum() > 2:
             found.append(_line(road.across(station[inside], offset[inside]), width_m))
-    return join(found)
+    return join_strips(found)
 
 
 def _line(points_m: FloatArray, width_m: float) -> Strips:
@@ -93,4 +95,4 @@ def _line(points_m: FloatArray, width_m: float) -> Strips:
     begin, end = points_m[:-1], points_m[1:]
     step = end - begin
     side = np.column_stack([-step[:, 1], step[:, 0]]) * (width_m / 2 / np.hypot(step[:, :1], step[:, 1:]))
-    return strips(np.stack([begin + side, begin - side, end - side, end + side], axis=1))
+    return make_strips(np.stack([begin + side, begin - side, end - side, end + side], axis=1))
