@@ -1,4 +1,4 @@
-"""A real camera: a V4L2 device, or a file or an address that OpenCV opens, read by a thread of its own."""
+"""A real camera: a V4L2 device, or a file or address that OpenCV opens, read in a thread of its own."""
 
 from __future__ import annotations
 
@@ -24,22 +24,24 @@ from lavt.vehicle.camera import CapturedFrame
 log = logging.getLogger(__name__)
 
 RETRY_S: Final = 1.0
-"""A camera that gives nothing is opened again so often."""
+"""The interval at which a camera without pictures is reopened."""
 MAX_CREDIBLE_RATE_HZ: Final = 1000.0
-"""Streams without a rate of their own name that of their time stamps (90 kHz), which is none of pictures."""
+"""Streams without a frame rate report that of their timestamps (90 kHz), which is ignored."""
 RATE_TOLERANCE: Final = 0.01
-"""30 and 29.97 Hz are one rate."""
+"""Relative: 30 and 29.97 Hz count as equal."""
 MAX_BUFFER_AGE_NS: Final = NS_PER_S
-"""A buffer's time that lies longer ago is of another clock: V4L2 drivers hold a few pictures at most."""
+"""An older buffer time is from another clock, because V4L2 drivers queue a few pictures at most."""
 WAIT_PERIODS: Final = 0.25
-"""So long a picture is waited for: a camera runs by a clock of its own, and where its pictures come just when they are
-asked for, many would be missed by a hair. They may be late by more than they vary, and one is missed only when the
-clocks have drifted apart by a period."""
+"""How long `capture` waits for a picture.
+
+A camera has a clock of its own. Where pictures arrive just when they are requested, jitter would make `capture` miss
+many of them. The wait exceeds the jitter, so a picture is missed only when the clocks have drifted apart by a period.
+"""
 MAX_AGE_PERIODS: Final = 2
-"""With equal rates a picture waits for one period at most; one that waited for two is of a camera that has stopped."""
+"""With equal rates a picture waits one period at most; after two periods the camera has stopped."""
 COUNTER_NAMES: Final = (
     "pictures_read",
-    "pictures_replaced",  # by a newer one, before anybody asked
+    "pictures_replaced",  # by a newer one, before a request
     "pictures_too_old",
     "pictures_without_a_time",
     "pictures_of_another_size",
@@ -50,20 +52,20 @@ COUNTER_NAMES: Final = (
 CLOSE_TIMEOUT_S: Final = 2.0
 _TIMEOUT_MS: Final = 3000
 
-# A camera that is gone is said here once, in words, and not by OpenCV at each attempt.
+# This module logs a lost camera once; without this OpenCV would print a message at each attempt.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 @value
 class DeviceFormat:
-    """What a device gives: its pictures' size, and their rate as it says itself; None where it does not."""
+    """The size of a device's pictures, and the rate it reports; None if it reports none."""
 
     width_px: int
     height_px: int
     rate_hz: float | None
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Return the size and rate as text."""
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.4g} Hz"
         return f"{self.width_px}x{self.height_px}{rate}"
 
@@ -76,12 +78,12 @@ class _BufferedPicture:
 
 
 class VideoDevice:
-    """A `Camera` that gives the newest picture that came since the last one it gave.
+    """A `Camera` that returns the newest picture received since its last frame.
 
-    `device` is a V4L2 device (its path or its number), or a file or address that OpenCV opens (FFmpeg): a file is
-    played at its own pace, over and over. `pixel_format` is V4L2's name of a format (four characters, such as MJPG);
-    empty: the driver's choice. Raises `UserError` for what cannot be opened, or gives pictures of another size or rate
-    than asked. What vanishes later is tried again each second; meanwhile there are no pictures.
+    `device` is a V4L2 device (its path or number), or a file or address that OpenCV opens with FFmpeg. A file is played
+    at its own rate in a loop. `pixel_format` is V4L2's name of a format (four characters, such as MJPG); if it is empty
+    the driver chooses. A `UserError` is raised if the device cannot be opened or has another size or rate than
+    requested. If the device disappears later, it is reopened each second; meanwhile there are no pictures.
     """
 
     phase_ns = 0
@@ -105,18 +107,18 @@ class VideoDevice:
         self._store(capture, picture)
         self._thread = threading.Thread(target=self._run, args=(capture,), name="camera device", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # nothing else closes a camera: it shall be free when the program has ended
+        atexit.register(self.close)  # nothing else releases the device when the program ends
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What became of the pictures, and how often the device was lost and tried again."""
+        """The number of pictures by outcome, and how often the device was lost, came back and was reopened."""
         with self._changed:
             return dict(self._counts)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:  # noqa: ARG002 (Camera's)
-        """Give the newest picture that was not given before, waiting a little for one; None when there is none.
+        """Return the newest picture not returned before, after a short wait if there is none yet.
 
-        Nor is there one when the newest has waited for too long.
+        None without a picture, or when the newest picture is too old.
         """
         with self._changed:
             self._changed.wait_for(self._has_picture, WAIT_PERIODS / self.rate_hz)
@@ -129,12 +131,12 @@ class VideoDevice:
             return CapturedFrame(number, newest.capture_ns, newest.picture)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until there is a picture to give; whether there is one."""
+        """Wait until a picture is available and return whether one is."""
         with self._changed:
             return self._changed.wait_for(self._has_picture, timeout_s)
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Stop the thread, which releases the device."""
         atexit.unregister(self.close)
         self._stopped.set()
         self._thread.join(CLOSE_TIMEOUT_S)
@@ -143,15 +145,15 @@ class VideoDevice:
         return self._newest is not None
 
     def _first_picture(self) -> tuple[cv2.VideoCapture, Picture]:
-        """Open the device and read one picture, which must be as asked."""
+        """Open the device and read one picture; raise `UserError` unless it has the requested format."""
         capture = self._open()
         picture = _read_picture(capture)
         if picture is None:
             raise UserError(_no_picture_message(self._device, is_open=capture.isOpened()))
         if self._pixel_format and round(capture.get(cv2.CAP_PROP_FOURCC)) != _fourcc(self._pixel_format):
             raise UserError(
-                f"{self._device} gives no pictures in the format {self._pixel_format}: choose another camera.format "
-                "(`v4l2-ctl --list-formats-ext` names them), or none"
+                f"{self._device} has no pictures in the format {self._pixel_format}: choose another camera.format "
+                "(`v4l2-ctl --list-formats-ext` lists them), or none"
             )
         reported_hz = capture.get(cv2.CAP_PROP_FPS)
         reported = DeviceFormat(
@@ -161,16 +163,16 @@ class VideoDevice:
         if not _matches_request(reported, self.model, self.rate_hz):
             capture.release()
             raise UserError(
-                f"{self._device} gives {reported}, but camera asks for {requested}: set camera.width_px, height_px and "
-                "rate_hz to what it gives, or camera.format to one in which it gives that"
+                f"{self._device} has {reported}, but camera requests {requested}: set camera.width_px, height_px and "
+                "rate_hz to the device's values, or camera.format to a format that has the requested ones"
             )
         return capture, picture
 
     def _open(self) -> cv2.VideoCapture:
-        """Open the device, or what cannot be read from if it is not there."""
+        """Open the device; without a device the result cannot be read from."""
         if not self._is_v4l2:
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
-            one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further one of FFmpeg's is a picture of delay
+            one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further FFmpeg thread adds a frame of delay
             return cv2.VideoCapture(self._device, cv2.CAP_FFMPEG, [*limits, *one_thread])
         capture = cv2.VideoCapture(self._device, cv2.CAP_V4L2)
         if capture.isOpened():
@@ -182,7 +184,7 @@ class VideoDevice:
         return capture
 
     def _run(self, capture: cv2.VideoCapture) -> None:
-        """Read until told to stop; open again what has ended: a file at once, anything else after a while."""
+        """Read until closed; when the source ends, reopen a file at once and anything else after `RETRY_S`."""
         while True:
             pictures = self._read_until_end(capture)
             capture.release()
@@ -196,7 +198,7 @@ class VideoDevice:
                 self._counts["times_opened_again"] += 1
 
     def _read_until_end(self, capture: cv2.VideoCapture) -> int:
-        """Read pictures until there are no more, or until told to stop, and tell how many there were."""
+        """Read pictures until the source ends or the camera is closed; return how many there were."""
         pictures = 0
         while not self._stopped.wait(self._wait_s()):
             picture = _read_picture(capture)
@@ -207,12 +209,12 @@ class VideoDevice:
         return pictures
 
     def _wait_s(self) -> float:
-        """How long the next picture of a file is not due; a device's comes by itself."""
+        """Return how long until the next picture of a file is due; 0 for a device, whose read blocks."""
         return max(0.0, (self._due_ns - self._clock.now().mono_ns) / NS_PER_S) if self._is_file else 0.0
 
     def _store(self, capture: cv2.VideoCapture, picture: Picture) -> None:
         arrived_ns = self._clock.now().mono_ns
-        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # what is late is not caught up
+        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # delays are not caught up
         capture_ns = buffer_time_ns(capture.get(cv2.CAP_PROP_POS_MSEC), arrived_ns) if self._is_v4l2 else None
         with self._changed:
             if picture.shape != (self.model.height_px, self.model.width_px, 3):
@@ -226,21 +228,21 @@ class VideoDevice:
             self._counts["times_back"] += is_back
             self._changed.notify_all()
         if is_back:
-            log.warning("the camera %s gives pictures again", self._device)
+            log.warning("camera %s: pictures received again", self._device)
 
     def _mark_lost(self) -> None:
         with self._changed:
             is_new = self._counts["times_lost"] == self._counts["times_back"]
             self._counts["times_lost"] += is_new
         if is_new:
-            log.warning("the camera %s gives no pictures any more: it is opened again each second", self._device)
+            log.warning("camera %s: no more pictures; reopening it every %g s", self._device, RETRY_S)
 
 
 def buffer_time_ns(position_ms: float, arrived_ns: int) -> int | None:
-    """Give a V4L2 buffer's time, which OpenCV tells as the position; None where it is not of the monotonic clock.
+    """Return a V4L2 buffer's time, which OpenCV reports as the position; None if it is not of the monotonic clock.
 
-    A buffer's time is of the clock its driver likes, and OpenCV does not tell which: it counts where it lies in the
-    second before the picture came. Linux, Documentation/userspace-api/media/v4l/buffer.rst.
+    The driver chooses the clock of a buffer's time, and OpenCV does not report it. The time is therefore accepted only
+    within the second before the picture arrived. See Linux, Documentation/userspace-api/media/v4l/buffer.rst.
     """
     if not math.isfinite(position_ms):
         return None
@@ -253,24 +255,24 @@ def _fourcc(pixel_format: str) -> int:
 
 
 def _read_picture(capture: cv2.VideoCapture) -> Picture | None:
-    """Read one picture; None where there is none, or it is not in three bytes a pixel."""
+    """Read one picture; None if there is none or it does not have three bytes per pixel."""
     try:
         good, picture = capture.read()
-    except cv2.error:  # of a picture that cannot be decoded, on some devices
+    except cv2.error:  # raised by some devices for a picture that cannot be decoded
         return None
     return cast("Picture", picture) if good and picture.ndim == 3 and picture.dtype == np.uint8 else None
 
 
 def _matches_request(reported: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
-    """Whether a device gives what it was asked for; a rate that it does not tell is not held against it."""
+    """Return whether a device has the requested size and rate; an unreported rate is accepted."""
     is_of_size = (reported.width_px, reported.height_px) == (model.width_px, model.height_px)
     return is_of_size and (reported.rate_hz is None or math.isclose(reported.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))
 
 
 def _no_picture_message(device: str, *, is_open: bool) -> str:
     if is_open:
-        return f"{device} opens, but no picture comes of it: see that no other program has it, and that it is a camera"
+        return f"{device} opens, but has no pictures: check that no other program uses it and that it is a camera"
     return (
-        f"{device} cannot be opened as a camera: see that it is there (`ls -l /dev/v4l/by-id`), and that this user may "
+        f"{device} cannot be opened as a camera: check that it exists (`ls -l /dev/v4l/by-id`) and that this user may "
         "read it (group video)"
     )

@@ -1,4 +1,7 @@
-"""Where a car is on its road, and what happens to it there: lanes left, rails hit, road left, route done, time over."""
+"""The route monitor: tracks a car on its road and reports lane invasions, collisions, leaving the road and completion.
+
+It also reports when the time limit is exceeded.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +19,24 @@ from lavt.vehicle.sim.road.road import PROJECTION_WINDOW_M, Road
 REFERENCE_SPEED_MPS = 30.0 / 3.6
 TIMEOUT_SLOWNESS = 3.0
 TIMEOUT_ALLOWANCE_S = 30.0
-"""A drive may take as long as the route takes at a third of 30 km/h, and this much more."""
+"""The default time limit is the route's time at a third of 30 km/h plus this allowance."""
 
 MOVING_MPS = 0.1
-"""The time of a drive counts from when the car is first faster than this."""
+"""A drive's time counts from the moment the car first exceeds this speed."""
 
 CONTACT_GAP_NS = NS_PER_S // 2
-"""A car that has been clear of all rails for so long and touches one again has another collision."""
+"""A contact later than this after the last one is another collision."""
 
 MAX_UNCHECKED_M = PROJECTION_WINDOW_M / 3
-"""So far a body may move before it is looked at again: projections look around the station that was seen last."""
+"""The farthest the body may move between checks, because projections search around the last known station."""
 
 RoadPosition = tuple[float, float, float]
-"""Station (m), lateral offset (m) and the road's heading (rad) of a point of the body."""
+"""Station (m) and lateral offset (m) of a point of the body, and the road's heading (rad) there."""
 
 
 @value
 class TrackingError:
-    """A car against the centre of its lane; see `GroundTruth` for what is measured where."""
+    """A car's pose relative to its lane's centre; `GroundTruth` defines where each value is measured."""
 
     cross_track_m: float
     heading_error_rad: float
@@ -41,12 +44,12 @@ class TrackingError:
 
 
 def time_limit_s(length_m: float) -> float:
-    """Time that a drive of a route may take where nobody says otherwise."""
+    """Return the default time limit for a route of this length."""
     return length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
 
 
 class RouteMonitor:
-    """Judges one drive; each ending happens once, lanes are left and rails are touched as often as they are."""
+    """A monitor of one drive: it reports timeout, leaving the road and completion once, other events each time."""
 
     def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
         self._road = road
@@ -63,16 +66,16 @@ class RouteMonitor:
         self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
         self._quiet = _QuietInterval(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
-        """Where the body touches a rail at the moment judged last."""
+        """Where the body touched a rail at the last update."""
 
     def track(self, motion: CarMotion) -> TrackingError:
-        """Measure the rear axle against the centre of the lane."""
+        """Return the rear axle's position and heading relative to the lane's centre."""
         s_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         return TrackingError(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
 
     def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
-        """Tell what has happened since the last call; call it at every step."""
-        # In a rail it is looked at every time: the contact may deepen or end, and lasts while the car stands in it.
+        """Return the events since the last call; it must be called at every step."""
+        # In contact with a rail, check every step: the contact may deepen or end, and lasts while the car stays in it.
         is_quiet = not self.contacts and self._quiet.covers(motion)
         events = [] if is_quiet else self._check_body(motion, at_ns)
         if self._began_ns is None:
@@ -83,7 +86,7 @@ class RouteMonitor:
         return events
 
     def _check_body(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
-        """Find out where the whole body is, and what that means."""
+        """Project the whole body onto the road and return the events that follow."""
         progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         self._near_s_m = progress_m
         *corners, middle = self._project_points(motion, (*self._corners, self._middle))
@@ -110,7 +113,7 @@ class RouteMonitor:
         return [VehicleEvent(at_ns, kind, detail)]
 
     def _project_points(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[RoadPosition]:
-        """Places of points of the body that are given ahead and to the left of the rear axle."""
+        """Return the road positions of body points, which are given ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
         project, near_s_m = self._road.project, self._near_s_m
         return [
@@ -119,7 +122,7 @@ class RouteMonitor:
         ]
 
     def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
-        """Make an event for each edge of the body that is in another lane than before; lanes count from the right.
+        """Return an event for each edge of the body that has changed lanes; lanes count from the right.
 
         An edge that is exactly on a line is still in the body's lane.
         """
@@ -135,18 +138,18 @@ class RouteMonitor:
         ]
 
     def _find_contacts(self, corners: Sequence[RoadPosition]) -> tuple[tuple[Contact, ...], Rail | None]:
-        """Find the corners that are in a rail, and the rail; a body that is wholly behind a rail does not touch it."""
+        """Return the corners inside a rail and that rail; a body entirely behind a rail does not touch it."""
         found, touched_rail = [], None
         highest_m, lowest_m = max([each[1] for each in corners]), min([each[1] for each in corners])
         for rail, side in self._rails:
             if (highest_m < rail.offset_m) if side > 0.0 else (lowest_m > rail.offset_m):
-                continue  # before the rail with every corner, as nearly always
+                continue  # the common case: all corners are clear of the rail
             depths_m = [side * (lateral_m - rail.offset_m) for _, lateral_m, _ in corners]
             if min(depths_m) >= 0.0:
                 continue
             for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
                 if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
-                    # Out is the shortest way: across, or along, for a car that has run against an end of the rail.
+                    # The way out is the shortest: across, or along the road for a car that hit an end of the rail.
                     ways = (
                         (depth_m, heading_rad - side * math.pi / 2),
                         (s_m - rail.from_m, heading_rad + math.pi),
@@ -165,13 +168,13 @@ class RouteMonitor:
 
 
 class _QuietInterval:
-    """Knows for how far nothing can happen: until a point of the body may have reached the nearest line that counts.
+    """The margin the body may move before an event is possible: until it may have reached the nearest boundary.
 
-    Lines that count are edges of lanes and of asphalt, rails, the stations where these begin and end, and the end of
-    the route. A point's station changes by no more than the point moves over `_slowest`: on the inside of a curve
-    stations are closer together than metres. Its lateral offset changes by how far it moves across the road as that
-    runs where it was looked at, and by how far the road may have bent away from there. While the body is between the
-    rails, it does not matter where these begin and end.
+    Boundaries are the edges of lanes and asphalt, the rails, the stations where asphalt and rails begin and end, and
+    the end of the route. When a point moves by d, its station changes by at most d / `_station_scale`: on the inside of
+    a curve stations are closer together than metres. Its lateral offset changes by its movement across the road's
+    direction at the last check, plus the distance by which the road may have bent away since. While the body is between
+    the rails, their ends do not matter.
     """
 
     def __init__(self, road: Road, reach_m: float) -> None:
@@ -196,9 +199,9 @@ class _QuietInterval:
         self._across_margin_m = self._along_margin_m = 0.0
 
     def restart(self, motion: CarMotion, positions: Sequence[RoadPosition]) -> None:
-        """Note where the body was looked at, the rear axle first, and how far it is from what counts."""
+        """Store a checked pose and its distance from the boundaries; the first position is the rear axle's."""
         if self._station_scale <= 0.0:
-            return  # a road for which this reckoning does not hold is looked at every time
+            return  # the bound does not hold on this road: check every step
         self._reference_pose = (motion.x_m, motion.y_m, motion.heading_rad)
         road_rad = positions[0][2]
         self._across_direction = (-math.sin(road_rad), math.cos(road_rad))
@@ -212,7 +215,7 @@ class _QuietInterval:
         self._along_margin_m = min(along_m * self._station_scale, MAX_UNCHECKED_M)
 
     def covers(self, motion: CarMotion) -> bool:
-        """Whether no point of the body can have reached a line since it was looked at."""
+        """Return whether no point of the body can have reached a boundary since the last check."""
         x_m, y_m, heading_rad = self._reference_pose
         dx_m, dy_m = motion.x_m - x_m, motion.y_m - y_m
         moved_m = math.hypot(dx_m, dy_m)
@@ -229,7 +232,7 @@ class _QuietInterval:
 
 
 def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
-    """Distance from a coordinate to the nearest of sorted lines."""
+    """Return the distance from a coordinate to the nearest of sorted lines."""
     index = bisect_left(lines_m, at_m)
     above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
     below_m = at_m - lines_m[index - 1] if index else math.inf
