@@ -1,4 +1,4 @@
-"""One picture of a road: from above, to scale, and from the driver's seat."""
+"""A figure of a road: a plan to scale, and views from the driver's seat."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lavt.vehicle.sim.road.cross_section import Along, PavedArea, Rail, RoadMark
 from lavt.vehicle.sim.road.road import Road
 
 VIEWS = 4
-"""From the driver's seat: at the start, at the end, and evenly between."""
+"""The number of views from the driver's seat: at the start, at the end, and evenly spaced between."""
 
 DETAIL_M = 40.0
-"""How much of the road the detail shows: enough to see single marks."""
+"""The length of road in the detail plot, which shows single marks."""
 
 _STEP_M = 1.0
 _STATION_STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
@@ -28,11 +28,11 @@ _ASPHALT, _LANE, _GRASS = "#8d9096", "#7f9fc4", "#dfe8d5"
 _PAINT = {"white": "#ffffff", "yellow": "#f2c14e"}
 _RAILS = {"rail": "#b5541c", "barrier": "#222222"}
 _FROM_ABOVE_PT = 0.3
-"""Thinnest line: from far above, marks are thinner than paper shows."""
+"""The line width of marks in the plan, where they are too thin to draw to scale."""
 
 
 def draw_road(road: Road, *, model: CameraModel, scenery: SceneryKind = "full") -> Figure:
-    """Draw `road` from above, whole and in detail at its start, its curvature, and views of the camera `model`."""
+    """Draw a plan of `road`, a detail of its start, its curvature, and views of the camera `model`."""
     figure = Figure(figsize=(14.0, 11.5), dpi=110, layout="constrained")
     figure.suptitle(f"{road.title}: {road.length_m:.1f} m", fontsize=14, fontweight="bold")
     rows = figure.add_gridspec(3, VIEWS, height_ratios=[3.4, 0.8, 1.6])
@@ -71,7 +71,7 @@ def _draw_whole(axes: Axes, road: Road) -> None:
 
 
 def _draw_detail(axes: Axes, road: Road) -> None:
-    """Show the first metres upright, as the driver goes: along upwards, left to the left."""
+    """Draw the first metres with stations upwards and left offsets on the left."""
     last_m = min(DETAIL_M, road.length_m)
     for strip in _overlapping(road.paved, 0.0, last_m):
         axes.fill_between(
@@ -114,9 +114,8 @@ def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     for strip in _overlapping(road.paved, first_m, last_m):
         _fill(axes, road, strip, (_first_station(strip, first_m), _last_station(strip, last_m)), _ASPHALT)
     _fill(axes, road, PavedArea(half_m, -half_m), (0.0, road.length_m), _LANE)
-    axes.plot(
-        *road.across(_sample_stations(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0
-    )  # seen from any height
+    # A line of fixed width, which stays visible at any scale.
+    axes.plot(*road.across(_sample_stations(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)
     for colour, paint in _PAINT.items():
         lines = [
             road.across(_sample_stations(*piece), mark.offset_m)

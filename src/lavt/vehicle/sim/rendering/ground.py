@@ -1,6 +1,6 @@
-"""The ground seen from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
+"""The ground from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
 
-A tile is a function of its place alone, so that what the camera sees does not depend on where the car has been.
+A tile depends on its position alone, so pictures do not depend on the car's history.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from lavt.vehicle.sim.road.strips import (
 )
 
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
-"""Edge of a tile at each scale."""
+"""The length of a tile's edge at each scale."""
 
 _MAX_TILES = (40, 60, 160, 400, 400)
-"""The two finest scales are painted on the way, a few tiles at a time; the others are kept for a whole road."""
+"""Cache sizes. The two finest scales are painted during the drive, a few tiles at a time; the others fit a road."""
 _GRAVEL_M = 1.6
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}
 _TRACK_PROFILE = ((1.1, 4), (0.8, 8), (0.5, 12))
-"""Wheel tracks are darker than the rest of a lane: width (m) and by how many grey levels, widest first."""
+"""Wheel tracks, which are darker than the rest of a lane: width (m) and grey levels, widest first."""
 _OIL = (0.7, 6)
-"""The middle of a lane is, too."""
+"""The darker middle of a lane: width (m) and grey levels."""
 
 
 class Ground:
-    """Tiles of one road in one light, painted when they are first asked for."""
+    """The tiles of one road in one light, painted on first use."""
 
     def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        # Factors in 255ths: a surface in the sun, and which share of that is gone in the deepest shadow.
+        # Factors in 255ths: of a surface in the sun, and the share of it that is lost in full shadow.
         self._lit = _bytes(np.array(light.lit))
         self._dimmed = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
@@ -67,10 +67,10 @@ class Ground:
         self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _mark_styles(road)]
 
     def assemble(self, level: int, low: tuple[int, int], count: int) -> Picture:
-        """Paint `count` x `count` tiles from the tile index `low` (x, y) on, with a fourth channel that says nothing.
+        """Return a picture of `count` x `count` tiles from the tile index `low` (x, y), with an unused fourth channel.
 
-        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. Four bytes a
-        texel, because OpenCV warps them in less than half the time of three.
+        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. OpenCV warps
+        four bytes per texel in less than half the time of three.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
         assemble = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
@@ -82,11 +82,11 @@ class Ground:
         return assemble
 
     def has_room(self, level: int) -> bool:
-        """Whether one more tile of a scale can be kept without giving up another."""
+        """Return whether one more tile of a scale fits the cache without evicting another."""
         return len(self._tiles[level]) < _MAX_TILES[level]
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Give one tile, painted now if it is not there."""
+        """Return one tile, painting it unless it is cached."""
         tiles = self._tiles[level]
         tile = tiles.get((column, row))
         if tile is None:
@@ -126,7 +126,7 @@ class Ground:
         for strips, grey in self._tracks:
             strips.fill(darker, square, grey)
         for wear in self._wear:
-            # What is thinner than a texel is still drawn about one texel wide: let as much of the road through.
+            # Strips thinner than a texel are still drawn about one texel wide: reduce their strength accordingly.
             grey = round(wear.grey * min(1.0, wear.width_m / scale_m))
             if grey:
                 wear.strips.fill(darker, square, grey)
@@ -150,20 +150,20 @@ def _bytes(factors: FloatArray) -> tuple[int, ...]:
 
 
 def _multiply_colour(picture: MatLike, colour: tuple[int, ...]) -> Picture:
-    """Multiply every texel by a colour, in 255ths."""
+    """Multiply every texel by a colour in 255ths."""
     return np.asarray(cv2.multiply(picture, _uniform_picture(picture.shape[0], colour), scale=1 / 255), dtype=np.uint8)
 
 
 @lru_cache(maxsize=32)
 def _uniform_picture(pixels: int, colour: tuple[int, ...]) -> Picture:
-    """Give a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
+    """Return a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
     flat = np.empty((pixels, pixels, 3), dtype=np.uint8)
     flat[:] = colour
     return flat
 
 
 def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
-    """Cut the square's part of a pattern; a period is a whole number of tiles or a tile one of periods."""
+    """Return a square's part of a texture; its period is a whole multiple of a tile's edge, or the reverse."""
     pixels, period = square.pixels, len(texture)
     if pixels > period:
         count = pixels // period
@@ -174,7 +174,7 @@ def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint
 
 
 def _tracks(road: Road) -> list[tuple[Strips, int]]:
-    """Where wheels run, and where oil drips, in every lane of the driven direction."""
+    """Return the strips of wheel tracks and oil in every lane of the driven direction, with their grey levels."""
     edges = np.array(road.lanes.edges_m)
     centres = (edges[1:] + edges[:-1]) / 2
     wheels = [centre + side for centre in centres for side in (-0.85, 0.85)]
@@ -186,7 +186,7 @@ def _tracks(road: Road) -> list[tuple[Strips, int]]:
 
 
 def _mark_styles(road: Road) -> list[tuple[str, float]]:
-    """Colours and widths (m) of marks, white first."""
+    """Return the colours and widths (m) of marks, white first."""
     return [
         (colour, each) for colour in _PAINT for each in sorted({m.width_m for m in road.marks if m.colour == colour})
     ]
@@ -202,7 +202,7 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
             found.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
         begin = mark.dashes_m(road.first_m, road.last_m)
-        # Two pieces a dash and more, so that it bends with the road.
+        # At least two pieces per dash, so that it bends with the road.
         count = max(2, math.ceil(mark.dash_m / PIECE_M))
         parts = (begin + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
         found.append(strip_pieces(road, left_m, right_m, parts, parts + mark.dash_m / count + OVERLAP_M))
@@ -210,14 +210,14 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
 
 
 def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
-    """Lay a picture over another."""
+    """Blend a picture over another."""
     cover = cv2.merge((alpha, alpha, alpha))
     kept = cv2.multiply(under, cv2.bitwise_not(cover), scale=1 / 255)
     return np.asarray(cv2.add(cv2.multiply(over, cover, scale=1 / 255), kept), dtype=np.uint8)
 
 
 def _mottle(grass: Picture, square: Square) -> Picture:
-    """Lay large patches over the grass, of lengths that do not fit its period: the eye must not see it repeat."""
+    """Modulate the grass with wavelengths that do not divide its period, so that the repetition is not visible."""
     count = 16
     middle_m = (np.arange(count) + 0.5) * square.edge_m / count
     x_m, y_m = square.left_m + middle_m, (square.low_m + middle_m)[:, None]

@@ -1,8 +1,8 @@
-"""Pictures of a road for a camera on a car, made on the CPU.
+"""The renderer of a road for a camera on a car, on the CPU.
 
-The ground is warped from tiles seen from above, in five bands of rows (`bands`); sky and hills are cut from a panorama;
-what stands upright is drawn from far to near; the sensor adds its noise. A frame depends on the poses, the frame's
-number and the seed alone: equal to the byte for equal versions and processor features.
+The ground is warped from top-view tiles, in five bands of rows (`bands`). Sky and hills are cropped from a panorama,
+upright objects are drawn from far to near, and sensor noise is added. A frame depends only on the poses, its number and
+the seed: it is byte-for-byte reproducible for equal versions and processor features.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from lavt.vehicle.sim.rendering.shadows import Shadows
 from lavt.vehicle.sim.road.road import Road
 
 SceneryKind = Literal["full", "light", "none"]
-"""full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails and no shadows either."""
+"""full: everything; light: no trees, lamp posts, buildings or clouds; none: no rails or shadows either."""
 
 MAX_PARTS, MAX_INSTANTS = 8, 16
-"""An exposure is drawn in so many parts at most, the near ground in each from so many instants at most."""
+"""The maximum number of parts of an exposure, and of instants per part at which the near ground is drawn."""
 
 _STEP_PX = 3.0
 _NEAR_BANDS = 2
@@ -44,12 +44,12 @@ _SWERVE_RAD = 0.6
 
 
 class Renderer:
-    """Draws one road in one light for one camera model."""
+    """A renderer of one road in one light for one camera model."""
 
     def __init__(
         self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
     ) -> None:
-        cv2.setNumThreads(1)  # with more the split of the work, and with it the last bit, may change
+        cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, may vary
         self._road, self._model, self._seed = road, model, seed
         self._level_model = level_model(model)
         self._ground, self._scenery = world(road, scenery, light)
@@ -61,7 +61,7 @@ class Renderer:
         self._noise = _noise(model)
 
     def prepare(self) -> None:
-        """Do beforehand what would make a frame late: the coarse ground along the route, and the first picture."""
+        """Fill the caches whose first use would delay a frame: coarse ground along the route, sprites, textures."""
         for s_m in np.arange(0.0, self._road.length_m + 16.0, 16.0):
             heading_rad = float(self._road.point(s_m)[2])
             for lateral_m in (-_SWERVE_M, 0.0, _SWERVE_M):
@@ -73,16 +73,16 @@ class Renderer:
         self.render(Pose(0, *self._road.start), 0)
 
     def render(self, pose: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen in one moment by a vehicle at `pose`; a new array each time."""
+        """Return frame `number` for a vehicle at `pose`, without motion blur, in a new array."""
         picture = self._draw_world(pose)
         self._add_noise(picture, number)
         return picture
 
     def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open.
+        """Return frame `number` for a vehicle that moves from `begin` to `end` while the shutter is open.
 
-        The exposure is cut into parts, within which nothing but the near ground moves much; in each part that is seen
-        from several instants.
+        The exposure is divided into parts so short that only the near ground moves much within one; the near ground is
+        drawn at several instants per part.
         """
         parts = _part_count(self._motion_px(begin, end, self._bands[_NEAR_BANDS].end_row), MAX_PARTS)
         instants = _part_count(self._motion_px(begin, end, self._level_model.height_px - 1) / parts, MAX_INSTANTS)
@@ -96,7 +96,7 @@ class Renderer:
         return picture
 
     def _draw_world(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
-        """Draw the world without noise, from `pose`; the near ground as the mean of what is seen from `near`."""
+        """Return the world seen from `pose`, without noise; the near ground is the mean of its views from `near`."""
         placement = place_camera(self._level_model, pose)
         self._panorama.crop(placement.heading_rad, self._canvas[: self._bands[-1].first_row])
         blurred = len(near) > 1
@@ -123,7 +123,7 @@ class Renderer:
             cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
             return
         lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        # In NumPy: OpenCV's reduction by area takes longer than the warp.
+        # NumPy, because OpenCV's reduction by area takes longer than the warp.
         light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
         rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
 
@@ -168,7 +168,7 @@ class Renderer:
         rows[:] = (light + len(placements) // 2) // len(placements)
 
     def _motion_px(self, begin: Pose, end: Pose, row: int) -> float:
-        """How far the ground in the corners of a row moves in the picture, or the horizon if that is more."""
+        """Return how far a row's corners, or the horizon if that is more, move in the picture."""
         model = self._level_model
         first, last = place_camera(model, begin), place_camera(model, end)
         pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
@@ -188,7 +188,7 @@ class Renderer:
 
 @lru_cache(maxsize=1)  # up to a gigabyte, for 600 m driven
 def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
-    """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
+    """Return a road's ground and scenery, cached for consecutive runs of a sweep."""
     light = LIGHTS[light_name]
     if scenery == "none":
         return Ground(road, light, None), None
@@ -212,7 +212,7 @@ def _interpolate_pose(begin: Pose, end: Pose, share: float) -> Pose:
 
 
 def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
-    """What haze leaves of the ground's far rows (255ths), and what it adds: (rows, columns, 4) each."""
+    """Return the transmittance of haze for the far rows (255ths), and its added colour: (rows, columns, 4) each."""
     rows = np.arange(bands[-1].first_row, bands[1].first_row)
     angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
     depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
@@ -224,7 +224,7 @@ def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]
 
 
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:
-    """Make what the sensor adds and what it takes away, larger than a picture; a frame gets a part of it."""
+    """Return the positive and negative sensor noise, larger than a picture; each frame uses a random part."""
     size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
     noise = np.rint(stream(0, "sensor noise bank").standard_normal(size) * _NOISE_DEVIATION)
     return np.clip(noise, 0, 255).astype(np.uint8), np.clip(-noise, 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Draws what stands beside the road, from far to near, in one light."""
+"""The scenery: drawing of roadside objects from far to near, in one light."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, Trees
 
 HAZE_M = 240.0
-"""At this distance 63 % of a thing's colour is haze."""
+"""At this distance 63 % of an object's colour is haze."""
 
 _NEAR_M = 0.4
 _SUBPIXEL_BITS = 4
@@ -28,11 +28,11 @@ _GLASS = (104.0, 88.0, 74.0)
 _POLE = 96.0
 
 Drawing = tuple[float, Callable[..., None], Any, Any]
-"""Depth (m), what draws the thing, and its two arguments after the picture."""
+"""Depth (m), the drawing function, and its two arguments after the picture."""
 
 
 class Scenery:
-    """Everything that stands along one road, in one light."""
+    """The roadside objects of one road, in one light."""
 
     def __init__(self, objects: RoadsideObjects, light: Light) -> None:
         self._objects = objects
@@ -41,25 +41,25 @@ class Scenery:
         self._pole_colour = _POLE * light.upright_factors(np.zeros((1, 2)))
         self._wall_colours = walls.colours * light.upright_factors(walls.normals)
         self._glass = np.array(_GLASS) * light.upright_factors(walls.normals)
-        # The trees' pictures have the sun to the left: those that see it to the right of the road are mirrored.
+        # Sprites show trees with the sun on the left: they are mirrored where the sun is to the right of the road.
         mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
         self._trees = np.column_stack([objects.trees, mirrored])
         self._haze = np.array(light.haze)
         self._sprites = Trees(light)
 
     def prepare(self) -> None:
-        """Paint beforehand what is slow."""
+        """Fill the slow caches beforehand."""
         self._sprites.prepare()
 
     def draw(self, placement: CameraPlacement, picture: Picture) -> None:
-        """Draw into `picture` what is in view."""
+        """Draw the visible objects into `picture`."""
         drawings: list[Drawing] = [
             *self._face_drawings(placement),
             *self._pole_drawings(placement),
             *self._tree_drawings(placement),
             *self._wall_drawings(placement),
         ]
-        drawings.sort(key=itemgetter(0), reverse=True)  # stable: faces of one piece stay in the order of painting
+        drawings.sort(key=itemgetter(0), reverse=True)  # stable: faces of one piece stay in painting order
         for _, draw, shape, style in drawings:
             draw(picture, shape, style)
 
@@ -71,7 +71,7 @@ class Scenery:
         ahead = ahead[near]
         points = placement.project(_clip(corners[near], ahead))
         inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
-        # Faces of one piece have one depth.
+        # All faces of one piece have the same depth.
         depth = np.maximum(ahead[inside], _NEAR_M).mean(axis=1)
         shades = self._add_haze(self._colours[near[inside]], depth)
         return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
@@ -86,7 +86,7 @@ class Scenery:
         widths = np.clip(np.rint(poles[inside, 4] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
         shades = self._add_haze(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
         styles = zip(shades, widths, strict=True)
-        # A pole stands behind the face it carries.
+        # A pole is behind the face it carries.
         return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), styles)
 
     def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
@@ -105,7 +105,7 @@ class Scenery:
         walls = self._objects.walls
         outlines = walls.outlines_m
         begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
-        # Seen from outside, a wall's outline runs from the left to the right.
+        # A wall seen from outside has its begin on the left and its end on the right.
         seen = (placement.x_m - begin[:, 0]) * (end - begin)[:, 1] > (placement.y_m - begin[:, 1]) * (end - begin)[:, 0]
         ahead = _depth_m(outlines[:, :2, :2], placement)
         seen &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
@@ -143,13 +143,13 @@ def _facade(
 
 
 def _depth_m(points_m: FloatArray, placement: CameraPlacement) -> FloatArray:
-    """How far ahead of the camera points (..., 2) are."""
+    """Return how far ahead of the camera points (..., 2) are."""
     along = (points_m[..., 0] - placement.x_m) * math.cos(placement.heading_rad)
     return np.asarray(along + (points_m[..., 1] - placement.y_m) * math.sin(placement.heading_rad))
 
 
 def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
-    """Faces with the part that is not in front of the camera cut off; `ahead` (n, 2) is of their begin and end."""
+    """Clip faces to the part in front of the camera; `ahead` (n, 2) are the depths of their begin and end."""
     for near, far in ((0, 1), (1, 0)):
         cut = ahead[:, near] < _NEAR_M
         if cut.any():

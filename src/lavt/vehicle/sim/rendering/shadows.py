@@ -1,4 +1,4 @@
-"""Shadows on the ground, of what stands beside the road and of clouds; they are painted into the ground's tiles."""
+"""Shadows of roadside objects and clouds, painted into the ground's tiles."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join_strips, make
 _CLOUD_TEXELS = 128
 _CLOUD_TEXEL_M = 6.0
 _CLOUD_DEPTH = 150.0
-"""How dark a cloud's shadow becomes, of 255: light comes through and around it."""
+"""The darkest value of a cloud's shadow, of 255: some light passes through and around the cloud."""
 _MARGIN_M = 1.0
 
 
 class Shadows:
-    """The shadows of one road's things in one light."""
+    """The shadows on one road in one light."""
 
     def __init__(self, objects: RoadsideObjects, light: Light, *, clouds: bool) -> None:
         self._shadow_m = light.shadow_m
@@ -38,7 +38,7 @@ class Shadows:
         self._clouds = _clouds() if clouds else None
 
     def mask(self, square: Square) -> Grey | None:
-        """How much of the sun is away, 0 to 255, for each texel of a square; None where it shines everywhere."""
+        """Return the share of sunlight missing in each texel of a square, 0 to 255; None without any shadow."""
         mask = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         if self._clouds is not None:
             _draw_clouds(self._clouds, square, mask)
@@ -54,7 +54,7 @@ class Shadows:
         for x_m, y_m, height_m, kind in self._trees[overlapping]:
             shape = tree_shape(int(kind))
             rows, columns = shape.shape
-            # Rows of the shape run down the tree: its foot is at the last row, its top falls where the sun throws it.
+            # Rows of the shape run down the tree: the last row is its foot, the first is the shadow of its top.
             right = across * (height_m * TREE_WIDTH / columns)
             down = -self._shadow_m * (height_m / rows)
             foot = np.array([x_m, y_m])
@@ -66,7 +66,7 @@ class Shadows:
 
 
 def _face_shadows(objects: RoadsideObjects, shadow_m: FloatArray) -> Strips:
-    """Shadows of rails, barriers, arms of lamps and walls."""
+    """Return the shadows of rails, barriers, lamp arms and walls."""
     corners = np.concatenate([objects.faces.corners_m, objects.walls.outlines_m])
     return make_strips(corners[..., :2] + corners[..., 2:] * shadow_m)
 
@@ -93,7 +93,7 @@ def _draw_clouds(clouds: Grey, square: Square, mask: Grey) -> None:
             [0.0, texel, square.low_m / _CLOUD_TEXEL_M + texel / 2],
         ]
     )
-    # Brought near the origin first: what reads the pattern knows its far repeats, but not with all their digits.
+    # Reduce the offset to one period: `warpAffine` wraps the pattern, but loses precision far from the origin.
     matrix[:, 2] %= len(clouds)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     cv2.warpAffine(clouds, matrix, mask.shape, mask, flags, cv2.BORDER_WRAP)

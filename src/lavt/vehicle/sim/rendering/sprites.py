@@ -1,4 +1,4 @@
-"""Trees and a bush, painted once for each light and scaled to what the camera sees of them."""
+"""Sprites of trees and a bush, painted once per light and scaled to their size in the picture."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.textures import Grey
 
 TREE_KINDS = 5
-"""Three broad-leaved trees, a conifer, and last a bush."""
+"""Three broad-leaved trees, a conifer, and a bush as the last kind."""
 
 _WORLD_SEED = 0
 _HEIGHT_PX = 256
 _WIDTH_PX = 208
 TREE_WIDTH = _WIDTH_PX / _HEIGHT_PX
-"""Width of a tree's picture as a share of its height."""
+"""The width of a tree's sprite as a share of its height."""
 
 _SHADOW_REDUCTION = 4
 _MAX_CACHED_PX = 64
@@ -31,21 +31,21 @@ _HAZE_STEPS = 24
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """What a tree adds to a picture, and what it leaves of it, 0 to 255 (rows, columns, 3)."""
+    """A tree's premultiplied colour and the transmittance of the background, 0 to 255, (rows, columns, 3) each."""
 
     colour: Picture
     transmittance: Picture
 
 
 class Trees:
-    """The trees in one light."""
+    """The sprites of all trees in one light."""
 
     def __init__(self, light: Light) -> None:
         self._light = light
         self._cache: dict[tuple[int, bool, int, int], Sprite] = {}
 
     def prepare(self) -> None:
-        """Paint all trees beforehand."""
+        """Paint all trees in advance."""
         for kind in range(TREE_KINDS):
             for mirrored in (False, True):
                 _lit_tree(self._light, kind, mirrored)
@@ -53,7 +53,7 @@ class Trees:
     def draw(self, picture: Picture, shape: Sequence[float], haze: float) -> None:
         """Draw a tree into `picture`; `haze` is the share of haze in its colour.
 
-        `shape` is where its foot is (u, v), how high it is in pixels, its kind, and whether it is mirrored.
+        `shape` is the position of its foot (u, v), its height in pixels, its kind, and whether it is mirrored.
         """
         foot_u, foot_v, height_px, kind, mirrored = shape
         variant = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
@@ -85,7 +85,7 @@ class Trees:
     def _draw_large(
         self, picture: Picture, variant: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
     ) -> None:
-        """Scale only what of the tree is in the picture, to fractions of a pixel: large trees would jump otherwise."""
+        """Draw only the visible part of a large tree, with subpixel scaling: otherwise large trees would jump."""
         width_px = height_px * TREE_WIDTH
         left, top = foot_px[0] - width_px / 2, foot_px[1] - height_px
         low_u, high_u = max(round(left), 0), min(round(left + width_px), picture.shape[1])
@@ -121,7 +121,7 @@ def _resize(image: Picture, size: tuple[int, int]) -> Picture:
 
 @lru_cache(maxsize=240)
 def _full_size_sprite(light: Light, kind: int, mirrored: bool, step: int, halvings: int) -> Sprite:
-    """Make the sprite of a tree in full size, halved so many times."""
+    """Return a tree's sprite in full size, halved `halvings` times."""
     if halvings:
         larger = _full_size_sprite(light, kind, mirrored, step, halvings - 1)
         size = (_WIDTH_PX >> halvings, _HEIGHT_PX >> halvings)
@@ -133,17 +133,17 @@ def _full_size_sprite(light: Light, kind: int, mirrored: bool, step: int, halvin
 
 @lru_cache(maxsize=6 * TREE_KINDS)
 def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture, Picture]:
-    """What a tree adds to a picture without haze and in nothing but haze, and what it leaves."""
+    """Return a tree's colour without haze and in full haze, and its transmittance."""
     colour, alpha = _paint_tree(kind)
     if mirrored:
         colour, alpha = colour[:, ::-1], alpha[:, ::-1]
-    # The painting is of a tree in the noon sun: its dark side takes the colour of shade, its bright one of the sun.
+    # The painted tree is in the noon sun: its dark side takes the colour of shade, its bright side that of the sun.
     brightness = np.clip(colour.mean(axis=2, keepdims=True) / 75.0, 0.0, 1.0)
     if light.shadows:
         factor = np.array(light.shade) * 1.7 * (1 - brightness) + np.array(light.lit) * brightness
         lit = colour * np.minimum(factor, 1.15)
     else:
-        # Under clouds light comes from everywhere: the picture loses most of its contrast.
+        # Under clouds light comes from all directions, so the tree loses most of its contrast.
         mean = colour[alpha > 0].mean(axis=0)
         lit = (mean + 0.45 * (colour - mean)) * np.array(light.lit)
     cover = alpha[..., None] / 255.0
@@ -153,7 +153,7 @@ def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture
 
 @lru_cache(maxsize=TREE_KINDS)
 def tree_shape(kind: int) -> Grey:
-    """Outline of a tree as its shadow sees it, 0 to 255; small, so that the shadow's edge is soft."""
+    """Return a tree's silhouette for its shadow, 0 to 255; it is small, so that the shadow's edge is soft."""
     _, alpha = _paint_tree(kind)
     size = (_WIDTH_PX // _SHADOW_REDUCTION, _HEIGHT_PX // _SHADOW_REDUCTION)
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -161,7 +161,7 @@ def tree_shape(kind: int) -> Grey:
 
 @lru_cache(maxsize=TREE_KINDS)
 def _paint_tree(kind: int) -> tuple[Picture, Grey]:
-    """Colour (rows, columns, 3) and cover of a tree, the sun at its upper left."""
+    """Return the colour (rows, columns, 3) and opacity of a tree, with the sun at its upper left."""
     random = stream(_WORLD_SEED, "tree", kind)
     leaf = np.array([46.0, 92.0, 70.0]) * random.uniform(0.75, 1.1) + random.uniform(-8, 8, 3)
     colour = np.broadcast_to(np.clip(leaf * 0.55, 0, 255), (_HEIGHT_PX, _WIDTH_PX, 3)).astype(np.uint8).copy()
@@ -189,7 +189,7 @@ def _paint_trunk(colour: Picture, alpha: Grey, middle: int, random: np.random.Ge
 
 
 def _leaf_tufts(kind: int, random: np.random.Generator) -> FloatArray:
-    """Tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
+    """Return tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
     count = 3200
     middle = _WIDTH_PX / 2
     if kind == 3:  # a conifer: a cone of tiers
@@ -210,7 +210,10 @@ def _leaf_tufts(kind: int, random: np.random.Generator) -> FloatArray:
 def _crown(
     kind: int, random: np.random.Generator, count: int, middle: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """A crown is made of clumps, each a ball of leaves with a bright and a dark side, before and behind each other."""
+    """Return u, v, brightness and nearness of a crown's tufts of leaves.
+
+    A crown consists of overlapping clumps, each a ball of leaves with a bright and a dark side.
+    """
     bush = kind == TREE_KINDS - 1
     clumps = 26
     half_height, centre_v, half_width = (84.0, 150.0, 70.0) if bush else (62.0, 96.0, 70.0)
