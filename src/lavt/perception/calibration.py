@@ -1,4 +1,4 @@
-"""A camera as its calibration knows it: where a point of the ground is in its picture, through any lens OpenCV knows.
+"""Calibrated cameras: the projection of ground points into the picture, through any lens model of OpenCV.
 
 Ground coordinates are the vehicle's frame: x ahead of the rear axle, y left, in metres. Pixel coordinates are those of
 OpenCV: the middle of the top left pixel is (0, 0). The lens models are OpenCV's, with its order of coefficients:
@@ -17,30 +17,29 @@ from numpy.typing import NDArray
 from lavt.domain import CameraModel, FloatArray
 
 REFERENCE_FOCAL_PX = 320.0
-"""Of the camera for which sizes in pixels are given here: 640 columns over 90 degrees."""
+"""The focal length of the reference camera for sizes in pixels: 640 columns over 90 degrees."""
 
 RAY_STEPS = 8
-"""Steps from the lens's axis to a ray in which the picture must go outwards all the way.
+"""Steps from the lens's axis to a ray at which the image radius is checked to increase.
 
-A polynomial of distortion turns back at some angle and puts what lies beyond, which the lens does not see, into the
-picture once more.
+A distortion polynomial folds back at some angle: it maps points beyond, which the lens does not see, into the picture.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CalibratedCamera:
-    """A camera with its lens and its place on the vehicle.
+    """A camera with its lens and its pose on the vehicle.
 
-    `yaw_rad` is left positive, `pitch_rad` down positive, `roll_rad` positive with the right side down; the
-    vehicle's axes are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without any.
+    `yaw_rad` is positive to the left, `pitch_rad` downwards, `roll_rad` with the right side down. The vehicle's axes
+    are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without distortion.
     """
 
     width_px: int
     height_px: int
     focal_px: tuple[float, float]
-    """Along the columns' direction (fx) and along the rows' (fy)."""
+    """The focal lengths (fx, fy), horizontal and vertical."""
     middle_px: tuple[float, float]
-    """Where the lens's axis meets the picture (cx, cy)."""
+    """The principal point (cx, cy)."""
     x_m: float
     y_m: float
     z_m: float
@@ -58,12 +57,12 @@ class CalibratedCamera:
 
     @property
     def scale(self) -> float:
-        """How much larger things are in this camera's picture than in that of the reference."""
+        """The size of objects in this camera's picture relative to the reference camera's."""
         return self.focal_px[0] / REFERENCE_FOCAL_PX
 
 
 def calibrated(model: CameraModel) -> CalibratedCamera:
-    """Give the pinhole camera of a config as a calibrated one: square pixels, axis in the middle, no distortion."""
+    """Return a config's pinhole camera as a calibrated one: square pixels, central axis, no distortion."""
     return CalibratedCamera(
         width_px=model.width_px,
         height_px=model.height_px,
@@ -79,7 +78,7 @@ def calibrated(model: CameraModel) -> CalibratedCamera:
 
 
 def axes(camera: CalibratedCamera) -> FloatArray:
-    """Give the camera's axes in the vehicle's frame, (3, 3): rows to the right, down, and deep."""
+    """Return the camera's axes in the vehicle's frame, (3, 3): rows right, down and forward."""
     yaw, pitch, roll = camera.yaw_rad, camera.pitch_rad, camera.roll_rad
     ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
@@ -93,24 +92,23 @@ def axes(camera: CalibratedCamera) -> FloatArray:
 
 
 def ground_to_camera(camera: CalibratedCamera) -> FloatArray:
-    """Give the 3 x 3 map from ground (x, y, 1) to the camera's frame (right, down, deep), in metres."""
+    """Return the 3 x 3 matrix from ground (x, y, 1) to the camera's frame (right, down, forward), in metres."""
     turn = axes(camera)
     return np.column_stack([turn[:, 0], turn[:, 1], -turn @ np.array([camera.x_m, camera.y_m, camera.z_m])])
 
 
 def ground_to_picture(camera: CalibratedCamera) -> FloatArray:
-    """Give the 3 x 3 homography from ground (x, y, 1) to the picture (u, v, 1) without distortion, up to scale.
+    """Return the 3 x 3 homography from ground (x, y, 1) to the undistorted picture (u, v, 1), up to scale.
 
-    The third component is the depth along the camera's axis; a point with none is not in the picture.
+    The third component is the depth along the camera's axis; only points with a positive depth are in the picture.
     """
     return np.asarray(camera.camera_matrix @ ground_to_camera(camera), dtype=np.float64)
 
 
 def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray:
-    """Tell where in the distorted picture the ground points (n, 2) are seen: (n, 2) in pixels.
+    """Project ground points (n, 2) into the distorted picture: (n, 2) in pixels.
 
-    NaN for what is behind the camera or so far aside that the lens model does not speak of it; other points may lie
-    outside the picture.
+    Points behind the camera or outside the lens model's valid field are NaN; others may lie outside the picture.
     """
     seen = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
     ahead = seen[:, 2] > 1e-6
@@ -121,7 +119,7 @@ def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray
 
 
 def _distort(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
-    """Send rays, as points of the plane one deep (n, 2), through the lens: pixels (n, 2)."""
+    """Project rays, given as points (n, 2) of the plane at depth 1, through the lens to pixels (n, 2)."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.middle_px
     if not camera.distortion:
         return rays * (fx, fy) + (cx, cy)
@@ -136,7 +134,7 @@ def _distort(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
 
 
 def _in_lens_field(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
-    """Tell which rays lie within the field in which the lens model holds, (n,)."""
+    """Return which rays lie within the lens model's valid field, (n,)."""
     if not camera.distortion:
         return np.ones(len(rays), dtype=np.bool_)
     radii = [

@@ -1,4 +1,4 @@
-"""A detector for lanes that come without pixels: step 9 of the life of a frame where nothing is rendered."""
+"""A detector for lanes without pixels: step 9 of the life of a frame at fidelity `geometry`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from lavt.perception.lane_detector import FORGET_AFTER, GRID, LANE_WIDTH_M, TRAC
 
 
 class GivenLane:
-    """Averages lanes over pictures as `LaneDetector` does, so that the loop has the dynamics it has with pixels.
+    """A detector that averages given lanes as `LaneDetector` does, so the control loop has the same dynamics.
 
-    With little of a lane in view the confidence says so, and the lane is the one seen last.
+    When little of the lane is visible, the confidence is low and the lane is the last one detected.
     """
 
     def __init__(self) -> None:
@@ -19,11 +19,11 @@ class GivenLane:
         self._misses = FORGET_AFTER
 
     def forget(self) -> None:
-        """Take the next lane as the first one."""
+        """Restart the average with the next lane."""
         self._misses = FORGET_AFTER
 
     def detect(self, picture: SeenLane) -> Lane:
-        """Give the average of the lane in the next picture and those before."""
+        """Return the average of the lanes in this picture and those before."""
         seen = picture.lane
         if seen.confidence < TRACK_CONFIDENCE:
             self._misses += 1
