@@ -32,7 +32,7 @@ RATE_TOLERANCE: Final = 0.01
 MAX_BUFFER_AGE_NS: Final = NS_PER_S
 """An older buffer time is from another clock, because V4L2 drivers queue a few pictures at most."""
 WAIT_PERIODS: Final = 0.25
-"""How long `capture` waits for a picture.
+"""The longest wait of `capture` for a picture, in frame periods.
 
 A camera has a clock of its own. Where pictures arrive just when they are requested, jitter would make `capture` miss
 many of them. The wait exceeds the jitter, so a picture is missed only when the clocks have drifted apart by a period.

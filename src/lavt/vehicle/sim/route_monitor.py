@@ -66,7 +66,7 @@ class RouteMonitor:
         self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
         self._quiet = _QuietInterval(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
-        """Where the body touched a rail at the last update."""
+        """The body's contacts with rails at the last update."""
 
     def track(self, motion: CarMotion) -> TrackingError:
         """Return the rear axle's position and heading relative to the lane's centre."""

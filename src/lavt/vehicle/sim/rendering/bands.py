@@ -12,7 +12,7 @@ from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, row_of_depth
 from lavt.vehicle.sim.rendering.textures import SCALES_M
 
 BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
-"""How far ahead of the camera each scale of the ground reaches."""
+"""The distance ahead of the camera that each scale of the ground reaches."""
 
 _MAX_LINES = 6
 _TEXELS_A_LINE = 2.5

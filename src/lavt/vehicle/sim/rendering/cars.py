@@ -39,5 +39,5 @@ CARS = {"lincoln_mkz": LINCOLN_MKZ}
 def named_car(name: str) -> CarParameters:
     """Return the car with this name; raise a `UserError` that lists the known cars if there is none."""
     if name not in CARS:
-        raise UserError(f"there is no car {name!r}: the known cars are {', '.join(CARS)}")
+        raise UserError(f"there is no car {name!r}: the known ones are {', '.join(CARS)}")
     return CARS[name]

@@ -41,7 +41,7 @@ class Light:
     """The approximate share of the sky that clouds cover."""
     shadows: bool
     clouds_shade: bool
-    """Whether clouds throw shadows on the ground around the road."""
+    """True if clouds cast shadows on the ground around the road."""
 
     @property
     def towards_sun(self) -> FloatArray:

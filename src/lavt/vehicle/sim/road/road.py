@@ -22,7 +22,7 @@ from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
-"""How far from the last known station a projection searches; searching the whole road could find another part of it."""
+"""Range of a projection around the last known station; searching the whole road could find another part of it."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from lavt.vehicle.sim.road.road import Road
 Grey = NDArray[np.uint8]
 
 OVERLAP_M = 0.03
-"""How far a piece overlaps the next one, so that no gap is visible."""
+"""The overlap of a piece with the next one, so that no gap is visible."""
 
 PIECE_M = 2.0
 """The longest straight piece of a strip that follows the road."""
