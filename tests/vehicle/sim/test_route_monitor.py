@@ -274,6 +274,6 @@ def test_skipping_checks_changes_no_events(
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad
         motion = motion_at(road, s_m, lateral_m, turned_rad)
-        eager._quiet._across_margin_m = 0.0
+        eager._event_margin._across_margin_m = 0.0
         assert lazy.update(motion, index) == eager.update(motion, index)
         assert (lazy.contacts == ()) == (eager.contacts == ())

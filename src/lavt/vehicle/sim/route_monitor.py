@@ -64,7 +64,7 @@ class RouteMonitor:
         self._near_s_m = near_s_m
         self._last_contact_ns: int | None = None
         self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
-        self._quiet = _QuietInterval(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
+        self._event_margin = _EventMargin(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
         """The body's contacts with rails at the last update."""
 
@@ -76,8 +76,8 @@ class RouteMonitor:
     def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
         """Return the events since the last call; it must be called at every step."""
         # In contact with a rail, check every step: the contact may deepen or end, and lasts while the car stays in it.
-        is_quiet = not self.contacts and self._quiet.covers(motion)
-        events = [] if is_quiet else self._check_body(motion, at_ns)
+        can_skip = not self.contacts and self._event_margin.covers(motion)
+        events = [] if can_skip else self._check_body(motion, at_ns)
         if self._began_ns is None:
             if motion.speed_mps > MOVING_MPS:
                 self._began_ns = at_ns
@@ -103,7 +103,7 @@ class RouteMonitor:
             events += self._report_once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
         if progress_m >= self._road.length_m:
             events += self._report_once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
-        self._quiet.restart(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
+        self._event_margin.restart(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
         return events
 
     def _report_once(self, kind: EventKind, detail: str, at_ns: int) -> list[VehicleEvent]:
@@ -167,7 +167,7 @@ class RouteMonitor:
         )
 
 
-class _QuietInterval:
+class _EventMargin:
     """The margin the body may move before an event is possible: until it may have reached the nearest boundary.
 
     Boundaries are the edges of lanes and asphalt, the rails, the stations where asphalt and rails begin and end, and
