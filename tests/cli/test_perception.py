@@ -126,7 +126,7 @@ def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: AR
     nodes = build_client(config, MachineClock().now, MachineEntropy())
     detector = nodes.driver._detector
     assert isinstance(detector, LaneDetector)
-    assert isinstance(detector.view.region_from_grid, tuple)
+    assert isinstance(detector.bird_eye.region_from_grid, tuple)
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def stops(route: str, condition: str = "L0") -> Iterator[tuple[Curve, Stop, Stop
         gate = actuator_of(loop).gate
         assert loop.runtime.run(10 * NS_PER_S, lambda: gate.state == "driving" and gate._command is not None)
         car._car.motion.speed_mps, car._car.motion.brake = SPEED_MPS, 0.0
-        for curve in curves(route, car._judge._road):
+        for curve in curves(route, car._route_monitor._road):
             for metre in metres(curve):
                 _drive_to(loop, car, metre)
                 node = _copied(actuator_of(loop))
@@ -134,7 +134,7 @@ def _drive_to(loop: VirtualLoop, car: Simulator, metre: int) -> None:
 def _copied(node: ActuatorNode) -> ActuatorNode:
     """Copy the vehicle's side: gate, odometry and car; the road, which nobody changes, is shared."""
     assert isinstance(node.vehicle, Simulator)
-    road, fixes = node.vehicle._judge._road, node.gate._path._odometry._fixes
+    road, fixes = node.vehicle._route_monitor._road, node.gate._path._odometry._fixes
     other = copy.deepcopy(node, {id(road): road, id(fixes): fixes.copy()})
     other._endings = {}  # at the end of the route it goes on as anywhere
     return other
@@ -144,13 +144,15 @@ def _stopped(node: ActuatorNode) -> Stop:
     """Let the vehicle's side live on, woken when it asks to be and told nothing, until the car stands."""
     car = node.vehicle
     assert isinstance(car, Simulator)
-    judge, motion = car._judge, car._car.motion
-    begin, half_m = car.ground_truth(), judge._road.lanes.widths_m[judge._road.lanes.driven] / 2
+    monitor, motion = car._route_monitor, car._car.motion
+    begin, half_m = car.ground_truth(), monitor._road.lanes.widths_m[monitor._road.lanes.driven] / 2
     beyond_m, covered_m = -math.inf, 0.0
     while motion.speed_mps > 0:
         now = Now(node.next_wake_ns(), 0)
         before = (motion.x_m, motion.y_m)
         walk(node.name, node.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
         covered_m += math.dist(before, (motion.x_m, motion.y_m))
-        beyond_m = max(beyond_m, *(abs(place[1]) - half_m for place in judge._places(motion, judge._corners)))
+        beyond_m = max(
+            beyond_m, *(abs(place[1]) - half_m for place in monitor._project_points(motion, monitor._corners))
+        )
     return Stop(begin.progress_m, begin.speed_mps, beyond_m, covered_m, node.gate.state)

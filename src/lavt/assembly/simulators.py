@@ -30,6 +30,6 @@ def simulator_of(config: ServerConfig, road: Road, start_ns: int) -> Simulator:
         seed=config.seed,
         start_mono_ns=start_ns,
         parameters=car_of(config.vehicle),
-        goes_on=config.vehicle.after_collision == "continue",
+        continue_after_collision=config.vehicle.after_collision == "continue",
         limit_s=config.vehicle.time_limit_s,
     )
