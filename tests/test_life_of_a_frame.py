@@ -37,10 +37,10 @@ def armed_gate(car: Simulator) -> tuple[SafetyGate, int]:
     )
     numbers = count(1)
     gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
-    epoch = gate.answer(SessionRequest("hold", "newcomer", 1, 0), car.state(), START_NS).epoch
+    epoch = gate.session.answer(SessionRequest("hold", "newcomer", 1, 0), car.state(), START_NS).epoch
     for number in range(51):
         at_ns = START_NS - (51 - number) * 20 * NS_PER_MS
-        gate.written.note(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
+        gate.issued_stamps.add(WALL_NS + at_ns, number, at_ns, pixel_crc=number)
         neutral = Command(
             epoch, number, 0, WALL_NS + at_ns, 0, 0.0, throttle=0.0, brake=1.0,
             path_curvature_per_m=(0.0,) * 10, mode="arm", emergency_stop=0,
@@ -68,7 +68,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     # 2. The send time goes into the pixels, and the server remembers that it wrote it.
     stamp_ns = WALL_NS + now_ns
     write_stamp(frame.picture, stamp_ns)
-    gate.written.note(stamp_ns, frame.number, now_ns, pixel_crc=51)
+    gate.issued_stamps.add(stamp_ns, frame.number, now_ns, pixel_crc=51)
     assert set(frame.picture[:64, :64].ravel().tolist()) == {0, 255}
 
     # 3. The picture becomes H.264.
@@ -143,6 +143,6 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
 
     # 13. The vehicle obeys: it stood until now, and moves from now on.
     assert car.state().speed_mps == 0.0
-    car.apply(gate.actuation(car.state(), now_ns), now_ns)
+    car.apply(gate.watchdog.actuation(car.state(), now_ns), now_ns)
     car.advance(now_ns + NS_PER_S)
     assert car.state().speed_mps > 0.0

@@ -3,13 +3,13 @@ import math
 import pytest
 
 from lavt.control.pure_pursuit import (
-    SEEN_FROM,
+    ORIGIN,
     curvature_per_m,
-    goal_m,
+    goal_point_m,
     lookahead_m,
-    moved,
-    pursued_path,
+    move_along_arc,
     pursuit_curvature_per_m,
+    pursuit_path_per_m,
     steering_rad,
 )
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
@@ -30,7 +30,7 @@ def test_the_lookahead_grows_with_speed_between_its_ends(speed_mps: float, expec
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (1.5, -0.2, 0.012), (-3.0, 0.5, -0.02)])
 def test_the_goal_is_on_the_centre_and_a_lookahead_away(centre: tuple[float, float, float]) -> None:
     """The point aimed at lies on the polynomial, ahead, at the distance asked for."""
-    x_m, y_m = goal_m(lane(*centre), 6.2)
+    x_m, y_m = goal_point_m(lane(*centre), 6.2)
     assert math.hypot(x_m, y_m) == pytest.approx(6.2, abs=1e-3)
     assert y_m == pytest.approx(centre[0] + centre[1] * x_m + centre[2] * x_m**2)
     assert x_m > 0
@@ -63,8 +63,8 @@ def test_the_circle_leads_to_the_goal() -> None:
     bent = lane(0.5, 0.1, 0.01)
     curvature = pursuit_curvature_per_m(bent, 8.0)
     half_angle_rad = math.asin(curvature * 8.0 / 2)
-    x_m, y_m, _ = moved(SEEN_FROM, 2 * half_angle_rad / curvature, curvature)
-    assert (x_m, y_m) == pytest.approx(goal_m(bent, 8.0), abs=1e-3)
+    x_m, y_m, _ = move_along_arc(ORIGIN, 2 * half_angle_rad / curvature, curvature)
+    assert (x_m, y_m) == pytest.approx(goal_point_m(bent, 8.0), abs=1e-3)
 
 
 def test_steering_and_curvature_are_inverse() -> None:
@@ -75,7 +75,7 @@ def test_steering_and_curvature_are_inverse() -> None:
 
 def test_the_path_of_a_car_on_a_bend_is_the_bend() -> None:
     """On the centre of a gentle curve the path's curvature is the lane's, as far as the lane is one."""
-    path = pursued_path(lane(c2=0.5 / 135), 6.0, limit_per_m=1.0)
+    path = pursuit_path_per_m(lane(c2=0.5 / 135), 6.0, limit_per_m=1.0)
     assert len(path) == PATH_POINTS
     assert path[:5] == pytest.approx([1 / 135] * 5, rel=0.1)
 
@@ -83,9 +83,9 @@ def test_the_path_of_a_car_on_a_bend_is_the_bend() -> None:
 def test_the_path_leads_back_to_the_lane() -> None:
     """A car 1 m beside its lane and turned away drives the path it gives to within 0.3 m of the centre, along it."""
     beside = lane(c0=-1.0, c1=-0.1)
-    place, curvature = SEEN_FROM, pursuit_curvature_per_m(beside, 6.0)
-    for following in pursued_path(beside, 6.0, limit_per_m=1.0):
-        place = moved(place, PATH_STEP_M, curvature)
+    place, curvature = ORIGIN, pursuit_curvature_per_m(beside, 6.0)
+    for following in pursuit_path_per_m(beside, 6.0, limit_per_m=1.0):
+        place = move_along_arc(place, PATH_STEP_M, curvature)
         curvature = following
     x_m, y_m, heading_rad = place
     assert y_m == pytest.approx(-1.0 - 0.1 * x_m, abs=0.3)
@@ -94,10 +94,10 @@ def test_the_path_leads_back_to_the_lane() -> None:
 
 def test_the_path_keeps_to_the_limit() -> None:
     """No curvature of the path exceeds the limit."""
-    path = pursued_path(lane(3.0), 4.0, limit_per_m=0.04)
+    path = pursuit_path_per_m(lane(3.0), 4.0, limit_per_m=0.04)
     assert max(abs(curvature) for curvature in path) == 0.04
 
 
 def test_an_arc_is_driven_round() -> None:
     """A quarter of a circle of 10 m ends 10 m ahead and 10 m to the left, turned by 90 degrees."""
-    assert moved(SEEN_FROM, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))
+    assert move_along_arc(ORIGIN, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))

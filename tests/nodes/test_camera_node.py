@@ -136,12 +136,12 @@ def test_no_stamp_is_written_twice(walls_ns: list[int]) -> None:
 def test_the_same_buffer_again_and_again_is_seen(*, stuck: bool, fault: bool) -> None:
     """A camera that gives one buffer, stamp of the last frame in it, is frozen at the fifth; a live one is not."""
     node = node_with(NoiseCamera(stuck=noise(0) if stuck else None))
-    written = IssuedStamps(5 * NS_PER_S, 5)
+    stamps = IssuedStamps(5 * NS_PER_S, 5)
     for number in range(5):
-        assert not written.frozen
+        assert not stamps.is_frozen
         (frame,) = of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
-        written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
-    assert written.frozen == fault
+        stamps.add(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+    assert stamps.is_frozen == fault
 
 
 def test_no_picture_is_counted_and_nothing_sent() -> None:

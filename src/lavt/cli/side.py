@@ -28,8 +28,8 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
-from lavt.safety.gate import ACTIVE
 from lavt.safety.limits import LIMITS
+from lavt.safety.state_machine import ACTIVE
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
 from lavt.transport.netem.netem import NetemInterface
