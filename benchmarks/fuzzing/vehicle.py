@@ -294,7 +294,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
             bench.give("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
     def rejected() -> int:
-        return node.counts["netem_requests_unreadable"] + node.counts["netem refused"]
+        return node.counts["netem_requests_unreadable"] + node.counts["netem rejected"]
 
     def finish() -> str:
         answered = rejected() + node.counts["netem granted"]
