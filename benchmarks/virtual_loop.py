@@ -107,10 +107,10 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
 
     def watch(loop: VirtualLoop) -> None:
         for host in loop.runtime.hosts.values():
-            for running in host.running.values():  # the runtime has looked the chains up already
-                running.chains = {
-                    channel: (tuple(timed(running.node, name, stage) for name, stage in stages), spent_ns)
-                    for channel, (stages, spent_ns) in running.chains.items()
+            for runner in host.runners.values():  # the runtime has looked up the pipelines already
+                runner.chains = {
+                    channel: (tuple(timed(runner.node, name, stage) for name, stage in stages), ends_ns)
+                    for channel, (stages, ends_ns) in runner.chains.items()
                 }
 
     driven = drive_once(changes, limit_s, watch)

@@ -276,7 +276,7 @@ def test_another_instance_of_the_same_name_is_another_client() -> None:
     assert session.phase == "arming"
     session.handle_state(state_of("alice", "disarmed"), 400)
     session.handle_state(state_of("alice", "safe_stop", instance=8), 500)
-    assert session.phase == "watching"
+    assert (session.phase, session.has_control) == ("watching", False)
 
 
 def test_a_state_from_before_the_grant_has_no_effect() -> None:
