@@ -57,14 +57,14 @@ def sent_channels() -> set[tuple[str, str]]:
 
 def test_nodes_receive_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
     """Nodes receive exactly the channels that list them as receivers."""
-    received = {(channel, node.name) for node in nodes for channel in node.chains if channel != WAKE}
+    received = {(channel, node.name) for node in nodes for channel in node.pipelines if channel != WAKE}
     assert received == {(channel, name) for channel, row in CHANNELS.items() for name in row.receivers}
 
 
 def test_stages_have_different_names(nodes: Sequence[Node]) -> None:
     """Each pipeline has at least one stage, and its stages have different names."""
     for node in nodes:
-        for stages in node.chains.values():
+        for stages in node.pipelines.values():
             names = [name for name, _ in stages]
             assert names
             assert len(set(names)) == len(names)

@@ -41,7 +41,7 @@ class Send:
     peer: Peer = None
 
 
-Hop = tuple[str, Callable[[Any, Now], Any]]
+Stage = tuple[str, Callable[[Any, Now], Any]]
 """A name and a function of (result of the previous stage, now).
 
 The first stage of a pipeline gets the `Message`. A stage that returns None ends the pipeline; the last stage returns
@@ -63,7 +63,7 @@ class Node(Protocol):
         ...
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
         """Return the pipeline of each channel that the node receives."""
         ...
 

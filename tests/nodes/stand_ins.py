@@ -12,7 +12,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_S, Actuation, CameraModel, GroundTruth, Now, Picture, Pose, VehicleEvent, VehicleState
 from lavt.node import Message, Node, Send
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.vehicle.camera import CapturedFrame
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
@@ -42,7 +42,7 @@ def give(
 ) -> list[Send]:
     """Send one message through a node whose stages take no time, and return its sends."""
     message = Message(channel, payload, arrived or now, peer)
-    return walk(node.name, node.chains[channel], message, now, repeat(now)).sends
+    return run_stages(node.name, node.pipelines[channel], message, now, repeat(now)).sends
 
 
 def of(sends: list[Send], channel: str) -> list[Any]:

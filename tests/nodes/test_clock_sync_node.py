@@ -67,7 +67,7 @@ def test_a_reply_has_times_correction_and_bound() -> None:
     """A reply has the times of arrival and answer, and the last correction and bound of the server."""
     node = ClockSyncNode(MONO_NS)
     message = Message("probe_request", encode_request(9, 1234), at(0), ("client", 1))
-    (stage,) = node.chains["probe_request"]
+    (stage,) = node.pipelines["probe_request"]
     (send,) = stage[1](message, at(400))
     assert (send.channel, send.peer) == ("probe_reply", ("client", 1))
     assert decode_reply(send.payload) == ProbeReply(9, 1234, at(0).wall_ns, at(400).wall_ns, None, None)
@@ -79,7 +79,7 @@ def test_a_reply_has_times_correction_and_bound() -> None:
 def test_a_clock_that_is_set_back_between_arrival_and_answer() -> None:
     """If the clock is set back before the reply, the answer time is the arrival time, never an earlier one."""
     message = Message("probe_request", encode_request(9, 1234), at(0), ("client", 1))
-    (send,) = ClockSyncNode(MONO_NS).chains["probe_request"][0][1](message, at(400, -NS_PER_S))
+    (send,) = ClockSyncNode(MONO_NS).pipelines["probe_request"][0][1](message, at(400, -NS_PER_S))
     reply = decode_reply(send.payload)
     assert reply.answered_wall_ns == reply.received_wall_ns == at(0).wall_ns
 

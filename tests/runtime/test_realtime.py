@@ -10,7 +10,7 @@ import pytest
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.clock_sync.clock_report import ClockReport
 
@@ -43,7 +43,7 @@ class Ticker:
         self.late_ns: list[int] = []
         self.threads: set[str] = set()
         self._next_ns = start_ns
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             WAKE: (("tick", self._tick),),
             "state": (("receive", self._receive),),
         }

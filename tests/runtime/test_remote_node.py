@@ -17,7 +17,7 @@ import pytest
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, Now
 from lavt.errors import WorkError
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
@@ -62,7 +62,7 @@ class Echo:
     received: list[Message] = field(default_factory=list)
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
         return {"control": (("receive", self._receive),), "session": (("answer", self._answer),), WAKE: ()}
 
     def next_wake_ns(self) -> int | None:
@@ -87,7 +87,7 @@ class Neighbour:
     received: list[Any] = field(default_factory=list)
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
         return {"rest": (("receive", lambda message, _now: self.received.append(message.payload)),), WAKE: ()}
 
     def next_wake_ns(self) -> int | None:

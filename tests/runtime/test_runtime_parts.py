@@ -13,7 +13,7 @@ from lavt.channels import CHANNELS
 from lavt.domain import Now, SessionReply
 from lavt.node import Message, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, QueuedRecorder, record
 from lavt.transport.messages import encode
 
@@ -90,7 +90,7 @@ def test_each_stage_gets_the_time_after_the_one_before() -> None:
     first = message("control")
     sends = [Send("event", 1)]
     stages = [("a", stage(Stamped(42))), ("b", stage("bare")), ("c", stage(sends))]
-    outcome = walk("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
+    outcome = run_stages("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
     assert seen == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
     assert (outcome.sends, outcome.end) == (sends, Now(1031, 5031))
     assert outcome.timeline is not None
@@ -101,7 +101,7 @@ def test_each_stage_gets_the_time_after_the_one_before() -> None:
 def test_none_ends_a_pipeline() -> None:
     """A stage that returns None ends the pipeline; without a stamp there is no timeline."""
     stages = [("a", lambda _value, _now: None), ("b", lambda _value, _now: pytest.fail("called"))]
-    outcome = walk("node", stages, message("control"), NOW, repeat(NOW.later(1)))
+    outcome = run_stages("node", stages, message("control"), NOW, repeat(NOW.later(1)))
     assert (outcome.sends, outcome.end.mono_ns, outcome.timeline) == ([], 1001, None)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine, Lognormal
 
@@ -25,7 +25,7 @@ class PeriodicSender:
         self.received: list[tuple[Any, int, int]] = []
         self._sends, self._next, self._period_ns = sends, start_ns, period_ns
         self._number = 0
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             WAKE: (("send", self._send),),
             receives: (("receive", self._receive),),
         }

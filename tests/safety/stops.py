@@ -23,7 +23,7 @@ from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop
 from lavt.node import WAKE, Message
 from lavt.nodes.actuator import ActuatorNode
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.simulator import Simulator
 
@@ -150,7 +150,7 @@ def _stopped(node: ActuatorNode) -> Stop:
     while motion.speed_mps > 0:
         now = Now(node.next_wake_ns(), 0)
         before = (motion.x_m, motion.y_m)
-        walk(node.name, node.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
+        run_stages(node.name, node.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
         covered_m += math.dist(before, (motion.x_m, motion.y_m))
         beyond_m = max(beyond_m, *(abs(place[1]) - half_m for place in judge._places(motion, judge._corners)))
     return Stop(begin.progress_m, begin.speed_mps, beyond_m, covered_m, node.gate.state)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, Ending, Now, Pose, SessionRequest, State, VehicleEvent
 from lavt.errors import BadMessage
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import Admission, AtWheel, Event, FrameWritten, Route, StationaryStatus
 from lavt.safety.gate import CommandVerdict, SafetyGate
 from lavt.transport.messages import decode, encode
@@ -96,7 +96,7 @@ class ActuatorNode:
         self._rejected_ns = start_ns
         self._pending: deque[tuple[int, int, int]] = deque(maxlen=MAX_PENDING_COMMANDS)
         """Time, sequence and stamp of applied commands, until the vehicle reports that they reached the wheels."""
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "control": (
                 ("decode", self._decode),
                 ("admit", self._admit),

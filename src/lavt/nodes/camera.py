@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lavt.domain import NS_PER_S, Now, Pose, Sight
 from lavt.errors import BadPacket
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import FrameWritten, VideoUnit
 from lavt.transport.rtp.rtcp import is_rtcp, parse_feedback
 from lavt.transport.video.frame_codec import PictureSender
@@ -83,7 +83,7 @@ class CameraNode:
         self._limit_bps: int | None = None
         self._stamps: deque[int] = deque(maxlen=REMEMBERED_STAMPS)
         self._highest_stamp_ns = 0
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             WAKE: (
                 ("capture", self._capture),
                 ("check", self._check),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lavt.domain import NS_PER_S, Now
 from lavt.errors import BadMessage
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import (
     SEQUENCES,
@@ -38,7 +38,7 @@ class ClockSyncNode:
         self._queried_period = -1
         self._wake_period_ns = PERIOD_NS // self.wakes_per_period
         self._latest: ClockReport | None = None
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             WAKE: (("ask", self._wake),),
             "clock_report": (("sample", self._sample),),
             **self._probe_pipelines(),
@@ -48,7 +48,7 @@ class ClockSyncNode:
         """Return when the next query or probe is due."""
         return self._start_ns + self._tick * self._wake_period_ns
 
-    def _probe_pipelines(self) -> dict[str, Sequence[Hop]]:
+    def _probe_pipelines(self) -> dict[str, Sequence[Stage]]:
         return {"probe_request": (("answer", self._answer),)}
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
@@ -90,7 +90,7 @@ class ProbingClockSyncNode(ClockSyncNode):
         self._sequence = 0
         self._sent_ns: dict[int, int] = {}
 
-    def _probe_pipelines(self) -> dict[str, Sequence[Hop]]:
+    def _probe_pipelines(self) -> dict[str, Sequence[Stage]]:
         return {"probe_reply": (("compare", self._compare),)}
 
     def _probes(self, now: Now) -> list[Send]:

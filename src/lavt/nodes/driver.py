@@ -11,7 +11,7 @@ from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
 from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
 from lavt.errors import BadMessage
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.payloads import DecodedFrame, LaneSeen, PathToken
 from lavt.nodes.picture_reader import PictureReader
@@ -77,7 +77,7 @@ class DriverNode:
         self._speed_mps = 0.0
         self._state_ns = 0
         self._command_ns: int | None = None
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "access_unit": reader.stages,
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),

@@ -13,7 +13,7 @@ from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError
-from lavt.node import WAKE, Hop, Message, Peer, Send
+from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.payloads import InjectionSample, StationaryStatus
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment, check_flows
 from lavt.transport.messages import decode, encode
@@ -110,7 +110,7 @@ class InjectionNode:
         self._lease: Lease | None = None
         self._status = StationaryStatus(False, None)
         self._waiting: deque[Peer] = deque(maxlen=MAX_PENDING_REQUESTS)
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "netem": (("answer", self._answer),),
             "injected": (("note", self._handle_result),),
             "rest": (("note", self._handle_status),),
@@ -233,7 +233,7 @@ class InjectionClient:
         )
         self._request_ns: int | None = start_ns if condition else None
         self._has_ordered = False
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "netem_reply": (("note", self._handle_reply),),
             "injected": (("note", self._handle_result),),
             WAKE: (("ask", self._wake),),

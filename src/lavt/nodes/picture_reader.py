@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from lavt.domain import Now
 from lavt.errors import BadPacket
-from lavt.node import Hop, Message, Send
+from lavt.node import Message, Send, Stage
 from lavt.nodes.payloads import DecodedFrame, PictureRead, ReceivedUnit, VideoUnit
 from lavt.transport.video.frame_codec import PictureReceiver, ReceivedPicture
 from lavt.transport.video.stamp import stamp_agrees
@@ -49,7 +49,11 @@ class PictureReader:
         reads_doubtful: bool = True,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.stages: Sequence[Hop] = (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show))
+        self.stages: Sequence[Stage] = (
+            ("decode", self._decode),
+            ("read_stamp", self._read_stamp),
+            ("show", self._show),
+        )
         self._pictures = pictures
         self._agrees = agrees
         self._reads_doubtful = reads_doubtful

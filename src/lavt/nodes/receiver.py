@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadPacket
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import PathToken, ReceivedUnit
 from lavt.transport.rtp.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
 from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
@@ -61,7 +61,7 @@ class ReceiverNode:
         self._in_doubt = False
         self._requested_ns: int | None = None
         """Time of the last keyframe request."""
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
             "path_token": (("note", self._note_token),),
             "picture_lost": (("ask", self._note_picture_lost),),

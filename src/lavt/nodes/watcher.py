@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from lavt.domain import Now
-from lavt.node import Hop, Message
+from lavt.node import Message, Stage
 from lavt.nodes.picture_reader import PictureReader
 
 
@@ -17,7 +17,7 @@ class WatcherNode:
 
     def __init__(self, reader: PictureReader) -> None:
         self.counts: Mapping[str, int] = reader.counts
-        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.stages, "view": (("forget", _forget),)}
+        self.pipelines: Mapping[str, Sequence[Stage]] = {"access_unit": reader.stages, "view": (("forget", _forget),)}
 
     def next_wake_ns(self) -> None:
         """Return None: only messages wake the node."""

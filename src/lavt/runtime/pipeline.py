@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from lavt.domain import Now
-from lavt.node import Hop, Message, Send
+from lavt.node import Message, Send, Stage
 from lavt.value import value
 
 
@@ -34,7 +34,7 @@ class PipelineResult:
     """Number of stages that were called."""
 
 
-def walk(node: str, stages: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
+def run_stages(node: str, stages: Sequence[Stage], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
     """Run a message through the stages; `ends` yields the end time of each stage."""
     value: object = message
     now = start

@@ -16,7 +16,7 @@ from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.wakeup import WakeEvent
 from lavt.transport.clock_sync.clock_report import ClockReport
@@ -117,7 +117,7 @@ class RealRuntime:
     def run_pipeline(self, node: Node, message: Message) -> None:
         """Run a message through its pipeline and send the result."""
         readings = iter(self._clock.now, None)
-        outcome = walk(node.name, node.chains[message.channel], message, next(readings), readings)
+        outcome = run_stages(node.name, node.pipelines[message.channel], message, next(readings), readings)
         for carrier, sends in groupby(outcome.sends, lambda send: CHANNELS[send.channel].carrier):
             self._send(carrier, tuple(sends))
         if outcome.timeline is not None:

@@ -16,7 +16,7 @@ from lavt.channels import CHANNELS
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, Recorder, record
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.emulation.delay_line import DelayLine
@@ -113,12 +113,12 @@ class _NodeRunner:
         self.host = host
         self.node = node
         self.inbox = Inbox()
-        self.chains = {
+        self.pipelines = {
             channel: (
                 stages,
                 _end_times_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in stages))),
             )
-            for channel, stages in node.chains.items()
+            for channel, stages in node.pipelines.items()
         }
         """Each pipeline with the times from its start to the start of the first stage and to the end of each stage."""
         self.next_wake_ns = node.next_wake_ns
@@ -223,11 +223,11 @@ class VirtualRuntime:
 
     def _run_pipeline(self, runner: _NodeRunner, message: Message, now: Now) -> None:
         host, true_ns = runner.host, self.true_ns
-        stages, ends_ns = runner.chains[message.channel]
+        stages, ends_ns = runner.pipelines[message.channel]
         times: Iterator[Now] = repeat(now)
         if ends_ns[-1]:
             times = map(host.clock.at, map(true_ns.__add__, ends_ns))
-        outcome = walk(runner.node.name, stages, message, next(times), times)
+        outcome = run_stages(runner.node.name, stages, message, next(times), times)
         took_ns = ends_ns[outcome.called]
         runner.free_ns = free_ns = true_ns + took_ns
         if outcome.timeline is not None:
