@@ -58,7 +58,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure what is asked for; 2 where GStreamer is missing."""
     requested = arguments()
-    process_priority.take()  # as the server and the client do; the processes of both sides and the relay inherit it
+    process_priority.raise_priority()  # as server and client do; the processes of both sides and the relay inherit it
     try:
         gstreamer()
         with tempfile.TemporaryDirectory() as name:

@@ -50,7 +50,7 @@ def test_lost_echoes_are_counted() -> None:
 
 def test_what_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Where pyzmq is missing the benchmark says how to install it and, with nothing else asked, ends with 2."""
-    monkeypatch.setattr(process_priority, "take", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(process_priority, "raise_priority", lambda: None)  # it would be that of all tests
     monkeypatch.setattr(carriers, "find_spec", lambda _name: None)
     monkeypatch.setattr(sys, "argv", ["control_round_trip.py", "--only", "pyzmq"])
     assert control_round_trip.main() == 2

@@ -41,7 +41,7 @@ def test_missing_gstreamer_is_said_with_debians_packages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Where GStreamer cannot be imported the benchmark ends with 2 and names what to install, in one sentence."""
-    monkeypatch.setattr(process_priority, "take", lambda: None)  # it would be that of all tests
+    monkeypatch.setattr(process_priority, "raise_priority", lambda: None)  # it would be that of all tests
     monkeypatch.setitem(sys.modules, "gi", None)
     monkeypatch.setattr(sys, "argv", ["video_vs_gstreamer.py"])
     assert video_vs_gstreamer.main() == 2

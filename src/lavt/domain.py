@@ -16,7 +16,7 @@ from lavt.value import value
 Picture = NDArray[np.uint8]
 """An image: (height, width, 3), blue green red, 0 to 255."""
 
-Sight = Any
+FramePayload = Any
 """Opaque payload of a frame, from camera to detector: a `Picture` or, if nothing is rendered, a `SeenLane`. Only these
 two and the frame codec read it."""
 

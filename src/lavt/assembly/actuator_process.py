@@ -85,7 +85,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     """Be the actuator's process: drive until the server's process ends or says so, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
-    process_priority.take(process_priority.OF_THE_CAR)
+    process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
         vehicle, start = open_by_wire(config.vehicle, clock), clock.now()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
-from lavt.domain import NS_PER_S, Now, Pose, Sight
+from lavt.domain import NS_PER_S, FramePayload, Now, Pose
 from lavt.errors import BadPacket
 from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import FrameWritten, VideoUnit
@@ -32,7 +32,7 @@ class StampedFrame:
     pixel_crc: int
     stamp_ns: int
     stamped_mono_ns: int
-    picture: Sight
+    picture: FramePayload
 
 
 @value
@@ -131,11 +131,11 @@ class CameraNode:
         """Capture a frame with a camera that has no exposure time and no sensor delay."""
         return self._capture_now(number, begin_ns, newest_pose(poses, begin_ns))
 
-    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, Sight, int]:
+    def _check(self, frame: CapturedFrame, _now: Now) -> tuple[CapturedFrame, FramePayload, int]:
         """Do all work that needs no stamp, so that it adds no latency: the checksum and the codec's preparation."""
         return frame, *self._pictures.prepare(frame.picture)
 
-    def _stamp(self, checked: tuple[CapturedFrame, Sight, int], now: Now) -> StampedFrame:
+    def _stamp(self, checked: tuple[CapturedFrame, FramePayload, int], now: Now) -> StampedFrame:
         frame, prepared, pixel_crc = checked
         stamp_ns = now.wall_ns
         if stamp_ns > self._highest_stamp_ns:

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, Protocol
 from lavt.control.drive_controller import DriveController
 from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
-from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
+from lavt.domain import Command, Decision, FramePayload, Lane, Mode, Now, SessionReply, State
 from lavt.errors import BadMessage
 from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.client_session import ClientSession
@@ -30,7 +30,7 @@ class LaneDetection(Protocol):
         """Drop the memory of earlier pictures."""
         ...
 
-    def detect(self, picture: Sight, /) -> Lane:
+    def detect(self, picture: FramePayload, /) -> Lane:
         """Return the lane in the next picture."""
         ...
 

@@ -8,11 +8,11 @@ from typing import Final
 
 NICENESS: Final = -10
 """Default priority: before ordinary programs, without starving the system (0 is normal, -20 the highest)."""
-OF_THE_CAR: Final = -15
+VEHICLE_NICENESS: Final = -15
 """Priority of the actuator's process, above that of the server, and of a software car."""
 
 
-def take(niceness: int = NICENESS) -> None:
+def raise_priority(niceness: int = NICENESS) -> None:
     """Raise the priority of this process; without permission, do nothing.
 
     Other load on the machine must not show as latency. Threads started later inherit the priority.

@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lavt.domain import Lane, Picture, SeenLane, Sight
+from lavt.domain import FramePayload, Lane, Picture, SeenLane
 from lavt.errors import BadPacket
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
@@ -36,7 +36,7 @@ class ReceivedPicture(Protocol):
     """What came of an access unit."""
 
     @property
-    def picture(self) -> Sight:
+    def picture(self) -> FramePayload:
         """What a detector looks at; it may be made only now."""
         ...
 
@@ -49,15 +49,15 @@ class ReceivedPicture(Protocol):
 class PictureSender(Protocol):
     """The camera's end."""
 
-    def prepare(self, picture: Sight) -> tuple[Sight, int]:
+    def prepare(self, picture: FramePayload) -> tuple[FramePayload, int]:
         """Give what the stamp goes into, and a number that tells the picture, without it, from the one before."""
         ...
 
-    def write_stamp(self, prepared: Sight, stamp_ns: int) -> Sight:
+    def write_stamp(self, prepared: FramePayload, stamp_ns: int) -> FramePayload:
         """Put the stamp into the picture, in place where it is pixels, and return it."""
         ...
 
-    def encode(self, stamped: Sight, *, keyframe: bool) -> bytes:
+    def encode(self, stamped: FramePayload, *, keyframe: bool) -> bytes:
         """Make an access unit of a stamped picture; a keyframe where one is asked for."""
         ...
 
