@@ -140,7 +140,7 @@ class CameraNode:
         stamp_ns = now.wall_ns
         if stamp_ns > self._highest_stamp_ns:
             self._highest_stamp_ns = stamp_ns
-        else:  # a clock that stands still or was stepped back must not issue a stamp twice
+        else:  # no stamp is issued twice, even if the clock stands still or is stepped back
             while stamp_ns in self._stamps:
                 stamp_ns += 1
             self._highest_stamp_ns = max(self._highest_stamp_ns, stamp_ns)

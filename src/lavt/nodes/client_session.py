@@ -101,7 +101,7 @@ class ClientSession:
             self.phase, self.reason, self._request_ns = "watching", "released", now_ns
 
     def handle_condition(self, reason: str) -> None:
-        """Store why the network condition is not in force; an empty `reason` ends the wait for it."""
+        """Store why the network condition is not in force; an empty `reason` ends the wait for good."""
         if self._waits_reason:
             self._waits_reason = self.reason = reason
 

@@ -90,7 +90,7 @@ class RealRuntime:
             self._recorder.write("counts", {"node": worker.node.name, **counts}, now)
 
     def deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer = None) -> None:
-        """Record a message and deliver it to its receivers; links call this from their threads."""
+        """Deliver a message to its receivers, and record it if it is not local; links call this from their threads."""
         if CHANNELS[channel].carrier != "local":
             self._recorder.write(channel, payload, arrived)
         self.put(Message(channel, payload, arrived, peer))

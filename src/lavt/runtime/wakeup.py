@@ -28,7 +28,7 @@ class WakeEvent:
         self._clear.acquire(blocking=False)
 
     def wait(self, pause_s: float | None) -> None:
-        """Wait until the event is set, for at most `pause_s` (None: without a limit), and clear it."""
+        """Wait until the event is set, for at most `pause_s` (None: no limit), and clear it; do nothing from 0 down."""
         if pause_s is None:
             self._clear.acquire()
         elif pause_s > 0:

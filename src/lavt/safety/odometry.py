@@ -37,7 +37,7 @@ class Odometry:
     """Dead reckoning from the vehicle's reports, with a memory of the last `memory_ns`.
 
     The model is the kinematic bicycle, which rolls without slip. Between two reports it has the mean of both speeds and
-    of both curvatures, so the result does not depend on the rate of the reports.
+    of both curvatures, so that the result hardly depends on the rate of the reports.
     """
 
     def __init__(self, wheelbase_m: float, memory_ns: int) -> None:
