@@ -169,7 +169,7 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no cha
         expect(told + rejected() == inputs, "replies were lost")
         return f"{told} told to the driver"
 
-    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob holds the vehicle"))], packed=True)
+    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob has control"))], packed=True)
     return Target({"netem_reply": corpus}, feed, rejected, finish)
 
 
