@@ -166,7 +166,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure what is asked for and there; 2 where what is asked for is not there."""
     requested = arguments()
-    process_priority.take()  # as the server and the client do; routers and both sides inherit it
+    process_priority.raise_priority()  # as the server and the client do; routers and both sides inherit it
     missing = [name for name, carrier in CARRIERS.items() if carrier.missing and name in (requested.only or CARRIERS)]
     for name in missing:
         print(f"{name} is not measured: it is not installed (pip install {CARRIERS[name].package})", file=sys.stderr)

@@ -116,7 +116,7 @@ def main() -> int:
     requested = parser.parse_args()
     if not 0 < requested.minutes <= 60:
         parser.error("--minutes must be above zero and at most 60")
-    process_priority.take()  # as the server and the client do
+    process_priority.raise_priority()  # as the server and the client do
     sampler = ResourceSampler(requested.minutes * 60)  # the run also has a warm-up
     with tempfile.TemporaryDirectory() as name:
         run = describe_clean_run(Path(name), SIZES[0], requested.minutes * 60)

@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
-    process_priority.take()
+    process_priority.raise_priority()
     took_ns: dict[str, list[int]] = {"straight": [], "through": []}
     config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
     sets = [word for change in CHANGES for word in ("--set", change)]

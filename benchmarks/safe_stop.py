@@ -21,29 +21,29 @@ Done = list[tuple[Curve, Stop, Stop]]
 FOLLOWED, HELD = "along the path", "wheel held"
 
 
-def out(done: Sequence[Stop]) -> int:
-    """Count the stops that left the lane by more than is allowed."""
+def count_outside(done: Sequence[Stop]) -> int:
+    """Return the number of stops that left the lane by more than the allowed distance."""
     return sum(stop.beyond_m > ALLOWED_M for stop in done)
 
 
 def worst(done: Sequence[Stop]) -> str:
-    """Say how far out a corner of the body got, and where the last command was."""
+    """Return the largest distance of a corner beyond the lane, with the station of its last command."""
     stop = max(done, key=lambda each: each.beyond_m)
     return f"{stop.beyond_m:+.2f} m, at {stop.at_m:.0f} m"
 
 
 def row(curve: Curve, done: Done) -> str:
-    """Make a row of the table: a curve, and the worst of its stops."""
+    """Return a row of the table: a curve with the worst of its stops."""
     side = "left" if curve.radius_m > 0 else "right"
     followed, held = [stop for _, stop, _ in done], [stop for _, _, stop in done]
     return (
         f"| {curve.route} | {curve.from_m:.0f} to {curve.to_m:.0f} m | {side}, {abs(curve.radius_m):.0f} m "
-        f"| {len(done)} | {worst(followed)} | {worst(held)} | {out(held)} |"
+        f"| {len(done)} | {worst(followed)} | {worst(held)} | {count_outside(held)} |"
     )
 
 
 def draw(done: Done) -> Figure:
-    """Draw how far out each stop got, over where its last command was; a panel for each route."""
+    """Draw the distance beyond the lane of each stop over the station of its last command, a panel for each route."""
     figure = new_figure(5.0)
     axes = figure.subplots(3, 2, sharey=True).ravel()
     for axis, route in zip(axes, ROUTES, strict=True):
@@ -65,7 +65,7 @@ def draw(done: Done) -> Figure:
 
 
 def main() -> None:
-    """Stop everywhere, print, and draw where a file is named."""
+    """Print the tables of all stops, and draw the picture if a file is given."""
     done = [each for route in ROUTES for each in stops(route)]
     print("| route | curve | bend, radius | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
@@ -74,12 +74,12 @@ def main() -> None:
     followed = [stop for _, stop, _ in done]
     speeds_kmh = [stop.speed_mps * 3.6 for stop in followed]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
-    print(f"way from the last command to standstill: at most {max(stop.covered_m for stop in followed):.1f} m")
+    print(f"distance from the last command to standstill: at most {max(stop.covered_m for stop in followed):.1f} m")
     print("\n| condition | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):
         _, delayed, held = zip(*stops("a", condition), strict=True)
-        print(f"| {condition} | {len(held)} | {worst(delayed)} | {worst(held)} | {out(held)} |")
+        print(f"| {condition} | {len(held)} | {worst(delayed)} | {worst(held)} | {count_outside(held)} |")
     for picture in sys.argv[1:]:
         draw(done).savefig(picture, dpi=110)
 

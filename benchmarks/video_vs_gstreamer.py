@@ -59,7 +59,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Measure the requested parts; return 2 if GStreamer is missing."""
     requested = parse_arguments()
-    process_priority.take()  # as the server and the client do; the processes of both sides and the relay inherit it
+    process_priority.raise_priority()  # as server and client do; the child processes inherit it
     try:
         load_gstreamer()
         with tempfile.TemporaryDirectory() as name:

@@ -36,7 +36,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop, drive
-from lavt.node import Hop, Node
+from lavt.node import Node, Stage
 
 SETTINGS = {
     "full": ("vehicle.scenery=full", "fidelity=video"),
@@ -96,7 +96,7 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
     """
     spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
 
-    def timed(node: Node, name: str, stage: Callable[..., Any]) -> Hop:
+    def timed(node: Node, name: str, stage: Callable[..., Any]) -> Stage:
         def run(value: Any, now: Any) -> Any:
             begin_s = cpu_s()
             result = stage(value, now)
@@ -107,10 +107,10 @@ def stages_ms(changes: Iterable[str], limit_s: float) -> dict[str, float]:
 
     def watch(loop: VirtualLoop) -> None:
         for host in loop.runtime.hosts.values():
-            for running in host.running.values():  # the runtime has looked the chains up already
-                running.chains = {
-                    channel: (tuple(timed(running.node, name, stage) for name, stage in stages), spent_ns)
-                    for channel, (stages, spent_ns) in running.chains.items()
+            for runner in host.runners.values():  # the runtime has looked up the pipelines already
+                runner.pipelines = {
+                    channel: (tuple(timed(runner.node, name, stage) for name, stage in stages), ends_ns)
+                    for channel, (stages, ends_ns) in runner.pipelines.items()
                 }
 
     driven = drive_once(changes, limit_s, watch)

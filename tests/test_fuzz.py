@@ -10,7 +10,7 @@ from benchmarks import fuzz
 from benchmarks.fuzzing.mutation import Chance, Corpus, an_input
 from benchmarks.fuzzing.target import Target
 
-from lavt.safety.gate import SafetyGate
+from lavt.safety.gate import RejectionReason, SafetyGate
 
 INPUTS = (50_000, 2_000_000)
 """Two million take a minute of CPU time, where it was measured."""
@@ -78,11 +78,11 @@ def test_growth_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_stranger_who_is_accepted_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the check of the sequence the fuzzer finds that a command of the operator's, said again, is obeyed."""
-    true_objection = SafetyGate.rejection_reason
+    rejection_reason = SafetyGate.rejection_reason
 
-    def objection(self: SafetyGate, *about: object) -> str:
-        said = true_objection(self, *about)  # type: ignore[arg-type]
-        return "" if said == "not newer than the last command" else said
+    def without_sequence(self: SafetyGate, *arguments: object) -> RejectionReason | None:
+        reason = rejection_reason(self, *arguments)  # type: ignore[arg-type]
+        return None if reason is RejectionReason.OLD_SEQUENCE else reason
 
-    monkeypatch.setattr(SafetyGate, "rejection_reason", objection)
+    monkeypatch.setattr(SafetyGate, "rejection_reason", without_sequence)
     assert "a stranger's command was obeyed" in fuzz.fuzz("vehicle_driven", 5000, 1).broke

@@ -129,8 +129,8 @@ def test_each_reason_against_a_drive_has_the_least_stall_that_explains_it(reason
     ("reason", "least_ms"),
     [
         ("driving -> safe_stop: no command for 500 ms", 100),
-        ("the vehicle does not obey: no SteerReport1 for 100 ms; no BrakeReport1 for 100 ms", 40),
-        ("the vehicle does not obey: no SteerReport1 for 200 ms", 140),
+        ("the vehicle does not accept commands: no SteerReport1 for 100 ms; no BrakeReport1 for 100 ms", 40),
+        ("the vehicle does not accept commands: no SteerReport1 for 200 ms", 140),
     ],
 )
 def test_each_safe_stop_has_the_least_stall_that_explains_it(reason: str, least_ms: float) -> None:

@@ -50,7 +50,7 @@ def test_lost_echoes_are_counted() -> None:
 
 def test_a_missing_carrier_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """If pyzmq is missing and no other carrier is requested, the benchmark names the package and exits with 2."""
-    monkeypatch.setattr(process_priority, "take", lambda: None)  # it would change the priority of all tests
+    monkeypatch.setattr(process_priority, "raise_priority", lambda: None)  # it would change the priority of all tests
     monkeypatch.setattr(carriers, "find_spec", lambda _name: None)
     monkeypatch.setattr(sys, "argv", ["control_round_trip.py", "--only", "pyzmq"])
     assert control_round_trip.main() == 2

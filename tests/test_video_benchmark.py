@@ -41,7 +41,7 @@ def test_missing_gstreamer_is_reported_with_the_packages_to_install(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """If GStreamer cannot be imported, the benchmark exits with 2 and names the packages to install in one line."""
-    monkeypatch.setattr(process_priority, "take", lambda: None)  # it would change the priority of all tests
+    monkeypatch.setattr(process_priority, "raise_priority", lambda: None)  # it would change the priority of all tests
     monkeypatch.setitem(sys.modules, "gi", None)
     monkeypatch.setattr(sys, "argv", ["video_vs_gstreamer.py"])
     assert video_vs_gstreamer.main() == 2

@@ -15,12 +15,12 @@ from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
     Command,
+    FramePayload,
     Lane,
     NetemReply,
     Picture,
     SessionReply,
     SessionRequest,
-    Sight,
     State,
 )
 from lavt.errors import BadPacket
@@ -69,7 +69,7 @@ class AlwaysALane:
     def forget(self) -> None:
         """Forget nothing."""
 
-    def detect(self, _picture: Sight) -> Lane:
+    def detect(self, _picture: FramePayload) -> Lane:
         """Give the lane."""
         return Lane((0.3, 0.01, 0.001), 3.5, 3.6, 20.0, 1.0)
 
@@ -169,7 +169,7 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no cha
         expect(told + rejected() == inputs, "replies were lost")
         return f"{told} told to the driver"
 
-    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob holds the vehicle"))], packed=True)
+    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob has control"))], packed=True)
     return Target({"netem_reply": corpus}, feed, rejected, finish)
 
 

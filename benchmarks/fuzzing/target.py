@@ -11,7 +11,7 @@ from benchmarks.fuzzing.mutation import Chance, Corpus
 
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Send
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 
 START = Now(1_000 * NS_PER_S, 1_790_000_000 * NS_PER_S)
 
@@ -46,8 +46,9 @@ class Bench:
 
     def give(self, channel: str, payload: Any, peer: Any = None) -> list[Send]:
         """Walk one message through the node."""
-        sends = walk(self.node.name, self.node.chains[channel], Message(channel, payload, self.now, peer), self.now,
-                     repeat(self.now)).sends  # fmt: skip
+        message = Message(channel, payload, self.now, peer)
+        stages = self.node.pipelines[channel]
+        sends = run_stages(self.node.name, stages, message, self.now, repeat(self.now)).sends
         for send in sends:
             self._hear(send)
         return sends

@@ -26,9 +26,10 @@ from lavt.node import Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.injection import InjectionNode
 from lavt.nodes.payloads import FrameWritten, StationaryStatus
-from lavt.safety.gate import LARGEST_STORED_NUMBER, SafetyGate
+from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
+from lavt.safety.session import LARGEST_STORED_NUMBER
 from lavt.transport.emulation.impairment import check_flows
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
@@ -182,7 +183,7 @@ def _feed(side: Vehicle, channel: str, data: bytes) -> list[Send]:
 
 def _counted(side: Vehicle, given: dict[str, int]) -> None:
     counts = side.node.counts
-    commands = counts.get("commands_unreadable", 0) + total(counts, "refused: ")
+    commands = counts.get("commands_unreadable", 0) + total(counts, "rejected: ")
     expect(commands == given["control"], f"{given['control']} commands were given, {commands} counted")
     queries = counts.get("session_requests_unreadable", 0) + total(counts, "session ")
     expect(queries == given["session"], f"{given['session']} queries were given, {queries} counted")
@@ -192,7 +193,7 @@ def _rejected(side: Vehicle) -> int:
     counts = side.node.counts
     rejections = sum(number for name, number in counts.items() if name.startswith("session ") and "rejected" in name)
     unreadable = counts.get("commands_unreadable", 0) + counts.get("session_requests_unreadable", 0)
-    return unreadable + total(counts, "refused: ") + rejections
+    return unreadable + total(counts, "rejected: ") + rejections
 
 
 def vehicle_at_rest(seed: int) -> Target:
@@ -234,18 +235,19 @@ def vehicle_driven(seed: int) -> Target:
         inputs += 1
         if side.gate.state != "driving" and inputs % 500 == 0:
             side.arm()
-        before, active_operator = side.gate.state, side.gate.active_operator
+        before, active_operator = side.gate.state, side.gate.session.active_operator
         driven += before == "driving"
         _feed(side, channel, data)
         taken = (
             before == "emergency_stop"
-            and side.gate.active_operator is not None
-            and side.gate.active_operator[0] != "operator"
+            and side.gate.session.active_operator is not None
+            and side.gate.session.active_operator[0] != "operator"
         )
         allowed = (before, "emergency_stop", *(("disarmed",) if taken else ()))
         expect(side.gate.state in allowed, f"a stranger has led from {before} to {side.gate.state}")
         expect(
-            side.gate.active_operator == active_operator or before != "driving", "a stranger has taken a driven vehicle"
+            side.gate.session.active_operator == active_operator or before != "driving",
+            "a stranger has taken a driven vehicle",
         )
         side.bench.go(STEP_NS)
         if inputs % TURN == 0 and side.gate.state == "driving":
@@ -292,7 +294,7 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
             bench.give("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
     def rejected() -> int:
-        return node.counts["netem_requests_unreadable"] + node.counts["netem refused"]
+        return node.counts["netem_requests_unreadable"] + node.counts["netem rejected"]
 
     def finish() -> str:
         answered = rejected() + node.counts["netem granted"]

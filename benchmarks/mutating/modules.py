@@ -25,6 +25,9 @@ _ADAPTER = tuple(
 
 MODULES: Final[dict[str, tuple[str, ...]]] = {
     "safety/gate.py": _SAFETY,
+    "safety/session.py": _SAFETY,
+    "safety/state_machine.py": _SAFETY,
+    "safety/watchdog.py": _SAFETY,
     "safety/takeover_requests.py": ("safety/test_safety_session.py",),
     "safety/limits.py": (*_SAFETY, "safety/test_limiter.py", "nodes/test_driver_node.py"),
     "safety/limiter.py": ("safety/test_limiter.py", "safety/test_safety_path.py", "nodes/test_actuator_node.py"),

@@ -16,7 +16,7 @@ from lavt.assembly.vehicles import VehicleSetup, build_unpictured
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
-from lavt.node import Hop, Message, Node, Send
+from lavt.node import Message, Node, Send, Stage
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.watcher import WatcherNode
 from lavt.runtime.realtime import RealRuntime
@@ -51,7 +51,7 @@ class SinkNode:
 
     def __init__(self, name: str, *channels: str) -> None:
         self.name = name
-        self.chains: Mapping[str, Sequence[Hop]] = dict.fromkeys(channels, (("forget", _forget),))
+        self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(channels, (("forget", _forget),))
 
     def next_wake_ns(self) -> None:
         """Return None: the node is never woken."""

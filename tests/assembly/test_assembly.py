@@ -39,7 +39,7 @@ from lavt.config import (
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.transport.clock_sync.persistent_process import Shell
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 from lavt.vehicle.video_device import VideoDevice
@@ -171,7 +171,7 @@ def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None
         assert actuator is not None
         while (wake_ns := actuator.next_wake_ns()) < 10**12 + 10**9:
             now = Now(max(wake_ns, 10**12), 10**18)
-            walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
+            run_stages("actuator", actuator.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
             wakes += 1
         woken.append(wakes)
     assert woken[0] == woken[2] > 240

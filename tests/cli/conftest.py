@@ -22,7 +22,7 @@ def run(
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
     monkeypatch.setattr(console, "keep_stdout_for_results", lambda: None)  # it would take pytest's output away
-    monkeypatch.setattr(process_priority, "take", lambda *_: None)  # it would be that of all tests
+    monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # it would be that of all tests
     monkeypatch.chdir(tmp_path)
 
     def run_here(*arguments: str) -> CommandResult:

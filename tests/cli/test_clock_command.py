@@ -23,12 +23,14 @@ def port() -> Iterator[int]:
     """A server that answers probes, and says that its clock needs no correction."""
     clock = MachineClock()
     node = ClockSyncNode(0)
-    node.chains["clock_report"][0][1](
+    node.pipelines["clock_report"][0][1](
         Message("clock_report", ClockReport(0, 0, "here", "chrony", 0.0, 0.0001), clock.now()), clock.now()
     )
 
     def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        for send in node.chains["probe_request"][0][1](Message("probe_request", payload, arrived, peer), clock.now()):
+        for send in node.pipelines["probe_request"][0][1](
+            Message("probe_request", payload, arrived, peer), clock.now()
+        ):
             link.send(send)
 
     link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")

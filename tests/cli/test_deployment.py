@@ -61,7 +61,7 @@ def test_units_run_as_a_user_of_their_own(path: Path) -> None:
     service = unit(path)["Service"]
     assert (service["User"], service["Group"]) == ("lavt", "lavt")
     assert (service["CapabilityBoundingSet"], service["NoNewPrivileges"]) == ("", "yes")
-    requested = process_priority.OF_THE_CAR if path.name == "lavt-server.service" else process_priority.NICENESS
+    requested = process_priority.VEHICLE_NICENESS if path.name == "lavt-server.service" else process_priority.NICENESS
     assert service["LimitNICE"] == str(requested)
 
 

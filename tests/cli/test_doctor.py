@@ -295,7 +295,9 @@ def probe_port() -> Iterator[int]:
     clock, node = MachineClock(), ClockSyncNode(0)
 
     def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        for send in node.chains["probe_request"][0][1](Message("probe_request", payload, arrived, peer), clock.now()):
+        for send in node.pipelines["probe_request"][0][1](
+            Message("probe_request", payload, arrived, peer), clock.now()
+        ):
             link.send(send)
 
     link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")

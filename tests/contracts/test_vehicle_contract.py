@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.nodes.stand_ins import MONO_NS, StandingVehicle
+from tests.nodes.stand_ins import MONO_NS, FakeVehicle
 
 from lavt.assembly.by_wire import inside
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
@@ -32,7 +32,7 @@ DRIVABLE: dict[str, Callable[[], Vehicle]] = {
     "dataspeed_gen1": lambda: by_wire("dataspeed_gen1"),
     "dataspeed_gen2": lambda: by_wire("dataspeed_gen2"),
 }
-VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "stand-in of the node tests": StandingVehicle}
+VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "fake of the node tests": FakeVehicle}
 each_vehicle = pytest.mark.parametrize("name", sorted(VEHICLES))
 each_drivable = pytest.mark.parametrize("name", sorted(DRIVABLE))
 

@@ -347,7 +347,7 @@ def test_what_was_forged_is_counted(attacked_drive: attacked.Drive, stalls: Stal
         assert counted(server, "commands_forged") > 500
         assert counted(server, "commands_screened_out") > 0.3 * attacked_drive.sent["flood"]
         assert counted(server, "session_requests_of_another_time") > 10
-        assert counted(server, "refused: not newer than the last command") > 100
+        assert counted(server, "rejected: not newer than the last command") > 100
 
 
 def test_only_what_the_vehicle_said_is_shown(attacked_drive: attacked.Drive, stalls: Stalls) -> None:

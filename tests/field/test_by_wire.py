@@ -62,7 +62,7 @@ def test_a_route_is_driven_over_can(tell: Tell, drive: Drive) -> None:
         if driven.loop.server.latest["ending"] != "completed":
             raise driven.stopped_wrongly()
         if os.geteuid() == 0:  # others may not have it
-            assert os.getpriority(os.PRIO_PROCESS, driven.actuator_pid) == process_priority.OF_THE_CAR
+            assert os.getpriority(os.PRIO_PROCESS, driven.actuator_pid) == process_priority.VEHICLE_NICENESS
         ended_ns = CLOCK.now().mono_ns
         tell(f"parked {driven.car.parked(ended_ns - NS_PER_S):.0f} ms after the end of the drive was seen")
 

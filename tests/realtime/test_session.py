@@ -29,7 +29,7 @@ Wait = Callable[[str, Callable[[], bool], float], None]
 
 BEGINS_S = 90.0
 """Programs start, routers find each other, a client asks, arms and speeds up: about 10 s on a quiet machine."""
-HELD = "held by operator-1, and the vehicle is not disarmed at standstill"
+HELD = "operator-1 has control, and the vehicle is not disarmed and stationary"
 ASKS = "operator-2 asks for the vehicle; SIGUSR2 hands it over"
 
 
@@ -188,7 +188,7 @@ def test_the_active_operator_hands_over_to_who_asks(session: Session, server: Re
     assert session.seen["handed over"]["active_operator"] == "operator-2"
     assert (session.seen["first, then"]["phase"], session.seen["first, then"]["session"]) == ("watching", "released")
     released_ns = event_ns(server, "release by operator-1 granted")
-    assert event_ns(server, "driving -> safe_stop: the client released the vehicle") >= released_ns
+    assert event_ns(server, "driving -> safe_stop: the client released control") >= released_ns
     held_ns = event_ns(server, "hold by operator-2 granted")
     assert held_ns >= released_ns
     with stalls.judging(released_ns, held_ns, stall_ms=LONG_STALL_MS):

@@ -49,7 +49,7 @@ class ActuatorProcess(RemoteNodeProxy):
     @property
     def in_force(self) -> tuple[int, int]:
         """The epoch in force and the sequence of the command last obeyed under it, as last told."""
-        return self.noted or (0, -1)
+        return self.status or (0, -1)
 
     def end(self) -> None:
         """Have the vehicle stopped and let go of, and wait for the end."""
@@ -85,7 +85,7 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
     """Be the actuator's process: drive until the server's process ends or says so, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
-    process_priority.take(process_priority.OF_THE_CAR)
+    process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
         vehicle, start = open_by_wire(config.vehicle, clock), clock.now()
@@ -97,12 +97,12 @@ def serve_actuator(connection: Connection, config: ServerConfig, host: str, vide
         return
     connection.send(None)
     parted = threading.Event()
-    here = NodeHost(connection, clock, node, note=lambda: node.gate.in_force, parted=parted.set)
+    here = NodeHost(connection, clock, node, get_status=lambda: node.gate.in_force, on_disconnect=parted.set)
     here.start()
     try:
         while not parted.wait(LOOK_S) and not here.runtime.stopped.is_set():
             pass
-        here.hand("server_ends", None)
+        here.deliver("server_ends", None)
         _wait_for_rest(here, vehicle, clock)
     finally:
         here.close()

@@ -181,7 +181,7 @@ def build_actuator(
         gate,
         start_ns=start.mono_ns,
         route=route,
-        looks=looks,
+        sample_times=looks,
         after_collision=config.vehicle.after_collision,
     )
 

@@ -55,7 +55,7 @@ def prove(
     dbw = settings.vehicle.dbw
     file = out or Path(dbw.watchdog_proof or "watchdog_proof.json")
     profile, watchdog = _provable(dbw)
-    process_priority.take()
+    process_priority.raise_priority()
     with closing(CanPort(dbw.interface, dbw.channel, dbw.options, clock=MachineClock())) as port:
         if not yes:
             _ask(dbw)

@@ -38,7 +38,7 @@ def client(
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

@@ -62,7 +62,7 @@ def doctor(
     Example: lavt doctor configs/client.yaml --set video.server=192.0.2.7
     """
     console.keep_stdout_for_results()
-    process_priority.take()
+    process_priority.raise_priority()
     if config is None and changes:
         raise UserError("--set changes a config: name one before it")
     settings = None if config is None else _load(config, changes or [])

@@ -35,7 +35,7 @@ def relay(
 
     Example: lavt relay configs/relay.yaml --set video.constant_ms=75
     """
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(RelayConfig, config, changes or [])
     opened = Relay(MachineClock(), flows(settings))
     with console.until_told() as told:

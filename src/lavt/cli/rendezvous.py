@@ -32,7 +32,7 @@ def rendezvous(
 
     Example: lavt rendezvous configs/rendezvous.yaml --set vehicle_key=keys/vehicle-1.sign.pub
     """
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(RendezvousConfig, config, changes or [])
     opened = open_rendezvous(settings, MachineClock())
     ports = {f"{flow}_port": each.port for flow, each in opened.items()}

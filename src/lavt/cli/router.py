@@ -30,7 +30,7 @@ def router(
     Example: lavt router zenoh-configs/router-server.json5 --set 'listen.endpoints=[tcp/127.0.0.1:7447]'
     """
     console.keep_stdout_for_results()
-    process_priority.take()
+    process_priority.raise_priority()
     from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (nobody else should wait for Zenoh)
 
     quiet_logs()

@@ -36,7 +36,7 @@ def server(
     Example: lavt server configs/server.yaml --out out/server
     """
     console.keep_stdout_for_results()
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
     with Side(settings, out, clock) as side:

@@ -28,8 +28,8 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
-from lavt.safety.gate import ACTIVE
 from lavt.safety.limits import LIMITS
+from lavt.safety.state_machine import ACTIVE
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
 from lavt.transport.netem.netem import NetemInterface
@@ -220,7 +220,7 @@ def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as
     """Print what is new, and `last` at the very end; as JSON also how everything is."""
     for heard, at in side.tap.take_heard():
         if isinstance(heard, State):
-            narrator.state(heard, at.mono_ns, holds=session is not None and session.holds)
+            narrator.state(heard, at.mono_ns, holds=session is not None and session.has_control)
         else:
             narrator.rejection(heard)
     narrator.ending(side.tap.ending)
@@ -239,7 +239,7 @@ def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as
 
 def _release(side: Side, told: console.StopEvent, session: ClientSession) -> str:
     """Release the vehicle while the link is open: it stops at once, and somebody else may have it."""
-    if not session.holds:
+    if not session.has_control:
         return "the client ends; it held no vehicle"
     side.tell("operator", "release")
     _wait(side, told, RELEASE_S, lambda: session.released)

@@ -51,7 +51,7 @@ def software_car(
 
     Example: lavt software-car configs/server-by-wire.yaml --set vehicle.dbw.channel=vcan0
     """
-    process_priority.take(process_priority.OF_THE_CAR)
+    process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     settings = load_config(ServerConfig, config, changes or [])
     dbw = settings.vehicle.dbw
     if dbw.interface == INSIDE:

@@ -59,7 +59,7 @@ def watch(
 
     Example: lavt watch --port 5004 --sender foreign
     """
-    process_priority.take()
+    process_priority.raise_priority()
     only_from = None if sent_from is None else look_up("--from", sent_from)
     clock, watched = MachineClock(), WatchNodes(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, watched.nodes, watched, lambda: None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
-from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
+from lavt.domain import NS_PER_S, CameraModel, FramePayload, Pose
 from lavt.value import value
 
 
@@ -22,7 +22,7 @@ class CapturedFrame:
 
     number: int
     capture_ns: int | None
-    picture: Sight
+    picture: FramePayload
 
 
 @value

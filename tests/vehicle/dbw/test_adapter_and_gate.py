@@ -19,8 +19,8 @@ def new_gate() -> SafetyGate:
 def decide(rig: Rig, gate: SafetyGate) -> None:
     """Have the gate say what the car shall do, as the actuator node does."""
     state = rig.adapter.state()
-    rig.actuation = gate.actuation(state, rig.now_ns)
-    rig.adapter.engage(gate.needs(state), rig.now_ns)
+    rig.actuation = gate.watchdog.actuation(state, rig.now_ns)
+    rig.adapter.engage(gate.watchdog.should_engage(state), rig.now_ns)
 
 
 @both
@@ -28,7 +28,7 @@ def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generatio
     """After an emergency stop, at rest and parked, a driver drives off by hand: the kit is not engaged again."""
     rig, gate = started(generation), new_gate()
     rig.engage()
-    assert gate.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
+    assert gate.session.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
     for _ in range(2000):
         decide(rig, gate)
         rig.run_ms(1)

@@ -18,7 +18,7 @@ import numpy as np
 from lavt.config import BoundaryConfig, RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS
-from lavt.errors import UserError, WorkError, in_words
+from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary.delay_margin import configured_loop, critical_delay_s
@@ -211,7 +211,7 @@ class _SearchProgress:
             except BrokenExecutor:
                 broken.add(requested.name)
             except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                self.fail(requested, in_words(error))
+                self.fail(requested, describe_error(error))
             else:
                 self._tell(f"{requested.name}: {_sentence(self.found[requested.name])}")
 

@@ -20,7 +20,7 @@ from lavt.clock import MachineClock
 from lavt.config import RunConfig, SweepConfig
 from lavt.config_file import load_config
 from lavt.domain import NS_PER_S
-from lavt.errors import UserError, WorkError, in_words
+from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.drive_data import DriveData, read_drive
 from lavt.experiment.analysis.results import FAILED, read_json, write_json
 from lavt.experiment.runs.plan import PlannedRun, plan_sweep
@@ -107,7 +107,7 @@ class _SweepProgress:
                 except BrokenExecutor:
                     broken.append(planned)
                 except Exception as error:  # whatever it is, the other runs have nothing to do with it
-                    self.fail(planned, in_words(error))
+                    self.fail(planned, describe_error(error))
                 else:
                     self.take(planned, drive)
         except KeyboardInterrupt:

@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lavt.domain import Lane, Picture, SeenLane, Sight
+from lavt.domain import FramePayload, Lane, Picture, SeenLane
 from lavt.errors import BadPacket
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
@@ -36,7 +36,7 @@ class ReceivedPicture(Protocol):
     """A picture decoded from an access unit."""
 
     @property
-    def picture(self) -> Sight:
+    def picture(self) -> FramePayload:
         """The picture for a detector; it may be converted only on access."""
         ...
 
@@ -49,15 +49,15 @@ class ReceivedPicture(Protocol):
 class PictureSender(Protocol):
     """The codec at the camera's end."""
 
-    def prepare(self, picture: Sight) -> tuple[Sight, int]:
+    def prepare(self, picture: FramePayload) -> tuple[FramePayload, int]:
         """Return the picture to stamp, and a checksum by which unstamped pictures can be told apart."""
         ...
 
-    def write_stamp(self, prepared: Sight, stamp_ns: int) -> Sight:
+    def write_stamp(self, prepared: FramePayload, stamp_ns: int) -> FramePayload:
         """Write the stamp into the picture, in place if it consists of pixels, and return it."""
         ...
 
-    def encode(self, stamped: Sight, *, keyframe: bool) -> bytes:
+    def encode(self, stamped: FramePayload, *, keyframe: bool) -> bytes:
         """Encode a stamped picture as an access unit, on request as a keyframe."""
         ...
 
