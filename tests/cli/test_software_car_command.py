@@ -129,7 +129,7 @@ def test_it_reports_and_tells_the_truth(start: Start) -> None:
         heard = program.hear(lambda heard: len(heard) >= 760)
         receiver, before_ns = TruthReceiver(), MachineClock().now().mono_ns
         while receiver.newest is None or receiver.newest.mono_ns < before_ns:
-            receiver.take(listener.recv(MAX_BYTES))
+            receiver.receive(listener.recv(MAX_BYTES))
     assert receiver.newest.speed_mps == 0.0
     assert receiver.newest.progress_m > 0.0
     for identifier, period_ms in ((0x100, 10), (0x101, 20), (0x103, 100)):

@@ -1,8 +1,8 @@
-"""Where the bits of generation 2 are.
+"""Message layouts of generation 2.
 
-The facts give every command's fields in their order with most widths, and of reports only what is in them. What is laid
-out by us is in `UNVERIFIED`: such a position was never held against a real kit. Reports have a counter and a checksum
-where there is room: ours too.
+The facts give the fields of every command in order, most of them with widths, but only the contents of reports.
+Positions of our own choice are listed in `UNVERIFIED`: they were never compared with a real kit. Reports have a
+counter and a checksum where there is room, which is our choice, too.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from lavt.vehicle.software_car.frames import Field, Layout
 UNVERIFIED: Final = {
     **dict.fromkeys(
         (0x200, 0x201, 0x202, 0x210, 0x211, 0x212),
-        "order and widths of the fields, the checksum in the last byte: facts; counter in bits 48 to 51: ours",
+        "facts: order and widths of the fields, checksum in the last byte; our choice: the counter in bits 48 to 51",
     ),
-    **dict.fromkeys((0x203, 0x213), "4-bit command first, checksum last: facts; no counter, as none is listed"),
-    0x216: "command, counter and checksum in this order: facts; half of the first byte each: our reading",
+    **dict.fromkeys((0x203, 0x213), "facts: 4-bit command first, checksum last; no counter, as none is listed"),
+    0x216: "facts: command, counter and checksum in this order; our assumption: half of the first byte each",
     **dict.fromkeys(
-        (0x100, 0x101, 0x102, 0x103), "widths of the values: facts; all places and the pedals' steps: ours"
+        (0x100, 0x101, 0x102, 0x103), "facts: widths of the values; our choice: all positions and the pedals' steps"
     ),
-    0x106: "all places, the numbers of the reasons and of the mode: ours",
-    0x107: "two speeds of 16 bits, one after the other: our reading",
-    0x2A4: "laid out as in generation 1",
-    0x2D8: "all places: ours",
+    0x106: "our choice: all positions, the numbers of the reasons and of the mode",
+    0x107: "our assumption: two consecutive speeds of 16 bits",
+    0x2A4: "same layout as in generation 1",
+    0x2D8: "our choice: all positions",
 }
-"""What of each message is ours."""
+"""Assumptions and choices of our own, by identifier."""
 
 PEDAL_FIELDS = (
     Field("type", 16, 4),
