@@ -15,7 +15,7 @@ from lavt.vehicle.ground_truth_wire import (
     REPEATS,
     TruthReceiver,
     TruthSender,
-    write_truth,
+    encode_truth,
 )
 
 START_NS = 5_000_000_000
@@ -32,7 +32,7 @@ def event(detail: str, mono_ns: int = START_NS) -> VehicleEvent:
 def test_the_truth_is_told_whole() -> None:
     """What is written is read again: every number of the truth, and events with time, kind and detail."""
     receiver = TruthReceiver()
-    assert receiver.take(write_truth(truth_at(START_NS), [(7, event("left"))])) == [event("left")]
+    assert receiver.receive(encode_truth(truth_at(START_NS), [(7, event("left"))])) == [event("left")]
     assert receiver.newest == truth_at(START_NS)
     assert receiver.counts == {"truths": 1}
 
@@ -40,11 +40,11 @@ def test_the_truth_is_told_whole() -> None:
 def test_an_event_is_said_again_and_taken_once() -> None:
     """An event is in 20 datagrams, of which any one is enough; it is taken once."""
     sender = TruthSender(START_NS)
-    datagrams = [sender.datagram(truth_at(START_NS), [event("left")])]
-    datagrams += [sender.datagram(truth_at(START_NS + index), []) for index in range(30)]
+    datagrams = [sender.make_datagram(truth_at(START_NS), [event("left")])]
+    datagrams += [sender.make_datagram(truth_at(START_NS + index), []) for index in range(30)]
     for heard in range(30):
         receiver = TruthReceiver()
-        taken = [receiver.take(datagram) for datagram in datagrams[heard:]]
+        taken = [receiver.receive(datagram) for datagram in datagrams[heard:]]
         assert taken[0] == ([event("left")] if heard < REPEATS else [])
         assert not any(taken[1:])
 
@@ -52,20 +52,20 @@ def test_an_event_is_said_again_and_taken_once() -> None:
 def test_events_keep_their_order() -> None:
     """Events of lost datagrams are taken from the next one, in order and once."""
     sender, receiver = TruthSender(START_NS), TruthReceiver()
-    sender.datagram(truth_at(1), [event("1")])
-    sender.datagram(truth_at(2), [event("2"), event("3")])
-    assert receiver.take(sender.datagram(truth_at(3), [event("4")])) == [event(each) for each in "1234"]
-    assert receiver.take(sender.datagram(truth_at(4), [event("5")])) == [event("5")]
+    sender.make_datagram(truth_at(1), [event("1")])
+    sender.make_datagram(truth_at(2), [event("2"), event("3")])
+    assert receiver.receive(sender.make_datagram(truth_at(3), [event("4")])) == [event(each) for each in "1234"]
+    assert receiver.receive(sender.make_datagram(truth_at(4), [event("5")])) == [event("5")]
 
 
 def test_many_events_wait_for_the_next_datagram() -> None:
     """A datagram has at most 16 events; more than that come later, and none is missing."""
     sender, receiver = TruthSender(START_NS), TruthReceiver()
     events = [event(str(index)) for index in range(3 * MAX_EVENTS)]
-    taken = receiver.take(sender.datagram(truth_at(1), events))
+    taken = receiver.receive(sender.make_datagram(truth_at(1), events))
     assert taken == events[:MAX_EVENTS]
     for index in range(3 * REPEATS):
-        taken += receiver.take(sender.datagram(truth_at(2 + index), []))
+        taken += receiver.receive(sender.make_datagram(truth_at(2 + index), []))
     assert taken == events
 
 
@@ -73,22 +73,22 @@ def test_a_car_that_was_started_again() -> None:
     """Events of a car that was started again are taken, though it counts anew."""
     receiver = TruthReceiver()
     first, second = TruthSender(START_NS), TruthSender(START_NS + 1_000_000)
-    receiver.take(first.datagram(truth_at(START_NS), [event("1"), event("2")]))
-    assert receiver.take(second.datagram(truth_at(START_NS + 1), [event("3")])) == [event("3")]
+    receiver.receive(first.make_datagram(truth_at(START_NS), [event("1"), event("2")]))
+    assert receiver.receive(second.make_datagram(truth_at(START_NS + 1), [event("3")])) == [event("3")]
 
 
 def test_the_past_is_not_the_newest() -> None:
     """A truth older than the newest is counted and does not replace it; its events count."""
     receiver = TruthReceiver()
-    receiver.take(write_truth(truth_at(START_NS), []))
-    assert receiver.take(write_truth(truth_at(START_NS - 1), [(1, event("left"))])) == [event("left")]
+    receiver.receive(encode_truth(truth_at(START_NS), []))
+    assert receiver.receive(encode_truth(truth_at(START_NS - 1), [(1, event("left"))])) == [event("left")]
     assert receiver.newest == truth_at(START_NS)
     assert receiver.counts == {"truths": 1, "old": 1}
 
 
 def test_a_long_detail_is_cut() -> None:
     """An event's detail is cut to 200 letters, and is read."""
-    (taken,) = TruthReceiver().take(write_truth(truth_at(1), [(1, event("x" * 1000))]))
+    (taken,) = TruthReceiver().receive(encode_truth(truth_at(1), [(1, event("x" * 1000))]))
     assert taken.detail == "x" * MAX_DETAIL
 
 
@@ -120,15 +120,15 @@ def with_event(*told: object) -> tuple[object, ...]:
 def test_what_is_not_the_truth(wrong: object) -> None:
     """A datagram with anything wrong is counted and dropped whole, and the next good one is taken."""
     receiver = TruthReceiver()
-    assert receiver.take(bytes(msgpack.packb(wrong))) == []
+    assert receiver.receive(bytes(msgpack.packb(wrong))) == []
     assert (receiver.newest, receiver.counts) == (None, {"garbage": 1})
-    assert len(receiver.take(bytes(msgpack.packb(GOOD)))) == 1
+    assert len(receiver.receive(bytes(msgpack.packb(GOOD)))) == 1
 
 
 def test_more_than_a_datagram_of_ours() -> None:
     """What is longer than any datagram of ours is not even looked at."""
     receiver = TruthReceiver()
-    receiver.take(bytes(msgpack.packb(GOOD)).ljust(MAX_BYTES + 1, b"\0"))
+    receiver.receive(bytes(msgpack.packb(GOOD)).ljust(MAX_BYTES + 1, b"\0"))
     assert receiver.counts == {"garbage": 1}
 
 
@@ -147,16 +147,16 @@ junk = st.recursive(
 def test_any_bytes(datagram: bytes) -> None:
     """Whatever comes never raises, and is counted once."""
     receiver = TruthReceiver()
-    assert receiver.take(datagram) == []
+    assert receiver.receive(datagram) == []
     assert sum(receiver.counts.values()) == 1
 
 
 @given(st.integers(0, 300), st.integers(0, 255))
 def test_a_datagram_with_a_wrong_byte(place: int, byte: int) -> None:
     """A datagram of ours with any byte changed or cut off never raises."""
-    datagram = bytearray(write_truth(truth_at(START_NS), [(1, event("left"))]))
+    datagram = bytearray(encode_truth(truth_at(START_NS), [(1, event("left"))]))
     receiver = TruthReceiver()
-    receiver.take(bytes(datagram[:place]))
+    receiver.receive(bytes(datagram[:place]))
     datagram[place % len(datagram)] = byte
-    receiver.take(bytes(datagram))
+    receiver.receive(bytes(datagram))
     assert sum(receiver.counts.values()) == 2

@@ -1,4 +1,4 @@
-"""The safety gate, the adapter and a software car together: who has the car after a stop."""
+"""The safety gate, the adapter and a software car together: control of the car after a stop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def new_gate() -> SafetyGate:
 
 
 def decide(rig: Rig, gate: SafetyGate) -> None:
-    """Have the gate say what the car shall do, as the actuator node does."""
+    """Apply the gate's decision, as the actuator node does."""
     state = rig.adapter.state()
     rig.actuation = gate.actuation(state, rig.now_ns)
     rig.adapter.engage(gate.needs(state), rig.now_ns)
@@ -25,7 +25,7 @@ def decide(rig: Rig, gate: SafetyGate) -> None:
 
 @both
 def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generation: int) -> None:
-    """After an emergency stop, at rest and parked, a driver drives off by hand: the kit is not engaged again."""
+    """The kit is not engaged again if a driver drives off by hand after an emergency stop, from standstill and PARK."""
     rig, gate = started(generation), new_gate()
     rig.engage()
     assert gate.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lavt.vehicle.dbw.states import SAID, TABLE
+from lavt.vehicle.dbw.states import SENT_IN_STATE, TABLE
 
 PAGE = Path(__file__).parents[3] / "docs/by_wire.md"
-SAID_TABLE = "\n".join(f"| {state} | {words} |" for state, words in SAID.items())
-TRANSITIONS = "\n".join(f"| {', '.join(row.sources)} | {row.words} | {row.target} |" for row in TABLE)
+SAID_TABLE = "\n".join(f"| {state} | {words} |" for state, words in SENT_IN_STATE.items())
+TRANSITIONS = "\n".join(f"| {', '.join(row.sources)} | {row.description} | {row.target} |" for row in TABLE)
 
 
 def test_said() -> None:

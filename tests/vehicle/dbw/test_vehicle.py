@@ -11,7 +11,7 @@ from tests.vehicle.dbw.rig import START_NS, profile
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
-from lavt.vehicle.dbw.vehicle import DbwVehicle, Truth
+from lavt.vehicle.dbw.vehicle import DbwVehicle, TruthSource
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
@@ -27,7 +27,7 @@ class StandInPort:
         self.waiting: list[ReceivedCanFrame] = []
         self.sent: list[tuple[CanFrame, int]] = []
         self.wake_ns: int | None = None
-        self.captured_ns = 0
+        self.taken_ns = 0
         self.is_gone = self.is_closed = False
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
@@ -38,7 +38,7 @@ class StandInPort:
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
         """Return what is waiting, once, and keep when it was taken."""
         self._check()
-        self.captured_ns = now_ns
+        self.taken_ns = now_ns
         taken, self.waiting = self.waiting, []
         return taken
 
@@ -60,7 +60,7 @@ def port() -> StandInPort:
     return StandInPort()
 
 
-def made(port: StandInPort, truth: Truth | None = None) -> DbwVehicle:
+def made(port: StandInPort, truth: TruthSource | None = None) -> DbwVehicle:
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     return DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS, truth=truth)
 
@@ -76,7 +76,7 @@ def test_without_truth(port: StandInPort) -> None:
     assert vehicle.advance(START_NS + NS_PER_MS) == []
     assert vehicle.ground_truth() is None
     assert vehicle.state().speed_mps > 0
-    assert port.captured_ns == START_NS + NS_PER_MS
+    assert port.taken_ns == START_NS + NS_PER_MS
 
 
 def test_truth_and_events(port: StandInPort) -> None:
@@ -136,7 +136,7 @@ def test_bus_gone(port: StandInPort) -> None:
 def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the adapter has due leaves with the time of the tick, after the bus was heard."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
-    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.captured_ns == now_ns else [])
+    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.taken_ns == now_ns else [])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
     assert port.sent == [(SPEED, START_NS + 7)]

@@ -11,7 +11,7 @@ from tests.vehicle.dbw.rig import START_NS, both, profile, road
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation, VehicleState
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.dbw.profile import OwnBrake
-from lavt.vehicle.dbw.proving import WatchdogTest
+from lavt.vehicle.dbw.watchdog_test import WatchdogTest
 from lavt.vehicle.sim.simulator import Simulator
 from lavt.vehicle.software_car.car import SoftwareCar
 from lavt.vehicle.software_car.kit import Kit
@@ -62,10 +62,10 @@ def test_proved(generation: int) -> None:
     attempt = Attempt(generation)
     proving = attempt.run()
     assert proving.failure == ""
-    assert proving.seen is not None
-    assert 100 * NS_PER_MS <= proving.seen.released_ns == proving.seen.braked_ns <= 121 * NS_PER_MS
-    assert proving.seen.reports == 49  # each 20 ms; the first came before the silence was known to be one
-    assert "watchdog has tripped" in proving.seen.words
+    assert proving.observation is not None
+    assert 100 * NS_PER_MS <= proving.observation.released_ns == proving.observation.braked_ns <= 121 * NS_PER_MS
+    assert proving.observation.reports == 49  # each 20 ms; the first came before the silence was known to be one
+    assert "watchdog has tripped" in proving.observation.kit_messages
     assert attempt.kit.state.gear == Gear.PARK
     assert not any(frame.identifier == GEAR_COMMANDS[generation] for _, frame in attempt.sent)
 
@@ -95,7 +95,7 @@ def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
     """While the kit is enabled, the adapter has a tick each 20 ms, and none once the silence has begun."""
     attempt = Attempt(1)
     ticks_ns: list[int] = []
-    ask = attempt.proving._adapter.ask
+    ask = attempt.proving._adapter.set_actuation
 
     def record(actuation: Actuation, now_ns: int) -> None:
         ticks_ns.append(now_ns)
@@ -113,7 +113,7 @@ def test_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_without_watchdog(generation: int) -> None:
     """A kit without its watchdog lets go and does not brake: nothing is proved."""
     proving = Attempt(generation, has_watchdog=False).run()
-    assert proving.seen is None
+    assert proving.observation is None
     assert proving.failure.startswith("the kit did not brake within 500 ms")
 
 
@@ -140,7 +140,7 @@ def test_late(by_ms: int, is_proved: bool) -> None:
     attempt = Attempt(1)
     attempt.spoil = delayed(attempt, by_ms)
     proving = attempt.run()
-    assert (proving.seen is not None) is is_proved
+    assert (proving.observation is not None) is is_proved
     if not is_proved:
         assert ", but only after 5" in proving.failure
 
@@ -175,7 +175,7 @@ def test_driver_brakes(generation: int) -> None:
     after.meddle = in_the_silence
     for attempt in (before, during, after):
         proving = attempt.run()
-        assert proving.seen is None
+        assert proving.observation is None
         assert proving.failure
 
 
@@ -199,7 +199,7 @@ HINDERED: list[tuple[Callable[[Attempt], object], str]] = [
     (lambda it: it.kit.inhibit("door", START_NS), "the kit cannot be enabled: a door is open"),
     (lambda it: it.kit.switch_remote(1, START_NS), "the kit cannot be enabled: RemoteReport has STATE pause"),
     (lambda it: it.proving.receive(CanFrame(0x201, bytes(8)), START_NS), "somebody else commands the kit (0x201)"),
-    (lambda it: it.proving.bus_gone("pulled out"), "the bus is gone: pulled out"),
+    (lambda it: it.proving.on_bus_gone("pulled out"), "the bus is gone: pulled out"),
 ]
 
 
@@ -209,7 +209,7 @@ def test_hindered(inhibit: Callable[[Attempt], object], failure: str) -> None:
     attempt = Attempt(2)
     inhibit(attempt)
     proving = attempt.run()
-    assert proving.seen is None
+    assert proving.observation is None
     assert proving.failure.startswith(failure)
     assert attempt.sent == []
 
@@ -230,7 +230,7 @@ def test_not_enabled() -> None:
     attempt = Attempt(2)
     attempt.meddle = lambda ms: attempt.kit.switch_remote(1, attempt.now_ns) if ms == 600 else None
     proving = attempt.run()
-    assert proving.seen is None
+    assert proving.observation is None
     assert proving.failure.startswith("the kit did not stay enabled: ")
 
 

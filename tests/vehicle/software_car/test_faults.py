@@ -73,12 +73,12 @@ def test_bus_off_is_silence(generation: int) -> None:
     """Cut from the bus the kit says and hears nothing, so commands time out and it brakes; back on it, it talks."""
     rig = driving(generation)
     rig.wait_ms(20)
-    rig.kit.bus_off(rig.now_ns)
+    rig.kit.set_bus_off(rig.now_ns)
     rig.last.clear()
     rig.drive_ms(80, throttle=0.5)
     assert rig.last == {}
     assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
-    rig.kit.bus_off(rig.now_ns, is_off=False)
+    rig.kit.set_bus_off(rig.now_ns, is_off=False)
     rig.wait_ms(100)
     assert len(rig.last) == (5 if generation == 1 else 8)
 

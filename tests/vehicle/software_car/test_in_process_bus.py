@@ -122,7 +122,7 @@ def test_a_set_from_the_past_goes_now() -> None:
     port.take(START_NS + 50 * NS_PER_MS)
     port.send(hand.commands(Asked(brake=0.5)), START_NS)
     port.take(START_NS + 51 * NS_PER_MS)
-    assert port.car.kit.state.actuators["brake"].heard_ns == START_NS + 50 * NS_PER_MS
+    assert port.car.kit.state.actuators["brake"].received_ns == START_NS + 50 * NS_PER_MS
 
 
 def test_waking_as_it_asks_hears_everything() -> None:

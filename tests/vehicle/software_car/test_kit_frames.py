@@ -9,7 +9,7 @@ from tests.vehicle.software_car.rig import START_NS, crc_by_division
 import lavt.vehicle.software_car as package
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import Field, Layout, checksum, crc8, has_crc, pack, unpack
+from lavt.vehicle.software_car.frames import Field, Layout, checksum, crc8, has_valid_crc, pack, unpack
 from lavt.vehicle.software_car.generation_1 import BRAKE_REPORT, STEERING_REPORT
 from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS, UNVERIFIED
 from lavt.vehicle.software_car.kit import Kit
@@ -35,10 +35,10 @@ def test_the_checksum_is_a_remainder(identifier: int, data: bytes) -> None:
     """The checksum is the remainder of a long division, and one turned bit of the data gives another."""
     crc = crc_by_division(identifier, data)
     assert checksum(identifier, data) == crc
-    assert has_crc(CanFrame(identifier, data + bytes([crc])))
+    assert has_valid_crc(CanFrame(identifier, data + bytes([crc])))
     for bit in range(8 * len(data)):
         turned = bytes(byte ^ (1 << bit % 8 if index == bit // 8 else 0) for index, byte in enumerate(data))
-        assert not has_crc(CanFrame(identifier, turned + bytes([crc])))
+        assert not has_valid_crc(CanFrame(identifier, turned + bytes([crc])))
 
 
 @given(st.data())
@@ -76,7 +76,7 @@ def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, b
     now_ns = START_NS
     for identifier, data, is_extended, wait_ms in frames:
         frame = CanFrame(identifier, data, is_extended)
-        if generation == 2 and has_crc(frame):
+        if generation == 2 and has_valid_crc(frame):
             continue
         enable_byte = {0x060: 3, 0x062: 3, 0x064: 2}.get(identifier)
         if generation == 1 and enable_byte is not None and len(data) == 8 and not is_extended:

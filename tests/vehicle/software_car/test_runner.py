@@ -12,7 +12,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.ground_truth_wire import TruthReceiver
 from lavt.vehicle.software_car.car import SoftwareCar
-from lavt.vehicle.software_car.runner import Runner
+from lavt.vehicle.software_car.runner import SoftwareCarRunner
 from lavt.vehicle.software_car.state import Gear
 
 STEP_NS = NS_PER_S // 240 + 1
@@ -53,7 +53,7 @@ class Life:
     def __init__(self) -> None:
         self.bus, self.hand = Bus(), Hand2()
         self.car: SoftwareCar = port_of(2).car
-        self.runner = Runner(self.car, self.bus, start_ns=START_NS)
+        self.runner = SoftwareCarRunner(self.car, self.bus, start_ns=START_NS)
         self.now_ns = START_NS
         self.said: list[tuple[str, str]] = []
 
@@ -116,7 +116,7 @@ def test_frames_are_taken_at_the_time_they_came() -> None:
     life.step_ms(20)
     life.come(*life.hand.commands(Asked(brake=0.5)), at_ns=life.now_ns + 5 * NS_PER_MS)
     life.step_ms(20)
-    assert life.car.kit.state.actuators["brake"].heard_ns == START_NS + 25 * NS_PER_MS
+    assert life.car.kit.state.actuators["brake"].received_ns == START_NS + 25 * NS_PER_MS
     assert life.runner.counts["frames_heard"] == 3
 
 
@@ -127,7 +127,7 @@ def test_times_that_cannot_be(at_ms: int, taken_ms: int) -> None:
     life.step_ms(20)
     life.come(*life.hand.commands(Asked(brake=0.5)), at_ns=START_NS + at_ms * NS_PER_MS)
     life.step_ms(20)
-    assert life.car.kit.state.actuators["brake"].heard_ns == START_NS + taken_ms * NS_PER_MS
+    assert life.car.kit.state.actuators["brake"].received_ns == START_NS + taken_ms * NS_PER_MS
 
 
 def test_the_news_of_a_drive() -> None:
@@ -135,10 +135,10 @@ def test_the_news_of_a_drive() -> None:
     life = Life()
     life.enable()
     life.drive_ms(200, throttle=0.3)
-    life.runner.act("driver_steers 3", life.now_ns)
+    life.runner.execute("driver_steers 3", life.now_ns)
     life.listen()
     life.drive_ms(100, throttle=0.3)
-    life.runner.act("driver_steers 0", life.now_ns)
+    life.runner.execute("driver_steers 0", life.now_ns)
     life.come(*life.hand.clearing())
     life.step_ms(1)
     assert life.said == [
@@ -162,8 +162,8 @@ def test_the_news_of_the_watchdog() -> None:
     life.said.clear()
     life.come(with_crc_broken(life.hand.commands(Asked())[0]))
     life.step_ms()
-    life.runner.act("driver_brakes 0.3", life.now_ns)
-    life.runner.act("driver_brakes 0", life.now_ns)
+    life.runner.execute("driver_brakes 0.3", life.now_ns)
+    life.runner.execute("driver_brakes 0", life.now_ns)
     life.come(*life.hand.clearing())
     life.step_ms(1)
     assert life.said == [
@@ -208,11 +208,11 @@ def test_what_happens_on_the_road_is_news() -> None:
 def test_words_that_are_none() -> None:
     """A word that is none is answered, an empty line is not, and `help` lists all."""
     life = Life()
-    life.runner.act("   ", life.now_ns)
+    life.runner.execute("   ", life.now_ns)
     assert life.listen() == []
-    life.runner.act("jump", life.now_ns)
+    life.runner.execute("jump", life.now_ns)
     assert life.listen() == [("rejected", "there is no word 'jump': help lists them")]
-    life.runner.act(" help\n", life.now_ns)
+    life.runner.execute(" help\n", life.now_ns)
     assert {kind for kind, _ in life.listen()} == {"help"}
 
 
@@ -220,7 +220,7 @@ def test_a_word_is_done_after_what_came_before_it() -> None:
     """A word is done at its time: what was heard before it is taken first."""
     life = Life()
     life.come(*life.hand.commands(Asked(brake=0.5)), life.hand.system(1), life.hand.gear(4))
-    life.runner.act("driver_shifts PARK", life.now_ns + NS_PER_MS)
+    life.runner.execute("driver_shifts PARK", life.now_ns + NS_PER_MS)
     assert life.car.kit.state.gear == Gear.PARK
     assert [kind for kind, _ in life.listen()][:2] == ["enabled", "gear"]
 
@@ -228,21 +228,21 @@ def test_a_word_is_done_after_what_came_before_it() -> None:
 def test_the_truth_is_told_for_each_step() -> None:
     """There is a datagram whenever the simulator has moved on, with the newest truth, and none in between."""
     life, receiver = Life(), TruthReceiver()
-    assert life.runner.truth() is not None
-    assert life.runner.truth() is None
+    assert life.runner.make_truth_datagram() is not None
+    assert life.runner.make_truth_datagram() is None
     life.car.events.append(VehicleEvent(START_NS + 1, "lane_invasion", "to the left"))
     life.step_ms(10)
-    datagram = life.runner.truth()
+    datagram = life.runner.make_truth_datagram()
     assert datagram is not None
-    assert receiver.take(datagram) == [VehicleEvent(START_NS + 1, "lane_invasion", "to the left")]
+    assert receiver.receive(datagram) == [VehicleEvent(START_NS + 1, "lane_invasion", "to the left")]
     assert receiver.newest == life.car.simulator.ground_truth()
-    assert life.runner.truth() is None
+    assert life.runner.make_truth_datagram() is None
     life.step_ms(1)
-    assert life.runner.truth() is None
+    assert life.runner.make_truth_datagram() is None
     life.step_ms(500)
-    datagram = life.runner.truth()
+    datagram = life.runner.make_truth_datagram()
     assert datagram is not None
-    assert receiver.take(datagram) == []
+    assert receiver.receive(datagram) == []
     assert life.now_ns - receiver.newest.mono_ns <= STEP_NS
 
 

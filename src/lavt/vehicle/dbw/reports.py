@@ -128,7 +128,7 @@ class NewestReports:
             if values[signal] not in numbers
         ]
         reasons = [
-            f"{message} gives the reason {self._value_name(message, signal, values[signal])}"
+            f"{message}: {self._value_name(message, signal, values[signal])}"
             for signal in report.reasons
             if values[signal]
         ]
