@@ -141,7 +141,7 @@ def test_requested_and_yes(run: Run, monkeypatch: pytest.MonkeyPatch, port: int)
     monkeypatch.setattr(sys, "stdin", Terminal("yes\n"))
     code, _, err = run(*changes("dataspeed_gen2", port))
     assert code == 1
-    assert "the kit is not heard" in err
+    assert "reports are missing" in err
 
 
 REJECTED: list[tuple[list[str], str]] = [

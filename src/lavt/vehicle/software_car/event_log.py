@@ -60,7 +60,7 @@ def _enabled_text(state: KitState, before: Any) -> str:
     axes = enabled(state)
     if set(axes) > set(before):
         return f"enabled: {', '.join(axes)}"
-    return f"released: {REASONS[state.disengaged]}" + (f"; still enabled: {', '.join(axes)}" if axes else "")
+    return f"released: {REASONS[state.disengaged]}" + (f"; remaining: {', '.join(axes)}" if axes else "")
 
 
 def _overridden_text(state: KitState, _: Any) -> str:
