@@ -33,7 +33,7 @@ GROUP = "239.74.163.2"
 CLOCK = MachineClock()
 LONGEST_NS = 60 * NS_PER_S
 KIT_MS = 100
-"""A kit disengages this long after the last command, which may precede the fault by no more than this."""
+"""A kit disengages this long after the last command, which it received before the fault."""
 ROOM_MS = 60
 """Tolerance for a busy machine, added to the design's limits."""
 BEFORE_MS = 200

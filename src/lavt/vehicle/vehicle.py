@@ -56,7 +56,7 @@ class Vehicle(Protocol):
         """Engage or disengage the vehicle. Repeated calls with the same `wanted` have no effect.
 
         A vehicle that needs time to engage reports in its state when it is engaged. A disengaged vehicle accepts no
-        command but the brake, and holds itself in place once it is stationary.
+        command but the brake, and stays in place once it is stationary.
         """
         ...
 

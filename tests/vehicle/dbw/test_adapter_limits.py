@@ -91,11 +91,11 @@ def test_rate_of_the_kit() -> None:
     for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
         rig = started(int(name[-1]))
         rig.engage()
-        told = {
+        rates = {
             frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
         }
-        assert 113 in told
-        assert told <= {0, 113}
+        assert 113 in rates
+        assert rates <= {0, 113}
 
 
 @both

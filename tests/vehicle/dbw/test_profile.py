@@ -38,9 +38,9 @@ def changed(folder: Path, name: str, **changes: Any) -> Path:
 def rejected(name_or_path: str | Path, **keys: Any) -> str:
     with pytest.raises(UserError) as error:
         load_profile(str(name_or_path), **keys)
-    said = str(error.value)
-    assert "\n" not in said
-    return said
+    message = str(error.value)
+    assert "\n" not in message
+    return message
 
 
 def test_shipped() -> None:
@@ -162,10 +162,10 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "changes", "said"), REJECTED, ids=[said for _, _, said in REJECTED])
-def test_rejected(tmp_path: Path, name: str, changes: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("name", "changes", "message"), REJECTED, ids=[message for _, _, message in REJECTED])
+def test_rejected(tmp_path: Path, name: str, changes: dict[str, Any], message: str) -> None:
     """The error for a wrong profile has one line and names the key or the signal."""
-    assert said in rejected(changed(tmp_path, name, **changes))
+    assert message in rejected(changed(tmp_path, name, **changes))
 
 
 def test_section() -> None:

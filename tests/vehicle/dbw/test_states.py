@@ -178,7 +178,7 @@ SEVERAL: list[tuple[State, dict[str, Any]]] = [
 @pytest.mark.parametrize(
     ("state", "cause", "known"),
     [(*each, known) for each in SEVERAL for known in DETAILS if (each[0], known) != ("enabling", "trips")],
-)  # a trip ends enabling at once
+)  # a trip ends enabling immediately
 def test_other_reported_problems_are_in_the_reason(state: State, cause: dict[str, Any], known: str) -> None:
     """A reason contains the kit's other texts, and no empty part if there are none."""
     text = reason(state, **{**cause, known: DETAILS[known]})

@@ -20,7 +20,7 @@ OTHER_COMMANDER_NS: Final = NS_PER_S
 
 
 class NewestReports:
-    """The newest report of each kind in a profile.
+    """The newest report of each message in a profile.
 
     `counts` has the reports that could not be used: `wrong_checksum`, `value_unknown` (the codec counts the others),
     and `foreign_commands`, commands that another sender sent to the kit.

@@ -60,7 +60,7 @@ class FrameSender:
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
         self.sent = DriveCommand(0.0, 0.0, 0.0)
-        """The last set's drive command; values of disabled axes are replaced by the reported ones."""
+        """The last set's drive command; a disabled axis has the reported angle or a released pedal."""
         self.sent_ns = start_ns
         self.counts: Counter[str] = Counter()
         """`sets`, and how often each limit took effect: `limited_wheel_deg`, `limited_throttle`, ..."""

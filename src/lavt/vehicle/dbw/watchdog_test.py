@@ -162,7 +162,7 @@ class WatchdogTest:
         reports = self._reports
         overrides = reports.texts("override")
         if self._released_ns is None:
-            self._fail("the kit did not release the brake: another sender may command it, or its time-out is off")
+            self._fail("the kit did not release the brake: another sender may command it, or its timeout is off")
         elif self._braked_ns is None or self._braked_ns - self._last_ns > BRAKE_WITHIN_NS:
             late = "" if self._braked_ns is None else f", but only after {self._ms(self._braked_ns)} ms"
             self._fail(
