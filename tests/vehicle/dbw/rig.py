@@ -46,7 +46,7 @@ class Moment:
     state: str
 
 
-class Rig:
+class AdapterRig:
     """An adapter that drives a software car and gets `actuation` every `tick_ns`.
 
     `spoil` may change a frame to the car, or drop it (None); `lose_report` drops frames from the car; `is_cut` drops
@@ -74,7 +74,7 @@ class Rig:
         if start_frames:
             self.run_ms(400)
 
-    def copy(self) -> Rig:
+    def copy(self) -> AdapterRig:
         """Return a rig in the same state that shares only immutable objects."""
         constants = (self.profile, self.profile.codec, road(), *self.moments)
         return deepcopy(self, {id(each): each for each in constants})
@@ -86,7 +86,7 @@ class Rig:
             self.now_ns = min(self.now_ns + step_ms * NS_PER_MS, end_ns)
             self._step()
 
-    def run_until(self, condition: Callable[[Rig], bool], limit_ms: int = 5000, *, step_ms: int = 1) -> int:
+    def run_until(self, condition: Callable[[AdapterRig], bool], limit_ms: int = 5000, *, step_ms: int = 1) -> int:
         """Run until a condition is met, and return the time taken in ms."""
         for passed_ms in range(0, limit_ms, step_ms):
             if condition(self):
@@ -136,29 +136,29 @@ class Rig:
         return (self.now_ns - since_ns) // NS_PER_MS
 
 
-def started(generation: int) -> Rig:
+def started(generation: int) -> AdapterRig:
     """Return a stationary car whose reports have all been received."""
     return _started(generation).copy()
 
 
-def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> Rig:
+def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> AdapterRig:
     """Return a car that drives at slightly more than 5 m/s, steered slightly to the left."""
-    rig = _accelerated(Rig(generation, **keys)) if keys else _driving(generation).copy()
+    rig = _accelerated(AdapterRig(generation, **keys)) if keys else _driving(generation).copy()
     rig.tick_ns = tick_ms * NS_PER_MS
     return rig
 
 
 @cache
-def _started(generation: int) -> Rig:
-    return Rig(generation)
+def _started(generation: int) -> AdapterRig:
+    return AdapterRig(generation)
 
 
 @cache
-def _driving(generation: int) -> Rig:
+def _driving(generation: int) -> AdapterRig:
     return _accelerated(started(generation))
 
 
-def _accelerated(rig: Rig) -> Rig:
+def _accelerated(rig: AdapterRig) -> AdapterRig:
     rig.engage()
     rig.actuation = Actuation(0.01, 0.5, 0.0)
     rig.run_until(lambda rig: rig.speed_mps > 5.0, 10_000, step_ms=COARSE_MS)

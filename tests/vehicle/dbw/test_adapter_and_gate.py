@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.safety.rig import new_limiter
-from tests.vehicle.dbw.rig import Rig, both, started
+from tests.vehicle.dbw.rig import AdapterRig, both, started
 
 from lavt.domain import SessionRequest
 from lavt.safety.gate import SafetyGate
@@ -16,7 +16,7 @@ def new_gate() -> SafetyGate:
     return SafetyGate(LIMITS, new_limiter(), new_epoch=lambda: next(epochs), new_token=lambda: b"token")
 
 
-def decide(rig: Rig, gate: SafetyGate) -> None:
+def decide(rig: AdapterRig, gate: SafetyGate) -> None:
     """Apply the gate's decision, as the actuator node does."""
     state = rig.adapter.state()
     rig.actuation = gate.actuation(state, rig.now_ns)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tests.vehicle.dbw.rig import Rig, driving, started
+from tests.vehicle.dbw.rig import AdapterRig, driving, started
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.vehicle import ReachedCommand
@@ -22,7 +22,7 @@ OTHER = bytes([0x77, 0x01])
 class ChosenReports:
     """A car whose steering reports contain the command that was chosen last, at first the one before the test."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: AdapterRig) -> None:
         self.rig = rig
         self._data, self._command = b"", b""
         rig.lose_report = self._replace

@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, START_NS, Rig, both, driving, profile, road, started
+from tests.vehicle.dbw.rig import COARSE_MS, START_NS, AdapterRig, both, driving, profile, road, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -23,7 +23,7 @@ from lavt.vehicle.software_car.state import AXES, Gear
 ALL = set(AXES)
 
 
-def names(rig: Rig) -> list[str]:
+def names(rig: AdapterRig) -> list[str]:
     """Return the DBC's names of the messages that were sent."""
     known = {facts.identifier: name for name, facts in rig.profile.codec.messages.items()}
     return [known[frame.identifier] for _, frame in rig.sent]
@@ -43,7 +43,7 @@ def test_idle_is_silent(generation: int) -> None:
 @both
 def test_missing_reports_inhibit(generation: int) -> None:
     """Until every report has arrived once, each missing one is an inhibit reason by name."""
-    rig = Rig(generation, start_frames=False)
+    rig = AdapterRig(generation, start_frames=False)
     inhibit_reason = rig.adapter.state().inhibit_reason
     assert inhibit_reason == "; ".join(f"no {message} yet" for message in rig.profile.reports)
 
@@ -245,7 +245,7 @@ def test_not_engaged_while_rolling(generation: int) -> None:
 
 def test_an_inhibited_installation_is_not_engaged() -> None:
     """An installation with an inhibit reason reports it and is never engaged."""
-    rig = Rig(2, inhibit_reason="55 signals of dataspeed_gen2 are unverified")
+    rig = AdapterRig(2, inhibit_reason="55 signals of dataspeed_gen2 are unverified")
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
@@ -255,7 +255,7 @@ def test_an_inhibited_installation_is_not_engaged() -> None:
 def test_an_unknown_steering_sign_inhibits() -> None:
     """A car whose steering sign is not known is not engaged."""
     known = profile("dataspeed_gen1")
-    rig = Rig(1, profile=replace(known, car=replace(known.car, steering_sign=None)))
+    rig = AdapterRig(1, profile=replace(known, car=replace(known.car, steering_sign=None)))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
@@ -275,10 +275,10 @@ def test_negative_steering_sign(generation: int) -> None:
 
 def test_user_commands() -> None:
     """Generation 2 can be driven with its user commands, but only if the kit accepts them."""
-    rig = Rig(2, profile=profile("dataspeed_gen2:user"), commands="user")
+    rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="user")
     rig.engage()
     assert {frame.identifier for _, frame in rig.sent} == {0x210, 0x211, 0x212, 0x213, 0x216}
-    other = Rig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
+    other = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
     other.adapter.engage(True, other.now_ns)
     other.run_ms(1000)
     assert other.adapter.state().inhibit_reason == "RemoteReport has STATE remote"

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -22,15 +22,15 @@ from lavt.vehicle.software_car.state import AXES, Gear
 STEERING = {1: 0x064, 2: 0x200}
 
 
-def last_sent_ns(rig: Rig) -> int:
+def last_sent_ns(rig: AdapterRig) -> int:
     return max(at_ns for at_ns, _ in rig.sent)
 
 
-def is_lost(rig: Rig) -> bool:
+def is_lost(rig: AdapterRig) -> bool:
     return rig.state == "lost"
 
 
-def stop_and_disengage(rig: Rig) -> None:
+def stop_and_disengage(rig: AdapterRig) -> None:
     """Stop the car with the driver's brake pedal, and disengage it."""
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, 20_000, step_ms=COARSE_MS)
@@ -201,13 +201,13 @@ def test_foreign_commands_end_driving(generation: int) -> None:
 
 # Override by the driver.
 
-OVERRIDES: dict[str, Callable[[Rig], None]] = {
+OVERRIDES: dict[str, Callable[[AdapterRig], None]] = {
     "steering": lambda rig: rig.kit.driver_steers(3.0, rig.now_ns),
     "brake": lambda rig: rig.kit.driver_brakes(0.3, rig.now_ns),
     "throttle": lambda rig: rig.kit.driver_throttles(0.3, rig.now_ns),
     "gear": lambda rig: rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns),
 }
-HANDS_OFF: dict[str, Callable[[Rig], None]] = {
+HANDS_OFF: dict[str, Callable[[AdapterRig], None]] = {
     "steering": lambda rig: rig.kit.driver_steers(0.0, rig.now_ns),
     "brake": lambda rig: rig.kit.driver_brakes(0.0, rig.now_ns),
     "throttle": lambda rig: rig.kit.driver_throttles(0.0, rig.now_ns),
@@ -549,7 +549,7 @@ def test_drive_rejected(generation: int) -> None:
     """A rejected gear is reported with the kit's reason after 3 s, and the car is disengaged in PARK."""
     known = profile(f"dataspeed_gen{generation}")
     gear = replace(known.gear, numbers={**known.gear.numbers, "drive": 5})
-    rig = Rig(generation, profile=replace(known, gear=gear))
+    rig = AdapterRig(generation, profile=replace(known, gear=gear))
     rig.adapter.engage(True, rig.now_ns)
     took_ms = rig.run_until(is_lost)
     assert 3120 <= took_ms <= 3160
@@ -567,7 +567,7 @@ def test_drive_rejected(generation: int) -> None:
 def test_a_shift_in_progress_is_awaited() -> None:
     """If DRIVE was requested but not reported, the axes stay enabled for 1 s before the car is disengaged in PARK."""
     known = profile("dataspeed_gen1")
-    rig = Rig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "drive": 5})))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling" and rig.adapter._is_shifting)
     rig.adapter.engage(False, rig.now_ns)
@@ -594,10 +594,10 @@ def test_park_rejected() -> None:
     assert "GearReport: fault" in reason
 
 
-def without_park() -> Rig:
+def without_park() -> AdapterRig:
     """Return a stationary car whose kit rejects the number that the profile has for PARK."""
     known = profile("dataspeed_gen1")
-    rig = Rig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "park": 5})))
+    rig = AdapterRig(1, profile=replace(known, gear=replace(known.gear, numbers={**known.gear.numbers, "park": 5})))
     rig.engage()
     return rig
 
@@ -659,7 +659,7 @@ def test_out_of_gear(generation: int) -> None:
 @both
 def test_every_end_of_driving_is_an_event(generation: int) -> None:
     """Every cause that ends driving emits events with texts, each once."""
-    causes: list[Callable[[Rig], Any]] = [
+    causes: list[Callable[[AdapterRig], Any]] = [
         lambda rig: rig.adapter.on_bus_gone("can0 is down", rig.now_ns),
         lambda rig: rig.kit.set_bus_off(rig.now_ns),
         lambda rig: rig.kit.driver_steers(3.0, rig.now_ns),

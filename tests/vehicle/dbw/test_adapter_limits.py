@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started, with_limits
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started, with_limits
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
@@ -20,7 +20,7 @@ LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
 STEERING = {1: 0x064, 2: 0x200}
 
 
-def angles_deg(rig: Rig) -> list[tuple[int, float]]:
+def angles_deg(rig: AdapterRig) -> list[tuple[int, float]]:
     """Return the times and steering angles that were sent, decoded from bytes 0 and 1."""
     identifier = STEERING[rig.generation]
     return [
@@ -58,7 +58,7 @@ def test_rate(generation: int) -> None:
 @both
 def test_a_limited_command_is_sent_faster(generation: int) -> None:
     """While the steering rate limits the angle, a set is sent every 5 ms, and then every 20 ms."""
-    rig = Rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
+    rig = AdapterRig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
     rig.engage()
     rig.run_ms(300, step_ms=COARSE_MS)
     rig.tick_ns = 50 * NS_PER_MS
@@ -74,7 +74,7 @@ def test_a_limited_command_is_sent_faster(generation: int) -> None:
 @both
 def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
     """Before the first tick nothing is sent, even if driving is wanted, and the missing tick is counted once."""
-    rig = Rig(generation, start_frames=False)
+    rig = AdapterRig(generation, start_frames=False)
     rig.is_ticking = False
     rig.run_ms(400, step_ms=COARSE_MS)
     rig.adapter.engage(True, rig.now_ns)

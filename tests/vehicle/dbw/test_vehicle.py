@@ -92,8 +92,10 @@ def test_truth_and_events(port: StandInPort) -> None:
     port.waiting = [ReceivedCanFrame(override, START_NS + 3)]
     events = vehicle.advance(START_NS + 9)
     assert [(event.mono_ns - START_NS, event.kind) for event in events] == [
-        (0, "off_road"), (3, "fault"), (5, "collision"),
-    ]  # fmt: skip
+        (0, "off_road"),
+        (3, "fault"),
+        (5, "collision"),
+    ]
     assert vehicle.ground_truth() == truth_at(START_NS + 5)
     vehicle.advance(START_NS + 20)
     assert vehicle.ground_truth() == truth_at(START_NS + 5)

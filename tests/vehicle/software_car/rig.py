@@ -109,7 +109,7 @@ class Sender2:
         return with_crc(0x216, bytes([request | self.count << 4]))
 
 
-class Rig:
+class KitRig:
     """A kit, a sender of commands, and a clock."""
 
     def __init__(self, generation: int, *, speed_mps: float = 0.0, **keys: Any) -> None:
@@ -181,9 +181,9 @@ ALL = set(AXES)
 both = pytest.mark.parametrize("generation", [1, 2])
 
 
-def driving(generation: int, **keys: Any) -> Rig:
+def driving(generation: int, **keys: Any) -> KitRig:
     """Return a kit that is enabled, in drive and moving."""
-    rig = Rig(generation, **keys)
+    rig = KitRig(generation, **keys)
     rig.enable()
     rig.set_motion(10.0)
     return rig

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.vehicle.software_car.rig import START_NS, Rig, driving
+from tests.vehicle.software_car.rig import START_NS, KitRig, driving
 
 from lavt.domain import NS_PER_S
 from lavt.errors import UserError
@@ -59,7 +59,7 @@ def test_a_command_has_its_effect(line: str, has_effect: Callable[[Kit], bool]) 
 )
 def test_an_inverse_command_restores_the_kit(command: str, inverse: str) -> None:
     """A command and its inverse leave the kit as it was."""
-    rig = Rig(2)
+    rig = KitRig(2)
     before = condition_of(rig)
     execute(rig.kit, command, rig.now_ns)
     assert condition_of(rig) != before
@@ -67,7 +67,7 @@ def test_an_inverse_command_restores_the_kit(command: str, inverse: str) -> None
     assert condition_of(rig) == before
 
 
-def condition_of(rig: Rig) -> tuple[object, ...]:
+def condition_of(rig: KitRig) -> tuple[object, ...]:
     """Return a kit's faults, and its number of frames in a second."""
     rig.now_ns += NS_PER_S
     state, frame_count = rig.kit.state, len(rig.kit.frames_due(rig.now_ns))

@@ -1,7 +1,7 @@
 """Overrides by the driver, and shifting."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, Rig, both, driving
+from tests.vehicle.software_car.rig import ALL, AXES, KitRig, both, driving
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
@@ -70,7 +70,7 @@ def test_clearing_frames_have_no_counter() -> None:
         rig.wait_ms(25)
         rig.send(*rig.sender.clearing())
     assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
-    other = Rig(1)
+    other = KitRig(1)
     other.send(*(CanFrame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.sender.clearing()))
     assert other.enabled() == set()
 
@@ -86,7 +86,7 @@ def test_a_full_clearing_frame_without_a_counter_trips() -> None:
 @both
 def test_a_shift_needs_the_brake(generation: int) -> None:
     """A shift without the brake is rejected with 5 (press the brake); with the brake it is executed."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.command(brake=0.0)
     rig.send(rig.sender.gear(4))
@@ -122,7 +122,7 @@ def test_reasons_for_rejected_gears(generation: int) -> None:
 @both
 def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
     """In park the car brakes, and in neutral the throttle has no effect, whether of the kit or of the driver."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.command(throttle=0.5)
     rig.kit.driver_throttles(0.02, rig.now_ns)
@@ -153,7 +153,7 @@ def test_override_by_the_shifter() -> None:
 @both
 def test_the_driver_prevents_enabling(generation: int) -> None:
     """A command to enable while the driver brakes is an override that stays after the pedal was released."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.command()
     rig.request_system()

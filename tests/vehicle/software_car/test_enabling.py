@@ -1,7 +1,7 @@
 """Enabling the axes of a kit, and commands of enabled axes."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, CommandValues, Rig, Sender2, both, driving, with_crc
+from tests.vehicle.software_car.rig import ALL, CommandValues, KitRig, Sender2, both, driving, with_crc
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import ReleaseReason, SystemState
@@ -9,7 +9,7 @@ from lavt.vehicle.software_car.state import ReleaseReason, SystemState
 
 def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
     """In generation 1 each axis is enabled by its own command with EN, independently of the others."""
-    rig = Rig(1)
+    rig = KitRig(1)
     steering, _, _ = rig.sender.commands(CommandValues(angle_deg=10.0))
     assert rig.enabled() == set()
     rig.send(steering)
@@ -18,12 +18,12 @@ def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
 
 def test_generation_2_needs_a_request_and_commands_to_all_axes() -> None:
     """In generation 2 no axis is enabled until the system is requested to enable and all axes are commanded with EN."""
-    rig = Rig(2)
+    rig = KitRig(2)
     rig.command()
     assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
     rig.request_system()
     assert (rig.enabled(), rig.kit.state.system) == (ALL, SystemState.ACTIVE)
-    other = Rig(2)
+    other = KitRig(2)
     other.request_system()
     steering, brake, throttle = other.sender.commands(CommandValues())
     other.send(steering, brake)
@@ -35,7 +35,7 @@ def test_generation_2_needs_a_request_and_commands_to_all_axes() -> None:
 def test_a_request_to_enable_expires() -> None:
     """A request to enable expires after 100 ms: later commands enable nothing."""
     for wait_ms, enabled in ((99.999, ALL), (100, set())):
-        rig = Rig(2)
+        rig = KitRig(2)
         rig.request_system()
         rig.wait_ms(wait_ms)
         rig.command()
@@ -45,7 +45,7 @@ def test_a_request_to_enable_expires() -> None:
 @both
 def test_disabling_in_park_does_not_trip(generation: int) -> None:
     """Disabling the kit in park at standstill does not trip the watchdog."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.request_system(2)
     rig.command(enable=False)
@@ -69,12 +69,12 @@ def test_generation_2_needs_a_new_request() -> None:
 
 def test_only_the_chosen_set_is_accepted() -> None:
     """A kit accepts commands of its own set only, remote or user."""
-    rig = Rig(2)
+    rig = KitRig(2)
     rig.sender = Sender2(0x210)
     rig.command()
     rig.request_system()
     assert rig.enabled() == set()
-    user = Rig(2, commands="user")
+    user = KitRig(2, commands="user")
     user.sender = Sender2(0x210)
     user.enable()
     assert user.enabled() == ALL
@@ -105,7 +105,7 @@ def test_steering_rate(generation: int) -> None:
 @both
 def test_steering_starts_at_the_current_angle(generation: int) -> None:
     """Once enabled, the kit turns the wheel from its current angle, not from the centre."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.set_motion(0.0, steering_rad=0.2)
     rig.enable()
     assert rig.wheels()[0] == pytest.approx(0.2 * 14.8 * 57.29578)
@@ -114,7 +114,7 @@ def test_steering_starts_at_the_current_angle(generation: int) -> None:
 @both
 def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
     """A command of an unknown type counts as a command without its enable bit."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.request_system()
     rig.command(angle_deg=1.0)
     assert rig.enabled() == ALL
@@ -149,7 +149,7 @@ def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: fl
 
 def test_a_repeated_counter_invalidates_a_request() -> None:
     """Generation 2 ignores a request to the system with the counter of the previous one."""
-    rig = Rig(2)
+    rig = KitRig(2)
     rig.enable()
     rig.request_system()
     rig.sender.count -= 1

@@ -1,7 +1,7 @@
 """Faults of a kit, conditions that inhibit it, and loss of the bus."""
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, Rig, both, driving
+from tests.vehicle.software_car.rig import ALL, KitRig, both, driving
 
 from lavt.errors import UserError
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
@@ -29,7 +29,7 @@ def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
 def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
     """A part with a fault is not enabled, and generation 2 not at all; clearing the fault allows it again."""
-    rig = Rig(generation)
+    rig = KitRig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.command()
     rig.request_system()
@@ -51,7 +51,7 @@ def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
 )
 def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
     """Belt, door and lockouts keep generation 2 in manual, with the reason; while driving it disengages and brakes."""
-    rig = Rig(2)
+    rig = KitRig(2)
     rig.kit.inhibit(name, rig.now_ns)
     rig.command()
     rig.request_system()
@@ -88,7 +88,7 @@ def test_bus_off(generation: int) -> None:
 @both
 def test_unknown_names_are_rejected(generation: int) -> None:
     """An unknown fault, inhibit reason, value or gear is rejected with the known ones."""
-    kit = Rig(generation).kit
+    kit = KitRig(generation).kit
     with pytest.raises(UserError, match=r"no fault 'brake\.smoke': the known ones are brake"):
         kit.set_fault("brake.smoke", 10**12)
     with pytest.raises(UserError, match=r"'rain': the known ones are acceleration"):

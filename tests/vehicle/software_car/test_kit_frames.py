@@ -11,7 +11,7 @@ from tests.vehicle.software_car.rig import START_NS, crc_by_division
 import lavt.vehicle.software_car as package
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import Field, Layout, checksum, crc8, has_valid_crc, pack, unpack
+from lavt.vehicle.software_car.frames import BitField, Layout, checksum, crc8, has_valid_crc, pack, unpack
 from lavt.vehicle.software_car.generation_1 import BRAKE_REPORT, STEERING_REPORT
 from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS, UNVERIFIED
 from lavt.vehicle.software_car.kit import Kit
@@ -53,7 +53,7 @@ def test_unpack_inverts_pack(data: st.DataObject) -> None:
 
 def test_values_out_of_range_are_clamped() -> None:
     """A value that does not fit its field is clamped and changes no other field."""
-    layout = Layout(2, (Field("low", 0, 4), Field("signed", 4, 4, is_signed=True), Field("high", 8, 8)))
+    layout = Layout(2, (BitField("low", 0, 4), BitField("signed", 4, 4, is_signed=True), BitField("high", 8, 8)))
     assert pack(layout, {"low": 99, "signed": -99, "high": 300}) == bytes([0x8F, 0xFF])
     with pytest.raises(KeyError, match="other"):
         pack(layout, {"other": 1})

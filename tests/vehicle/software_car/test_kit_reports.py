@@ -4,7 +4,15 @@ import math
 import struct
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, CommandValues, Rig, both, crc_by_division, driving, with_crc_broken
+from tests.vehicle.software_car.rig import (
+    START_NS,
+    CommandValues,
+    KitRig,
+    both,
+    crc_by_division,
+    driving,
+    with_crc_broken,
+)
 
 from lavt.domain import NS_PER_MS
 
@@ -14,7 +22,7 @@ PERIODS_MS = {
 }
 
 
-def reports(rig: Rig) -> dict[int, bytes]:
+def reports(rig: KitRig) -> dict[int, bytes]:
     """Return the newest reports after all periods have passed."""
     rig.last.clear()
     for _ in range(10):
@@ -27,7 +35,7 @@ def reports(rig: Rig) -> dict[int, bytes]:
 @both
 def test_reports_have_their_periods(generation: int) -> None:
     """Each report is sent once per period, exact to the nanosecond."""
-    kit = Rig(generation).kit
+    kit = KitRig(generation).kit
     times: dict[int, list[int]] = {identifier: [] for identifier in PERIODS_MS[generation]}
     while (wake_ns := kit.next_wake_ns()) <= START_NS + 1000 * NS_PER_MS:
         for frame in kit.frames_due(wake_ns):
@@ -39,7 +47,7 @@ def test_reports_have_their_periods(generation: int) -> None:
 @both
 def test_a_late_call_returns_each_report_once(generation: int) -> None:
     """A call that is one second late returns each report once, and the next ones at their regular times."""
-    kit = Rig(generation).kit
+    kit = KitRig(generation).kit
     late_ns = START_NS + 1_003 * NS_PER_MS
     assert sorted(frame.identifier for frame in kit.frames_due(late_ns)) == sorted(PERIODS_MS[generation])
     assert kit.frames_due(late_ns) == []
@@ -129,7 +137,7 @@ def test_generation_1_reports_an_override() -> None:
 )
 def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int) -> None:
     """A fault sets exactly its own bit."""
-    rig = Rig(1 if identifier < 0x100 else 2)
+    rig = KitRig(1 if identifier < 0x100 else 2)
     before = dict(reports(rig))[identifier]
     rig.kit.set_fault(name, rig.now_ns)
     changed = [index ^ after for index, after in zip(before, dict(reports(rig))[identifier], strict=True)]
@@ -181,20 +189,20 @@ def test_generation_2_reports_an_override_of_another_axis() -> None:
 
 def test_unknown_values() -> None:
     """An unknown angle, speed or wheel speed is reported as 0x8000."""
-    rig = Rig(1)
+    rig = KitRig(1)
     for name in ("angle", "speed", "wheel_speed"):
         rig.kit.set_unknown(name)
     found = reports(rig)
     assert (found[0x065][0:2], found[0x065][4:6], found[0x06A]) == (b"\x00\x80", b"\x00\x80", b"\x00\x80" * 4)
     rig.kit.set_unknown("speed", is_unknown=False)
     assert reports(rig)[0x065][4:6] == b"\x00\x00"
-    second = Rig(2)
+    second = KitRig(2)
     second.kit.set_unknown("speed")
     assert reports(second)[0x107][:4] == b"\x00\x80\x00\x80"
 
 
 def test_a_rejected_gear_is_reported() -> None:
     """Generation 1 reports the reason of a rejected gear: 5, press the brake."""
-    rig = Rig(1)
+    rig = KitRig(1)
     rig.send(rig.sender.gear(4))
     assert reports(rig)[0x067] == bytes([1 | 4 << 4, 5 | 0x80])

@@ -3,7 +3,7 @@
 from itertools import product
 
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, CommandValues, Rig, Sender2, both, driving, with_crc_broken
+from tests.vehicle.software_car.rig import ALL, AXES, CommandValues, KitRig, Sender2, both, driving, with_crc_broken
 
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
 from lavt.vehicle.software_car.state import Gear, ReleaseReason, SystemState
@@ -114,7 +114,7 @@ def test_a_wrong_checksum_trips_the_watchdog() -> None:
 
 def test_orders_with_wrong_checksums_are_ignored() -> None:
     """A request to the system or a shift with a wrong checksum has no effect."""
-    rig = Rig(2)
+    rig = KitRig(2)
     rig.command(brake=0.5)
     assert isinstance(rig.sender, Sender2)
     rig.send(with_crc_broken(rig.sender.system(1)))
@@ -127,7 +127,7 @@ def test_orders_with_wrong_checksums_are_ignored() -> None:
 def test_generation_1_disabled_in_gear_or_moving_trips() -> None:
     """In generation 1, disabling an actuator in gear or while the car moves trips the watchdog."""
     for in_gear, speed_mps in product((False, True), (0.0, 10.0)):
-        rig = Rig(1)
+        rig = KitRig(1)
         rig.enable(in_drive=in_gear)
         rig.set_motion(speed_mps)
         rig.command(enable=False)

@@ -7,7 +7,7 @@ from lavt.vehicle.can_frame import CanFrame
 
 
 @value
-class Field:
+class BitField:
     """A bit field of a message; `bit` is its lowest bit, with the message as one little-endian number."""
 
     name: str
@@ -32,7 +32,7 @@ class Layout:
 
     length: int
     """In bytes."""
-    fields: tuple[Field, ...]
+    fields: tuple[BitField, ...]
 
 
 def pack(layout: Layout, values: dict[str, int]) -> bytes:

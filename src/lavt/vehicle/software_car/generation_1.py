@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import Field, Layout, pack, unpack
+from lavt.vehicle.software_car.frames import BitField, Layout, pack, unpack
 from lavt.vehicle.software_car.mechanics import (
     Mechanics,
     hundredths_of_kmh,
@@ -23,21 +23,21 @@ CLEARING_LENGTH = 4
 """A command of this length has no counter and only clears."""
 
 PEDAL_COMMAND = (
-    Field("command", 0, 16),
-    Field("type", 20, 4),
-    Field("enable", 24, 1),
-    Field("clear", 25, 1),
-    Field("ignore", 26, 1),
-    Field("count", 56, 8),
+    BitField("command", 0, 16),
+    BitField("type", 20, 4),
+    BitField("enable", 24, 1),
+    BitField("clear", 25, 1),
+    BitField("ignore", 26, 1),
+    BitField("count", 56, 8),
 )
 STEERING_COMMAND = (
-    Field("command", 0, 16, is_signed=True),
-    Field("enable", 16, 1),
-    Field("clear", 17, 1),
-    Field("ignore", 18, 1),
-    Field("type", 23, 1),
-    Field("rate", 24, 8),
-    Field("count", 56, 8),
+    BitField("command", 0, 16, is_signed=True),
+    BitField("enable", 16, 1),
+    BitField("clear", 17, 1),
+    BitField("ignore", 18, 1),
+    BitField("type", 23, 1),
+    BitField("rate", 24, 8),
+    BitField("count", 56, 8),
 )
 COMMANDS: dict[int, tuple[Axis, Layout]] = {
     0x060: ("brake", Layout(8, PEDAL_COMMAND)),
@@ -45,54 +45,54 @@ COMMANDS: dict[int, tuple[Axis, Layout]] = {
     0x064: ("steering", Layout(8, STEERING_COMMAND)),
 }
 GEAR_COMMAND_ID = 0x066
-GEAR_COMMAND = Layout(1, (Field("gear", 0, 3), Field("clear", 7, 1)))
+GEAR_COMMAND = Layout(1, (BitField("gear", 0, 3), BitField("clear", 7, 1)))
 
 PEDAL_REPORT = (
-    Field("input", 0, 16),
-    Field("command", 16, 16),
-    Field("output", 32, 16),
-    Field("watchdog_source", 52, 4),
-    Field("enabled", 56, 1),
-    Field("override", 57, 1),
-    Field("driver", 58, 1),
-    Field("FLTWDC", 59, 1),
-    Field("FLT1", 60, 1),
-    Field("FLT2", 61, 1),
-    Field("FLTPWR", 62, 1),
-    Field("timeout", 63, 1),
+    BitField("input", 0, 16),
+    BitField("command", 16, 16),
+    BitField("output", 32, 16),
+    BitField("watchdog_source", 52, 4),
+    BitField("enabled", 56, 1),
+    BitField("override", 57, 1),
+    BitField("driver", 58, 1),
+    BitField("FLTWDC", 59, 1),
+    BitField("FLT1", 60, 1),
+    BitField("FLT2", 61, 1),
+    BitField("FLTPWR", 62, 1),
+    BitField("timeout", 63, 1),
 )
-BRAKE_REPORT = Layout(8, (*PEDAL_REPORT, Field("watchdog_brakes", 51, 1)))
+BRAKE_REPORT = Layout(8, (*PEDAL_REPORT, BitField("watchdog_brakes", 51, 1)))
 THROTTLE_REPORT = Layout(8, PEDAL_REPORT)
 STEERING_REPORT = Layout(
     8,
     (
-        Field("angle", 0, 16, is_signed=True),
-        Field("command", 16, 15, is_signed=True),
-        Field("is_torque", 31, 1),
-        Field("speed", 32, 16, is_signed=True),
-        Field("torque", 48, 8, is_signed=True),
-        Field("enabled", 56, 1),
-        Field("override", 57, 1),
-        Field("FLTPWR", 58, 1),
-        Field("FLTWDC", 59, 1),
-        Field("FLTBUS1", 60, 1),
-        Field("FLTBUS2", 61, 1),
-        Field("FLTCAL", 62, 1),
-        Field("timeout", 63, 1),
+        BitField("angle", 0, 16, is_signed=True),
+        BitField("command", 16, 15, is_signed=True),
+        BitField("is_torque", 31, 1),
+        BitField("speed", 32, 16, is_signed=True),
+        BitField("torque", 48, 8, is_signed=True),
+        BitField("enabled", 56, 1),
+        BitField("override", 57, 1),
+        BitField("FLTPWR", 58, 1),
+        BitField("FLTWDC", 59, 1),
+        BitField("FLTBUS1", 60, 1),
+        BitField("FLTBUS2", 61, 1),
+        BitField("FLTCAL", 62, 1),
+        BitField("timeout", 63, 1),
     ),
 )
 GEAR_REPORT = Layout(
     2,
     (
-        Field("gear", 0, 3),
-        Field("override", 3, 1),
-        Field("command", 4, 3),
-        Field("FLTBUS", 7, 1),
-        Field("reject", 8, 3),
-        Field("ready", 15, 1),
+        BitField("gear", 0, 3),
+        BitField("override", 3, 1),
+        BitField("command", 4, 3),
+        BitField("FLTBUS", 7, 1),
+        BitField("reject", 8, 3),
+        BitField("ready", 15, 1),
     ),
 )
-WHEEL_SPEEDS = Layout(8, tuple(Field(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
+WHEEL_SPEEDS = Layout(8, tuple(BitField(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
 
 FAULTS: dict[str, tuple[str, ...]] = {
     "steering": ("FLTPWR", "FLTBUS1", "FLTBUS2", "FLTCAL"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from lavt.vehicle.software_car.frames import Field, Layout
+from lavt.vehicle.software_car.frames import BitField, Layout
 
 UNVERIFIED: Final = {
     **dict.fromkeys(
@@ -29,16 +29,16 @@ UNVERIFIED: Final = {
 """Assumptions and choices of our own, by identifier."""
 
 PEDAL_FIELDS = (
-    Field("type", 16, 4),
-    Field("enable", 20, 1),
-    Field("clear", 21, 1),
-    Field("ignore", 22, 1),
-    Field("count", 48, 4),
+    BitField("type", 16, 4),
+    BitField("enable", 20, 1),
+    BitField("clear", 21, 1),
+    BitField("ignore", 22, 1),
+    BitField("count", 48, 4),
 )
-STEERING_COMMAND = Layout(8, (Field("command", 0, 16, is_signed=True), *PEDAL_FIELDS, Field("rate", 24, 8)))
-PEDAL_COMMAND = Layout(8, (Field("command", 0, 16), *PEDAL_FIELDS))
-GEAR_COMMAND = Layout(4, (Field("command", 0, 4),))
-SYSTEM_COMMAND = Layout(2, (Field("command", 0, 4), Field("count", 4, 4)))
+STEERING_COMMAND = Layout(8, (BitField("command", 0, 16, is_signed=True), *PEDAL_FIELDS, BitField("rate", 24, 8)))
+PEDAL_COMMAND = Layout(8, (BitField("command", 0, 16), *PEDAL_FIELDS))
+GEAR_COMMAND = Layout(4, (BitField("command", 0, 4),))
+SYSTEM_COMMAND = Layout(2, (BitField("command", 0, 4), BitField("count", 4, 4)))
 
 FLAG_NAMES = (
     "ready",
@@ -52,43 +52,45 @@ FLAG_NAMES = (
     "override_latched",
     "external_control",
 )
-FLAGS = tuple(Field(name, 40 + place, 1) for place, name in enumerate(FLAG_NAMES))
-COUNT = Field("count", 52, 4)
-PEDAL_REPORT = Layout(8, (Field("input", 0, 12), Field("command", 12, 12), Field("output", 24, 12), *FLAGS, COUNT))
-WHEEL_SPEEDS = Layout(8, tuple(Field(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
+FLAGS = tuple(BitField(name, 40 + place, 1) for place, name in enumerate(FLAG_NAMES))
+COUNT = BitField("count", 52, 4)
+PEDAL_REPORT = Layout(
+    8, (BitField("input", 0, 12), BitField("command", 12, 12), BitField("output", 24, 12), *FLAGS, COUNT)
+)
+WHEEL_SPEEDS = Layout(8, tuple(BitField(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
 REPORT_LAYOUTS: Final = {
     0x100: Layout(
         8,
         (
-            Field("angle", 0, 14, is_signed=True),
-            Field("command", 16, 14, is_signed=True),
-            Field("torque", 32, 8, is_signed=True),
+            BitField("angle", 0, 14, is_signed=True),
+            BitField("command", 16, 14, is_signed=True),
+            BitField("torque", 32, 8, is_signed=True),
             *FLAGS,
             COUNT,
         ),
     ),
     0x101: PEDAL_REPORT,
     0x102: PEDAL_REPORT,
-    0x103: Layout(8, (Field("gear", 0, 4), Field("command", 4, 4), *FLAGS, COUNT)),
+    0x103: Layout(8, (BitField("gear", 0, 4), BitField("command", 4, 4), *FLAGS, COUNT)),
     0x106: Layout(
         8,
         (
-            Field("state", 0, 4),
-            Field("sync_mode", 4, 4),
-            Field("reason_disengage", 8, 8),
-            Field("reason_not_ready", 16, 8),
+            BitField("state", 0, 4),
+            BitField("sync_mode", 4, 4),
+            BitField("reason_disengage", 8, 8),
+            BitField("reason_not_ready", 16, 8),
             COUNT,
         ),
     ),
     0x107: Layout(
         8,
         (
-            Field("by_brakes", 0, 16, is_signed=True),
-            Field("by_propulsion", 16, 16, is_signed=True),
-            Field("direction_source", 32, 4),
+            BitField("by_brakes", 0, 16, is_signed=True),
+            BitField("by_propulsion", 16, 16, is_signed=True),
+            BitField("direction_source", 32, 4),
             COUNT,
         ),
     ),
     0x2A4: WHEEL_SPEEDS,
-    0x2D8: Layout(8, (Field("mode", 0, 4), Field("state", 4, 4), COUNT)),
+    0x2D8: Layout(8, (BitField("mode", 0, 4), BitField("state", 4, 4), COUNT)),
 }
