@@ -94,7 +94,7 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/codec.py": (f"{_DBW}/test_codec.py", f"{_DBW}/test_profile_dbc.py", f"{_DBW}/test_adapter_vectors.py"),
     f"{_DBW}/crc8.py": (f"{_DBW}/test_crc8.py",),
     f"{_DBW}/profile.py": (f"{_DBW}/test_profile.py", f"{_DBW}/test_profile_dbc.py", *_ADAPTER),
-    f"{_DBW}/proving.py": (f"{_DBW}/test_proving.py",),
+    f"{_DBW}/watchdog_test.py": (f"{_DBW}/test_watchdog_test.py",),
     f"{_DBW}/reports.py": (f"{_DBW}/test_reports.py", *_ADAPTER),
     f"{_DBW}/sending.py": _ADAPTER,
     f"{_DBW}/states.py": (*_ADAPTER, f"{_DBW}/test_by_wire_page.py"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, Asked, Hand1, Hand2
+from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2
 
 from lavt.assembly.dbw import load_profile
 from lavt.assembly.simulators import simulator_of
@@ -28,10 +28,14 @@ def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
 )
 def test_the_kit_is_the_profiles(profile: str, accepted: str) -> None:
     """The kit obeys the commands of the generation and set that the profile is for, and no others."""
-    hands: dict[str, Hand1 | Hand2] = {"generation 1": Hand1(), "remote": Hand2(), "user": Hand2(first=0x210)}
-    for name, hand in hands.items():
+    senders: dict[str, Sender1 | Sender2] = {
+        "generation 1": Sender1(),
+        "remote": Sender2(),
+        "user": Sender2(first=0x210),
+    }
+    for name, sender in senders.items():
         car = built(profile)
-        for frame in hand.commands(Asked(brake=0.5)):
+        for frame in sender.commands(CommandValues(brake=0.5)):
             car.receive(frame, START_NS)
         assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted)
 

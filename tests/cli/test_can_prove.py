@@ -22,7 +22,7 @@ from lavt.clock import MachineClock
 from lavt.config.dbw import DbwConfig
 from lavt.config_file import shipped
 from lavt.domain import NS_PER_MS
-from lavt.vehicle.dbw.proving import WatchdogObservation
+from lavt.vehicle.dbw.watchdog_test import WatchdogObservation
 
 SERVER = str(shipped("configs/server.yaml"))
 GROUP = "239.74.163.2"
@@ -141,7 +141,7 @@ def test_requested_and_yes(run: Run, monkeypatch: pytest.MonkeyPatch, port: int)
     monkeypatch.setattr(sys, "stdin", Terminal("yes\n"))
     code, _, err = run(*changes("dataspeed_gen2", port))
     assert code == 1
-    assert "the kit is not heard" in err
+    assert "reports are missing" in err
 
 
 REJECTED: list[tuple[list[str], str]] = [
@@ -167,7 +167,7 @@ PROFILE = load_profile("dataspeed_gen2")
 
 def proof(tmp_path: Path, **others: Any) -> str:
     """A proof of generation 2, with something changed."""
-    seen = WatchdogObservation(released_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, words="")
+    seen = WatchdogObservation(released_ns=100 * NS_PER_MS, braked_ns=120 * NS_PER_MS, reports=49, kit_messages="")
     made = proof_of(seen, "park", PROFILE, CONFIG, 0).model_dump() | others
     path = tmp_path / "proof.json"
     path.write_text(json.dumps(made))

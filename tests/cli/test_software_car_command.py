@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from tests.support.command_line import Run
 from tests.support.ports import free_port
-from tests.vehicle.software_car.rig import Asked, Hand1, Hand2
+from tests.vehicle.software_car.rig import CommandValues, Sender1, Sender2
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -129,7 +129,7 @@ def test_it_reports_and_tells_the_truth(start: Start) -> None:
         heard = program.hear(lambda heard: len(heard) >= 760)
         receiver, before_ns = TruthReceiver(), MachineClock().now().mono_ns
         while receiver.newest is None or receiver.newest.mono_ns < before_ns:
-            receiver.take(listener.recv(MAX_BYTES))
+            receiver.receive(listener.recv(MAX_BYTES))
     assert receiver.newest.speed_mps == 0.0
     assert receiver.newest.progress_m > 0.0
     for identifier, period_ms in ((0x100, 10), (0x101, 20), (0x103, 100)):
@@ -162,10 +162,10 @@ def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start
     program.type(f"fault steering.{fault}")
     assert program.until("done")["text"] == f"fault steering.{fault}"
     program.hear(is_reported(1))
-    program.type(f"mend steering.{fault}")
+    program.type(f"clear_fault steering.{fault}")
     program.until("done")
     program.hear(is_reported(0))
-    program.type("mend the wheel")
+    program.type("clear_fault the wheel")
     assert "'the wheel'" in program.until("rejected")["text"]
 
 
@@ -177,19 +177,19 @@ def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
     """It obeys commands of another process, tells what it does, and brakes when the commands stop."""
     program = start(f"vehicle.dbw.profile=dataspeed_gen{generation}")
     program.told()
-    hand: Hand1 | Hand2 = Hand1() if generation == 1 else Hand2()
+    sender: Sender1 | Sender2 = Sender1() if generation == 1 else Sender2()
     for index in range(125):
-        program.send(*hand.commands(Asked(brake=0.5) if index < 25 else Asked(throttle=0.4)))
-        if index in {10, 12} and isinstance(hand, Hand2):
-            program.send(hand.system(1))
+        program.send(*sender.commands(CommandValues(brake=0.5) if index < 25 else CommandValues(throttle=0.4)))
+        if index in {10, 12} and isinstance(sender, Sender2):
+            program.send(sender.system(1))
         if index == 20:
-            program.send(hand.gear(4))
+            program.send(sender.gear(4))
         pause(20 * NS_PER_MS)
     accepts = program.until("enabled")
-    while accepts["text"] != "obeys: steering, brake, throttle":  # generation 1: one after another
+    while accepts["text"] != "enabled: steering, brake, throttle":  # generation 1: one after another
         accepts = program.until("enabled")
     assert program.until("gear")["text"] == "gear DRIVE"
-    assert program.until("enabled")["text"].startswith("lets go: no command in time")
+    assert program.until("enabled")["text"].startswith("released: no command in time")
     assert program.until("watchdog")["text"].startswith("watchdog brakes: no command in time")
     speeds = [
         int.from_bytes(each.frame.data[4:6] if generation == 1 else each.frame.data[:2], "little", signed=True) / 360

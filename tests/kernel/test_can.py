@@ -22,7 +22,7 @@ from tests.field.by_wire import (
     GENERATIONS,
     KIT_MS,
     ROOM_MS,
-    Car,
+    SoftwareCarProcess,
     ms_since,
     software_car,
 )
@@ -111,7 +111,7 @@ def prove(machine: Machine, changes: tuple[str, ...], stalls: Stalls) -> None:
 class Driven:
     """A drive over CAN that is under way."""
 
-    car: Car
+    car: SoftwareCarProcess
     loop: Loop
     out: Path
     actuator_pid: int
@@ -132,10 +132,10 @@ class Driven:
     def stopped_wrongly(self, status: dict[str, Any], braked_ns: int | None) -> Exception:
         """Return what to raise where it stopped though nothing was broken."""
         now_ns = CLOCK.now().mono_ns
-        since_ns = self.car.heard("enabled", "obeys: ") or now_ns
+        since_ns = self.car.event_ns("enabled", "enabled: ") or now_ns
         said = f"stopped before it drove: {status}, {self.car.events}"
         if braked_ns is not None:
-            failure = self.car.let_go_wrongly(braked_ns, said)
+            failure = self.car.unexpected_release(braked_ns, said)
         else:
             least_ms = least_stop_ms(str(status["reason"]))
             failure = self.stalls.verdict(said, since_ns, now_ns, stall_ms=least_ms)
@@ -214,7 +214,7 @@ def test_a_route_is_driven_over_can(profile: str, lab: Lab, tell: Tell) -> None:
     told = f"{profile}: {in_short(drive.result)}; {'; '.join(changes_of_safety(drive))}"
     tell(told)
     if drive.result["ending"] != "completed" and braked_ns is not None:
-        raise or_too_slow(driven.car.let_go_wrongly(braked_ns, told), lab.stalls, since_ns, braked_ns)
+        raise or_too_slow(driven.car.unexpected_release(braked_ns, told), lab.stalls, since_ns, braked_ns)
     require_completed(drive, lab.stalls)
     require_valid(drive, lab.stalls)
     assert drive.result["p95_m"] <= P95_M
@@ -245,24 +245,24 @@ def test_a_bus_that_goes_leaves_a_braking_car(lab: Lab, tell: Tell) -> None:
         since_ns = CLOCK.now().mono_ns
         take_down("vcan0")
         down_ms = ms_since(CLOCK.now().mono_ns, since_ns)
-        took_ms = driven.car.held(since_ns, room_ms=down_ms + ROOM_MS)
+        took_ms = driven.car.wait_for_watchdog_ms(since_ns, room_ms=down_ms + ROOM_MS)
         driven.wait_stopped()
         tell(f"down took {down_ms:.0f} ms, the kit brakes {took_ms:.0f} ms after its begin, {driven.reason()}")
         ip("link", "set", "vcan0", "up")
         pause(NS_PER_S)
-        assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
+        assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
 def test_a_kit_that_falls_silent_stops_the_drive(lab: Lab, tell: Tell) -> None:
     """A kit in bus-off brakes by its watchdog; the server, which hears no report, stops for safety and says why."""
     with lab.driving("dataspeed_gen1") as driven:
-        since_ns = driven.car.act("bus_off")
-        took_ms = driven.car.held(since_ns)
+        since_ns = driven.car.execute("bus_off")
+        took_ms = driven.car.wait_for_watchdog_ms(since_ns)
         driven.wait_stopped()
         tell(f"the kit brakes {took_ms:.0f} ms after, {driven.reason()}")
-        driven.car.act("bus_on")
+        driven.car.execute("bus_on")
         pause(NS_PER_S)
-        assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
+        assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
 def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
@@ -273,7 +273,7 @@ def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
         os.kill(driven.actuator_pid, signal.SIGSTOP)
         frozen_ns = CLOCK.now().mono_ns
         try:
-            took_ms = driven.car.held(since_ns)
+            took_ms = driven.car.wait_for_watchdog_ms(since_ns)
             pause(NS_PER_S)
             last_ns = last_command_ns(port)
         finally:
@@ -282,7 +282,7 @@ def test_no_frame_leaves_a_frozen_actuator(lab: Lab, tell: Tell) -> None:
         pause(NS_PER_S)
         tell(f"last command {ms_since(last_ns, since_ns):.0f} ms, the kit brakes {took_ms:.0f} ms after")
         assert last_ns < frozen_ns + SENT_LATE_MS * NS_PER_MS
-        assert driven.car.heard("enabled", "obeys: ", since_ns=since_ns) is None
+        assert driven.car.event_ns("enabled", "enabled: ", since_ns=since_ns) is None
 
 
 def test_a_server_that_is_killed_parks_the_car(lab: Lab, tell: Tell) -> None:
@@ -290,6 +290,6 @@ def test_a_server_that_is_killed_parks_the_car(lab: Lab, tell: Tell) -> None:
     with lab.driving("dataspeed_gen1") as driven:
         since_ns = CLOCK.now().mono_ns
         lab.server.call(processes.send_signal, driven.loop.server.number, signal.SIGKILL)
-        took_ms = driven.car.parked(since_ns)
+        took_ms = driven.car.wait_for_park_ms(since_ns)
         tell(f"in park {took_ms:.0f} ms after")
         assert took_ms < PARKED_MS

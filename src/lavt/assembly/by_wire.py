@@ -16,7 +16,7 @@ from lavt.vehicle.can_frame import BusGone, BusPort
 from lavt.vehicle.dbw.adapter import ByWireAdapter
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.vehicle import HEAR_PERIOD_NS, DbwVehicle, Truth
+from lavt.vehicle.dbw.vehicle import POLL_PERIOD_NS, DbwVehicle, TruthSource
 from lavt.vehicle.ground_truth_socket import TruthSocket
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.software_car.in_process_bus import InProcessPort
@@ -67,7 +67,7 @@ def listen(config: VehicleConfig, clock: Clock, duration_ns: int) -> tuple[int, 
             for each in port.take(now_ns):
                 adapter.receive(each.frame, now_ns)
                 heard += 1
-            pause(HEAR_PERIOD_NS)
+            pause(POLL_PERIOD_NS)
     except BusGone as gone:
         return heard, str(gone)
     finally:
@@ -121,7 +121,7 @@ def _vehicle(
     capabilities: Capabilities,
     start: Now,
     *,
-    truth: Truth | None,
+    truth: TruthSource | None,
     inhibit_reason: str = "",
 ) -> DbwVehicle:
     adapter = ByWireAdapter(profile, start_ns=start.mono_ns, inhibit_reason=inhibit_reason)

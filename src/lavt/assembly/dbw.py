@@ -233,7 +233,7 @@ class _Reader:
             },
             override=self._signs(message, report.override),
             trip=self._signs(message, report.trip),
-            lapse=self._signs(message, report.lapse),
+            command_error=self._signs(message, report.command_error),
             fault=self._signs(message, report.fault),
             needs={
                 self._signal(message, signal).name: frozenset(self._of_set(numbers, f"{part}.needs.{signal}"))

@@ -93,7 +93,7 @@ def _read(report: ReportConfig) -> Iterator[tuple[str, str]]:
     """The signals of a report, by role."""
     for word, signal in report.values.items():
         yield f"values.{word}", signal
-    for group in ("override", "trip", "lapse", "fault"):
+    for group in ("override", "trip", "command_error", "fault"):
         for sign in getattr(report, group):
             yield f"{group}.{sign}", sign.partition("=")[0]
     for signal in report.needs:

@@ -13,7 +13,7 @@ from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.vehicle.dbw.bus import is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
+from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
 
 AGAIN = "run `lavt can prove`"
 
@@ -34,7 +34,7 @@ def proof_of(seen: WatchdogObservation, gear: str, profile: Profile, config: Dbw
         release_ms=round(seen.released_ns / NS_PER_MS, 1),
         braked_ms=round(seen.braked_ns / NS_PER_MS, 1),
         reports=seen.reports,
-        said=seen.words,
+        said=seen.kit_messages,
     )
 
 

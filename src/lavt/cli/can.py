@@ -158,7 +158,7 @@ def _show(
         for frames, now_ns in chain([first], batches):
             is_any = is_any or bool(frames)
             for heard in frames:
-                traffic.hear(heard)
+                traffic.receive(heard)
                 write_down(heard)
             if (now_ns - begin_ns) // NS_PER_S > shown_s:
                 shown_s = (now_ns - begin_ns) // NS_PER_S

@@ -23,7 +23,7 @@ from lavt.runtime import process_priority
 from lavt.vehicle.can_frame import BusGone
 from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import OwnBrake, Profile
-from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, WatchdogTest
+from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogTest
 
 LOOK_EVERY_S: Final = 0.002
 BEFOREHAND: Final = f"""The kit is enabled with the brake at {BRAKE}, then left alone: its watchdog has to brake.
@@ -62,9 +62,9 @@ def prove(
         _forget(file)
         proving = WatchdogTest(profile, watchdog, start_ns=MachineClock().now().mono_ns)
         _go(proving, port)
-    if proving.seen is None:
+    if proving.observation is None:
         raise WorkError(f"nothing is proved: {proving.failure}")
-    proof = proof_of(proving.seen, proving.gear, profile, dbw, MachineClock().now().wall_ns)
+    proof = proof_of(proving.observation, proving.gear, profile, dbw, MachineClock().now().wall_ns)
     _write(file, proof.model_dump_json(indent=1))
     if as_json:
         console.show_json({"file": str(file), **proof.model_dump()})
@@ -113,7 +113,7 @@ def _go(proving: WatchdogTest, port: CanPort) -> None:
                 now_ns = clock.now().mono_ns
                 port.send(proving.frames_due(now_ns), now_ns)
             except BusGone as gone:
-                proving.bus_gone(str(gone))
+                proving.on_bus_gone(str(gone))
 
 
 def _forget(file: Path) -> None:

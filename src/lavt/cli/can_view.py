@@ -15,7 +15,7 @@ from rich.text import Text
 
 from lavt.cli import console
 from lavt.domain import NS_PER_S
-from lavt.vehicle.dbw.traffic import OTHERS, BusTraffic, MessageSummary, signal_words
+from lavt.vehicle.dbw.traffic import OTHER_IDENTIFIERS, BusTraffic, MessageSummary, signal_text
 
 
 class BusView:
@@ -38,7 +38,7 @@ class BusView:
 
     def second(self, passed_ns: int, now_ns: int) -> None:
         """Show what came since the last time."""
-        told = self._traffic.tell(now_ns)
+        told = self._traffic.take_period(now_ns)
         if self._as_json:
             console.show_json({"second": self._as_data(passed_ns, told)})
         elif self._live is not None:
@@ -51,7 +51,7 @@ class BusView:
 
     def summary(self, passed_ns: int, now_ns: int) -> None:
         """Show what came in all."""
-        told = self._traffic.tell_all(now_ns)
+        told = self._traffic.total(now_ns)
         if self._as_json:
             console.show_json({"summary": self._as_data(passed_ns, told)})
             return
@@ -80,7 +80,7 @@ class BusView:
 
 def identifier_words(identifier: int, is_extended: bool) -> str:
     """Say an identifier as CAN tools do: three digits, or eight of one of 29 bits."""
-    if (identifier, is_extended) == OTHERS:
+    if (identifier, is_extended) == OTHER_IDENTIFIERS:
         return "others"
     return f"0x{identifier:0{8 if is_extended else 3}X}"
 
@@ -102,7 +102,7 @@ def _rate(told: MessageSummary) -> str:
 
 
 def _words(told: MessageSummary) -> list[str]:
-    words = (signal_words(told.facts.signals[name], value) for name, value in told.values.items())
+    words = (signal_text(told.facts.signals[name], value) for name, value in told.values.items())
     return [each for each in words if each]
 
 
@@ -113,7 +113,7 @@ def _table(told: Sequence[MessageSummary], rest: Sequence[str]) -> Table:
     for each in told:
         says = Text()
         for name, value in each.values.items():
-            words = signal_words(each.facts.signals[name], value)
+            words = signal_text(each.facts.signals[name], value)
             says.append(f"{words}  " if words else "", style="bold yellow" if name in each.changed else "")
         table.add_row(
             each.facts.name,

@@ -29,7 +29,7 @@ from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.event_log import KitEvent
-from lavt.vehicle.software_car.runner import Runner
+from lavt.vehicle.software_car.runner import SoftwareCarRunner
 
 LONGEST_LINE: Final = 1000
 INSIDE: Final = "inside"
@@ -68,7 +68,7 @@ def software_car(
         if not is_virtual(dbw.interface, dbw.channel):
             console.say(f"lavt: {dbw.channel} is no virtual bus: see to it that no real kit is on it")
         start_ns = clock.now().mono_ns
-        runner = Runner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)
+        runner = SoftwareCarRunner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)
         tell = _tell_json if as_json else _tell_in_words(start_ns)
         with console.until_told() as told, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
             speaker.setblocking(False)
@@ -82,7 +82,7 @@ def software_car(
 
 
 def _live(
-    runner: Runner,
+    runner: SoftwareCarRunner,
     clock: MachineClock,
     told: console.StopEvent,
     lines: InputLines,
@@ -93,14 +93,14 @@ def _live(
     while not told.is_set():
         now_ns = clock.now().mono_ns
         runner.step(now_ns)
-        datagram = runner.truth()
+        datagram = runner.make_truth_datagram()
         if datagram is not None:
             send(datagram)
         for events in runner.take_events():
             tell(events)
         pause_ns = max(runner.next_wake_ns() - clock.now().mono_ns, 0)
         for line in lines.wait(told, pause_ns / NS_PER_S):
-            runner.act(line, clock.now().mono_ns)
+            runner.execute(line, clock.now().mono_ns)
 
 
 class InputLines:

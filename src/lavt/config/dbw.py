@@ -58,8 +58,8 @@ class SentConfig(Section):
 class ReportConfig(Section):
     """How one report is read; an empty message: there is none.
 
-    The keys of `override`, `trip`, `lapse` and `fault` are signs, the values what they mean in words: `SIGNAL` is a
-    sign where it is not 0, `SIGNAL=7` where it is 7.
+    The keys of `override`, `trip`, `command_error` and `fault` are conditions, the values the texts for them: `SIGNAL`
+    is met if the signal is not 0, `SIGNAL=7` if it is 7.
     """
 
     message: str = ""
@@ -71,8 +71,8 @@ class ReportConfig(Section):
     """The driver has taken over; CLEAR takes it back."""
     trip: dict[str, str] = Field(default_factory=dict)
     """The kit's watchdog has tripped; CLEAR takes it back, once somebody has taken over."""
-    lapse: dict[str, str] = Field(default_factory=dict)
-    """What the kit found wrong with our commands, until the next right one."""
+    command_error: dict[str, str] = Field(default_factory=dict)
+    """The kit received late or invalid commands; ends with the next valid one."""
     fault: dict[str, str] = Field(default_factory=dict)
     """What hinders driving as long as it is reported."""
     needs: dict[str, list[int] | dict[CommandSet, list[int]]] = Field(default_factory=dict)
