@@ -24,8 +24,8 @@ from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US
 from lavt.experiment.runs.processes import Processes
 from lavt.runtime import process_priority
-from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
-from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, wrap, write_registration
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, enable_arrival_times
+from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, encode_registration, wrap
 from lavt.transport.video.path_validation import PathClient
 
 HERE = "127.0.0.1"
@@ -41,7 +41,7 @@ class Ends:
     def __init__(self, vehicle: socket.socket, client: socket.socket, between: Address) -> None:
         self._clock = MachineClock()
         self._vehicle, self._client, self._between = vehicle, client, between
-        want_arrival_times(client)
+        enable_arrival_times(client)
         for each in (vehicle, client):
             each.bind((HERE, 0))
             each.settimeout(WAIT_S)
@@ -53,7 +53,7 @@ class Ends:
         if now.mono_ns - self._registered_ns < REGISTER_EVERY_NS:
             return
         self._registered_ns = now.mono_ns
-        self._vehicle.sendto(write_registration("vehicle-1", "video", now.wall_ns, None), self._between)
+        self._vehicle.sendto(encode_registration("vehicle-1", "video", now.wall_ns, None), self._between)
         self._client.sendto(PathClient(bytes(16)).hello(0), self._between)
         self._vehicle.recv(2000)
 

@@ -13,9 +13,9 @@ from lavt.transport.rendezvous.forwarder import (
     MOST_CLIENTS,
     REGISTER_EVERY_NS,
     Forwarder,
+    encode_registration,
     unwrap,
     wrap,
-    write_registration,
 )
 from lavt.transport.security.keys import SIGNATURE_BYTES, PublicKey
 
@@ -45,7 +45,7 @@ def rendezvous(_seed: int) -> Target:
     requested = set[tuple[str, int]]()
 
     def registration(wall_ns: int) -> bytes:
-        said = write_registration("vehicle-1", "video", wall_ns, None)
+        said = encode_registration("vehicle-1", "video", wall_ns, None)
         return said + key.sign(b"LAVT 1 registration vehicle-1\0" + said)
 
     registrations = Corpus([registration(1), registration(2)], fields=((4, 1), (5, 1), (6, 8), (14, 32), (46, 8)))

@@ -17,7 +17,7 @@ QUEUED_LONGEST_NS = 10 * NS_PER_S
 Ancillary = list[tuple[int, int, bytes]]
 
 
-def want_arrival_times(opened: socket.socket) -> None:
+def enable_arrival_times(opened: socket.socket) -> None:
     """Ask the kernel to stamp what comes in on a socket; where it cannot, `arrival` gives the time of reading."""
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)

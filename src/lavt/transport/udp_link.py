@@ -13,7 +13,7 @@ from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
-from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, enable_arrival_times
 
 Deliver = Callable[[str, Any, Now, Any], None]
 """(channel, payload, arrived, peer): what a link does with what comes in."""
@@ -47,12 +47,12 @@ class UdpLink:
         self._clock = clock
         self._channel = channel
         self._deliver = deliver
-        self._remote = None if remote is None else (look_up("video.server", remote[0]), remote[1])
+        self._remote = None if remote is None else (resolve_host("video.server", remote[0]), remote[1])
         self._server: tuple[str, int] | None = None
         self._only_from = only_from
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        want_arrival_times(self._socket)
+        enable_arrival_times(self._socket)
         try:
             self._socket.bind(bind)
         except (OSError, ValueError) as error:
@@ -117,7 +117,7 @@ class UdpLink:
         return self._remote is not None and address != self._server
 
 
-def look_up(key: str, host: str) -> str:
+def resolve_host(key: str, host: str) -> str:
     """Look a host up, once: no datagram waits for a name server, and senders are compared by their numbers.
 
     Raises `UserError` naming the config `key` where nobody knows the host.

@@ -17,9 +17,9 @@ from lavt.transport.rendezvous.forwarder import (
     VEHICLE_SILENCE_NS,
     Address,
     Forwarder,
+    encode_registration,
     unwrap,
     wrap,
-    write_registration,
 )
 from lavt.transport.rtp.rtp import Packetizer
 from lavt.transport.security.keys import PrivateKey
@@ -43,7 +43,7 @@ def key() -> PrivateKey:
 def registered(flow: str = "video") -> Forwarder:
     """A forwarder without keys, at which the vehicle has registered."""
     forwarder = Forwarder("vehicle-1", "probe" if flow == "probe" else "video", None)
-    registration = write_registration("vehicle-1", "probe" if flow == "probe" else "video", 1, None)
+    registration = encode_registration("vehicle-1", "probe" if flow == "probe" else "video", 1, None)
     assert forwarder.receive(registration, VEHICLE, T) is None
     assert forwarder.vehicle_at(T) == VEHICLE
     return forwarder
@@ -60,8 +60,8 @@ def answer(forwarder: Forwarder, client: Address = CLIENT, now_ns: int = T) -> t
 def test_bytes_on_the_wire(key: PrivateKey) -> None:
     """Registration and wrapping are as docs/wire.md says: magic, version, kind, and their fields in network order."""
     said = b"LAVR\x01\x01" + (258).to_bytes(8, "big") + b"vehicle-1".ljust(32, b"\0") + b"video".ljust(8, b"\0")
-    assert write_registration("vehicle-1", "video", 258, None) == said
-    signed = write_registration("vehicle-1", "video", 258, key)
+    assert encode_registration("vehicle-1", "video", 258, None) == said
+    signed = encode_registration("vehicle-1", "video", 258, key)
     assert signed[:54] == said
     assert key.public.verifies(signed[54:], b"LAVT 1 registration vehicle-1\0" + said)
     assert wrap(("192.0.2.9", 258), b"rest") == b"LAVR\x01\x02" + bytes([192, 0, 2, 9, 1, 2]) + b"rest"
@@ -119,7 +119,7 @@ def test_nobody_is_reached_who_did_not_ask() -> None:
     assert answer(forwarder, SECOND) is None
     assert answer(forwarder) is not None
     late_ns = T + CLIENT_SILENCE_NS + 1
-    forwarder.receive(write_registration("vehicle-1", "video", 2, None), VEHICLE, late_ns)
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), VEHICLE, late_ns)
     assert answer(forwarder, now_ns=late_ns) is None
     assert forwarder.counts["to_nobody"] == 3
 
@@ -138,12 +138,12 @@ def test_only_the_vehicle_registers(key: PrivateKey) -> None:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    good = write_registration("vehicle-1", "video", 5, key)
+    good = encode_registration("vehicle-1", "video", 5, key)
     stranger = PrivateKey(Ed25519PrivateKey.generate())
     forged = [
-        write_registration("vehicle-1", "video", 5, None),
-        write_registration("vehicle-1", "video", 5, stranger),
-        write_registration("vehicle-1", "video", 6, None) + good[54:],
+        encode_registration("vehicle-1", "video", 5, None),
+        encode_registration("vehicle-1", "video", 5, stranger),
+        encode_registration("vehicle-1", "video", 6, None) + good[54:],
         good[:-1] + bytes([good[-1] ^ 1]),
     ]
     for each in forged:
@@ -157,9 +157,9 @@ def test_only_the_vehicle_registers(key: PrivateKey) -> None:
 def test_without_the_key(key: PrivateKey) -> None:
     """A rendezvous that has no key takes any registration of the vehicle's name and the flow, signed or not."""
     forwarder = Forwarder("vehicle-1", "video", None)
-    forwarder.receive(write_registration("vehicle-1", "video", 1, key), VEHICLE, T)
+    forwarder.receive(encode_registration("vehicle-1", "video", 1, key), VEHICLE, T)
     assert forwarder.vehicle_at(T) == VEHICLE
-    forwarder.receive(write_registration("vehicle-1", "video", 2, None), OTHER, T)
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, T)
     assert forwarder.vehicle_at(T) == OTHER
 
 
@@ -167,7 +167,7 @@ def test_without_the_key(key: PrivateKey) -> None:
 def test_another_vehicle_or_flow(vehicle: str, flow: str, key: PrivateKey) -> None:
     """A registration of another vehicle, or of the other flow, is none, signed by the right key or not."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    registration = write_registration(vehicle, "probe" if flow == "probe" else "video", 1, key)
+    registration = encode_registration(vehicle, "probe" if flow == "probe" else "video", 1, key)
     forwarder.receive(registration, VEHICLE, T)
     assert forwarder.counts == {"registrations_of_others": 1}
     assert forwarder.vehicle_at(T) is None
@@ -176,7 +176,7 @@ def test_another_vehicle_or_flow(vehicle: str, flow: str, key: PrivateKey) -> No
 def test_replayed_registration(key: PrivateKey) -> None:
     """A registration counts once: again, or one that is older, it moves nothing, wherever it comes from."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    old, new = (write_registration("vehicle-1", "video", each, key) for each in (5, 6))
+    old, new = (encode_registration("vehicle-1", "video", each, key) for each in (5, 6))
     forwarder.receive(new, VEHICLE, T)
     forwarder.receive(new, OTHER, T + 1)
     forwarder.receive(old, OTHER, T + VEHICLE_SILENCE_NS)
@@ -188,14 +188,14 @@ def test_a_vehicle_moves_and_goes() -> None:
     """A newer registration from elsewhere moves the vehicle at once; after 10 s without one it is not there."""
     forwarder = registered()
     ask(forwarder)
-    forwarder.receive(write_registration("vehicle-1", "video", 2, None), OTHER, T + 1)
+    forwarder.receive(encode_registration("vehicle-1", "video", 2, None), OTHER, T + 1)
     assert ask(forwarder, now_ns=T + 1) == (wrap(CLIENT, HELLO), OTHER)
     assert answer(forwarder, now_ns=T + 1) is None
     gone_ns = T + 1 + VEHICLE_SILENCE_NS + 1
     assert forwarder.vehicle_at(gone_ns - 1) == OTHER
     assert ask(forwarder, now_ns=gone_ns) is None
     assert forwarder.receive(wrap(CLIENT, b"late"), OTHER, gone_ns) is None
-    forwarder.receive(write_registration("vehicle-1", "video", 1, None), VEHICLE, gone_ns)
+    forwarder.receive(encode_registration("vehicle-1", "video", 1, None), VEHICLE, gone_ns)
     assert forwarder.vehicle_at(gone_ns) == VEHICLE, "whose clock was set back meanwhile"
 
 
@@ -229,12 +229,12 @@ def test_the_vehicle_is_not_flooded() -> None:
 def test_forged_registrations_keep_nobody_out(key: PrivateKey) -> None:
     """Of a flood of registrations so many signatures a second are looked at, and the vehicle's next one counts."""
     forwarder = Forwarder("vehicle-1", "video", key.public)
-    forwarder.receive(write_registration("vehicle-1", "video", 5, key), VEHICLE, T)
-    forged = write_registration("vehicle-1", "video", 6, None)
+    forwarder.receive(encode_registration("vehicle-1", "video", 5, key), VEHICLE, T)
+    forged = encode_registration("vehicle-1", "video", 6, None)
     for _ in range(2 * REGISTRATIONS_PER_S):
         forwarder.receive(forged, OTHER, T + NS_PER_S)
     assert forwarder.counts["registrations_forged"] == REGISTRATIONS_PER_S
-    forwarder.receive(write_registration("vehicle-1", "video", 7, key), VEHICLE, T + NS_PER_S)
+    forwarder.receive(encode_registration("vehicle-1", "video", 7, key), VEHICLE, T + NS_PER_S)
     assert forwarder.counts["registrations"] == 2
 
 

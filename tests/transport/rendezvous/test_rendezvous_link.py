@@ -12,7 +12,7 @@ from tests.support.clocks import ShiftedClock
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S, Now
 from lavt.node import Send
-from lavt.transport.rendezvous.forwarder import Forwarder, wrap, write_registration
+from lavt.transport.rendezvous.forwarder import Forwarder, encode_registration, wrap
 from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.video.path_validation import PathClient
 
@@ -32,7 +32,7 @@ class Ends:
         self.vehicle = RendezvousLink(
             MachineClock(), "feedback", lambda *heard: self.heard.put(heard), bind=ANY,
             rendezvous=("127.0.0.1", self.between.port),
-            registration=lambda wall_ns: write_registration("vehicle-1", "video", wall_ns, None),
+            registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
         )  # fmt: skip
         stack.callback(self.vehicle.close)
 
@@ -96,7 +96,7 @@ def test_what_is_not_wrapped(client: socket.socket) -> None:
     heard: queue.Queue[Any] = queue.Queue()
     link = RendezvousLink(
         MachineClock(), "feedback", lambda *each: heard.put(each), bind=ANY, rendezvous=client.getsockname(),
-        registration=lambda wall_ns: write_registration("vehicle-1", "video", wall_ns, None),
+        registration=lambda wall_ns: encode_registration("vehicle-1", "video", wall_ns, None),
     )  # fmt: skip
     link.start()
     for datagram in (HELLO, b"", b"LAVR\x01\x02short", wrap(("192.0.2.9", 5004), b"last")):

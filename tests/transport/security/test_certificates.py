@@ -16,10 +16,14 @@ def test_expired_authority() -> None:
     authority = certificates.new_authority(NOW_NS, 10)
     last = NOW_NS + 10 * certificates.NS_PER_DAY
     for now_ns in (NOW_NS, last - NS_PER_S):
-        pair = certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=now_ns, days=30)
-        assert certificates.described(pair.shown, "") == certificates.Described("one", "operator", (), "2027-01-25")
+        pair = certificates.new_certificate(
+            authority, "one", "operator", server_hosts=None, now_wall_ns=now_ns, days=30
+        )
+        assert certificates.summarize(pair.public, "") == certificates.CertificateSummary(
+            "one", "operator", (), "2027-01-25"
+        )
     with pytest.raises(UserError, match="2027-01-25"):
-        certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=last, days=30)
+        certificates.new_certificate(authority, "one", "operator", server_hosts=None, now_wall_ns=last, days=30)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.envelope import (
     TRAILER_BYTES,
-    NoVehicleAuthenticator,
+    NullVehicleAuthenticator,
     OperatorAuthenticator,
     VehicleAuthenticator,
     VerifiedReply,
@@ -411,7 +411,7 @@ def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
 
 def test_without_keys_everything_is_as_it_is() -> None:
     """Where nothing is signed, bytes go in and out unchanged."""
-    authenticator = NoVehicleAuthenticator()
+    authenticator = NullVehicleAuthenticator()
     request = authenticator.open_request("session", b"request")
     assert request is not None
     assert {

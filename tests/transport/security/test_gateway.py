@@ -10,7 +10,7 @@ from lavt.domain import NS_PER_S, PATH_POINTS, Command, Now, SessionReply, Sessi
 from lavt.node import Send
 from lavt.transport import zenoh_link
 from lavt.transport.messages import encode
-from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
@@ -172,7 +172,7 @@ def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
             lambda _channel, payload, _arrived, _peer: heard.append(payload),
             lambda *_: None,
             lambda: (7, 2),
-            NoVehicleAuthenticator(),
+            NullVehicleAuthenticator(),
         )
     )
     for number in range(10_000):
@@ -250,7 +250,7 @@ def test_requests_that_are_never_answered_are_forgotten() -> None:
     """The door remembers the newest requests, as many as a link keeps queries, and answers each of them once."""
     carried: list[Send] = []
     gateway = ServerGateway(
-        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NoVehicleAuthenticator()
+        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NullVehicleAuthenticator()
     )
     for number in range(1000):
         gateway.receive("session", b"request", Now(number * NS_PER_S, 0), number)

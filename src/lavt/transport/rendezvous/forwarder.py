@@ -64,7 +64,7 @@ _ADDRESS: Final = struct.Struct(">4sH")
 WRAPPING_BYTES: Final = len(_WRAPPED) + _ADDRESS.size
 
 
-def write_registration(vehicle: str, flow: FlowName, wall_ns: int, key: PrivateKey | None) -> bytes:
+def encode_registration(vehicle: str, flow: FlowName, wall_ns: int, key: PrivateKey | None) -> bytes:
     """Say where the flow of a vehicle is, by sending this from there: 54 bytes, 118 where it is signed."""
     said = _LAYOUT.pack(_REGISTRATION, wall_ns, vehicle.encode(), flow.encode())
     return said if key is None else said + key.sign(_context(vehicle) + said)
@@ -144,7 +144,7 @@ class Forwarder:
         if len(said) != _LAYOUT.size or len(signature) not in {0, SIGNATURE_BYTES}:
             return "registrations_malformed"
         told_ns = _LAYOUT.unpack(said)[1]
-        if said != write_registration(self._vehicle, self._flow, told_ns, None):
+        if said != encode_registration(self._vehicle, self._flow, told_ns, None):
             return "registrations_of_others"
         at = self.vehicle_at(now_ns)
         if at is not None and told_ns <= self._told_ns:

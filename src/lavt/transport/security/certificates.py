@@ -39,7 +39,7 @@ class KeyPair:
     """A private key, and what may be shown of it: a certificate, or a public key. Both PEM."""
 
     private: bytes
-    shown: bytes
+    public: bytes
 
 
 @value
@@ -68,11 +68,11 @@ def new_authority(now_wall_ns: int, days: int) -> KeyPair:
 
 
 def new_certificate(
-    authority: KeyPair, name: str, role: str, *, dialled_at: Iterable[str] | None, now_wall_ns: int, days: int
+    authority: KeyPair, name: str, role: str, *, server_hosts: Iterable[str] | None, now_wall_ns: int, days: int
 ) -> KeyPair:
     """Make a key and its certificate for `name`, which is the CN; the role is its organizational unit (OU).
 
-    `dialled_at` are the addresses and host names beside the loopback's; None: it is never dialled. It holds for
+    `server_hosts` are the addresses and host names beside the loopback's; None: it is never dialled. It holds for
     `days`, but not longer than the authority. Raises `UserError` for an authority that cannot be read or has expired.
     """
     issuer, issuer_key = _authority(authority)
@@ -83,8 +83,8 @@ def new_certificate(
     subject = x509.Name(
         [x509.NameAttribute(NameOID.COMMON_NAME, name), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role)]
     )
-    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([] if dialled_at is None else [ExtendedKeyUsageOID.SERVER_AUTH])
-    hosts = [name] if dialled_at is None else [name, *LOOPBACK, *dialled_at]
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([] if server_hosts is None else [ExtendedKeyUsageOID.SERVER_AUTH])
+    hosts = [name] if server_hosts is None else [name, *LOOPBACK, *server_hosts]
     builder = (
         _builder(subject, issuer.subject, key, now_wall_ns)
         .not_valid_after(min(calendar_time(now_wall_ns + days * NS_PER_DAY), ends))
@@ -106,7 +106,7 @@ def new_signing_pair() -> KeyPair:
     return KeyPair(_private(key), public)
 
 
-def described(certificate: bytes, where: str) -> CertificateSummary:
+def summarize(certificate: bytes, where: str) -> CertificateSummary:
     """Read what a certificate says; raises `UserError`, which says `where` it is, for bytes that are none."""
     read = _read(certificate, where)
     server = _extension(read, x509.ExtendedKeyUsage)
@@ -121,7 +121,7 @@ def described(certificate: bytes, where: str) -> CertificateSummary:
 
 
 def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
-    """Tell for how many days a certificate holds from now on, negative where it has ended; errors as `described`."""
+    """Tell for how many days a certificate holds from now on, negative where it has ended; errors as `summarize`."""
     return _read(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY - now_wall_ns / NS_PER_DAY
 
 
@@ -188,7 +188,7 @@ def _read(certificate: bytes, where: str) -> x509.Certificate:
 
 
 def _authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
-    certificate = _read(authority.shown, "that of the authority")
+    certificate = _read(authority.public, "that of the authority")
     try:
         key = serialization.load_pem_private_key(authority.private, password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:

@@ -92,7 +92,7 @@ class VerifiedRequest:
     """It has not the place that is next, so it may be a replay: nobody looks at it, and who sent it may ask again."""
 
 
-class NoVehicleAuthenticator:
+class NullVehicleAuthenticator:
     """The vehicle's end where nothing is signed: everything is taken to be authentic."""
 
     counts: Mapping[str, int] = {}
@@ -126,7 +126,7 @@ class NoVehicleAuthenticator:
         return body
 
 
-class VehicleAuthenticator(NoVehicleAuthenticator):
+class VehicleAuthenticator(NullVehicleAuthenticator):
     """The vehicle's end: `operators` are the names and keys of who may drive."""
 
     def __init__(self, vehicle: str, key: PrivateKey, operators: Mapping[str, PublicKey]) -> None:

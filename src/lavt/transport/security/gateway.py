@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from lavt.domain import NS_PER_S, Now
 from lavt.node import Peer, Send
-from lavt.transport.security.envelope import REQUESTS, NoVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
+from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
 from lavt.transport.security.flood_filter import QUERIES_PER_S, FloodFilter, RateLimiter
 
 Deliver = Callable[[str, Any, Now, Peer], None]
@@ -44,7 +44,7 @@ class ServerGateway:
         deliver: Deliver,
         carry: Carry,
         in_force: Callable[[], tuple[int, int]],
-        authenticator: NoVehicleAuthenticator,
+        authenticator: NullVehicleAuthenticator,
     ) -> None:
         self._deliver = deliver
         self._carry = carry
