@@ -71,14 +71,16 @@ def gateway_of_vehicle(seed: int) -> Target:
         request = desk.sign_request("session", body)
         gateway.receive("session", request, now, "query")
         if not inside:
-            again = desk.open_reply("session", outside.pop().payload).again
+            again = desk.verify_reply("session", outside.pop().payload).retry
             expect(again is not None, "the operator was not told to ask again")
             request = again or b""
             gateway.receive("session", request, now, "query")
         expect(inside == [("session", body)], "the operator's request did not get in")
         inside.clear()
         gateway.send(Send("session_reply", answer, "query"))
-        expect(desk.open_reply("session", outside.pop().payload).body == answer, "the operator cannot read his answer")
+        expect(
+            desk.verify_reply("session", outside.pop().payload).body == answer, "the operator cannot read his answer"
+        )
         return request
 
     said: deque[bytes] = deque(maxlen=256)
@@ -126,12 +128,12 @@ def gateway_of_operator(seed: int) -> Target:
         OperatorAuthenticator("car", "alice", operator_key, vehicle_key.public),
     )
     hurry: Any = outside.append
-    gateway._send_soon = hurry  # type: ignore[method-assign]  # noqa: SLF001 (here no thread is needed)
+    gateway._send_in_thread = hurry  # type: ignore[method-assign]  # noqa: SLF001 (here no thread is needed)
     now = START
 
     def answer(body: bytes) -> bytes:
         """Answer the request that is outside, and let the door hear it; gives the reply's bytes."""
-        request = car.open_request("session", outside.pop().payload)
+        request = car.verify_request("session", outside.pop().payload)
         assert request is not None
         reply = car.sign_reply(request, b"" if request.is_stale else body)
         gateway.receive("session_reply", reply, now, None)

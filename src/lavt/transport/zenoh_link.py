@@ -38,7 +38,7 @@ REQUESTED = {answer: query for query, answer in ANSWERS.items()}
 ARRIVING_KEPT = 256
 """So many messages wait to be heard; of more the oldest goes. Zenoh's threads put down what comes and never wait for
 Python's lock, so that a flood makes no queue in sockets."""
-QUERIES_KEPT = 64
+MAX_PENDING_QUERIES = 64
 """So many queries of each kind wait for an answer; nobody answers what cannot be read, and then the oldest goes."""
 CONTROL: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -313,7 +313,7 @@ class ZenohLink:
         with self._queries_lock:
             kept = self._queries[channel]
             kept[number] = query
-            oldest = kept.pop(next(iter(kept))) if len(kept) > QUERIES_KEPT else None
+            oldest = kept.pop(next(iter(kept))) if len(kept) > MAX_PENDING_QUERIES else None
         if oldest is not None:
             oldest.drop()
         self._deliver(channel, payload, self._clock.now(), number)

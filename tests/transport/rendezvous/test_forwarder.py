@@ -63,7 +63,7 @@ def test_bytes_on_the_wire(key: PrivateKey) -> None:
     assert encode_registration("vehicle-1", "video", 258, None) == said
     signed = encode_registration("vehicle-1", "video", 258, key)
     assert signed[:54] == said
-    assert key.public.verifies(signed[54:], b"LAVT 1 registration vehicle-1\0" + said)
+    assert key.public.verify(signed[54:], b"LAVT 1 registration vehicle-1\0" + said)
     assert wrap(("192.0.2.9", 258), b"rest") == b"LAVR\x01\x02" + bytes([192, 0, 2, 9, 1, 2]) + b"rest"
 
 

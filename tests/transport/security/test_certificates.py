@@ -12,7 +12,7 @@ NOW_NS = 1_800_000_000 * NS_PER_S
 
 
 def test_expired_authority() -> None:
-    """An authority signs until the second it expires, and then no more."""
+    """An authority signs certificates until the second it expires, and then is refused."""
     authority = certificates.new_authority(NOW_NS, 10)
     last = NOW_NS + 10 * certificates.NS_PER_DAY
     for now_ns in (NOW_NS, last - NS_PER_S):
@@ -44,6 +44,6 @@ def test_expired_authority() -> None:
         (".".join(["a" * 60] * 5), False),
     ],
 )
-def test_hosts(text: str, expected: bool) -> None:
-    """A host is an IP address or a name of the DNS, and nothing around it."""
+def test_is_host(text: str, expected: bool) -> None:
+    """A host is an IP address or a DNS name, without brackets, port or line break."""
     assert certificates.is_host(text) is expected

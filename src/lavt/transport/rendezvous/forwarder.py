@@ -152,7 +152,7 @@ class Forwarder:
         if self._key is not None:
             if not self._signatures[sender == at].take(now_ns):
                 return "registrations_too_many"
-            if not self._key.verifies(signature, _context(self._vehicle) + said):
+            if not self._key.verify(signature, _context(self._vehicle) + said):
                 return "registrations_forged"
         self._at, self._registered_ns, self._told_ns = sender, now_ns, told_ns
         return "registrations"
