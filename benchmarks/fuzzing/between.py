@@ -10,7 +10,7 @@ from benchmarks.fuzzing.target import START, Target, expect, total
 
 from lavt.domain import NS_PER_MS
 from lavt.transport.rendezvous.forwarder import (
-    MOST_CLIENTS,
+    MAX_CLIENTS,
     REGISTER_EVERY_NS,
     Forwarder,
     encode_registration,
@@ -68,9 +68,9 @@ def rendezvous(_seed: int) -> Target:
             requested.add(sender)
         elif passed is not None:
             expect(passed[1] in requested, "something goes to who has not asked")
-        expect(forwarder.vehicle_at(now_ns) == VEHICLE, "the vehicle is somewhere else")
+        expect(forwarder.vehicle_address(now_ns) == VEHICLE, "the vehicle is somewhere else")
         clients = forwarder._clients
-        expect(max(len(clients._answered), len(clients._unanswered)) <= MOST_CLIENTS, "clients are kept for ever")
+        expect(max(len(clients._answered), len(clients._unanswered)) <= MAX_CLIENTS, "clients are kept for ever")
 
     def rejected() -> int:
         counts = forwarder.counts
