@@ -209,7 +209,7 @@ def encrypted_video(seed: int) -> Target:
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         frame += 1
-        return [server.cipher.authenticator(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
+        return [server.cipher.protect(each) for each in (*datagrams, *repairs.repair(datagrams, 1))]
 
     signed = true_frame()
     corpora["rtp"] = Corpus(signed, fields=EVERYWHERE)

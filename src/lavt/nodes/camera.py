@@ -174,7 +174,7 @@ class CameraNode:
         sends = [Send("frame", frame)]
         if proven is not None:
             cipher = self._path.cipher
-            sends += [Send("rtp", cipher.authenticator(each), proven) for each in (*packets.media, *packets.repair)]
+            sends += [Send("rtp", cipher.protect(each), proven) for each in (*packets.media, *packets.repair)]
             sends += [Send("rtp", cipher.protect_control(each), proven) for each in packets.report]
         plain = [*packets.media, *packets.report]
         sends += [Send("rtp", each, address) for address in self._send_to for each in plain]

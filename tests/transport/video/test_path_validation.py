@@ -257,7 +257,7 @@ def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
     """What either end seals the other opens, and nothing of a picture can be read in between."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    signed = server.cipher.authenticator(RTP)
+    signed = server.cipher.protect(RTP)
     assert b"a picture" not in signed
     assert client.open(signed) == RTP
     assert client.open(signed) is None
@@ -271,18 +271,18 @@ def test_each_opening_has_keys_of_its_own() -> None:
     """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    before = server.cipher.authenticator(RTP)
-    late = server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    before = server.cipher.protect(RTP)
+    late = server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
     reopened(server, client, ELSEWHERE, T0 + 1)
-    after = server.cipher.authenticator(RTP)
+    after = server.cipher.protect(RTP)
     assert after != before
     assert client.open(after) == RTP
     assert client.open(late) is not None
     assert client.open(before) == RTP
     assert client.open(before) is None
     assert server.cipher.open_control(client.protect_control(RTCP)) is None  # the last that came was under the old keys
-    server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
-    assert client.open(server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.open(server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
     assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
 
 
@@ -293,7 +293,7 @@ def test_answers_that_are_lost_do_no_harm() -> None:
     for later_ns in range(1, 4):
         challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
         assert client.answer(challenge or b"") is not None
-    assert client.open(server.cipher.authenticator(RTP)) == RTP
+    assert client.open(server.cipher.protect(RTP)) == RTP
     assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
 
 

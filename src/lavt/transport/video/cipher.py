@@ -20,7 +20,7 @@ _LABELS: Final = {"server": b"LAVT 1 SRTP server to client", "client": b"LAVT 1 
 class Cipher(Protocol):
     """Both directions of an open path, as one end has them."""
 
-    def authenticator(self, packet: bytes) -> bytes:
+    def protect(self, packet: bytes) -> bytes:
         """Make what is sent of an RTP packet."""
         ...
 
@@ -44,11 +44,11 @@ NewCipher = Callable[[bytes, bytes], Cipher]
 class NoCipher:
     """Leaves every packet as it is."""
 
-    def authenticator(self, packet: bytes) -> bytes:
+    def protect(self, packet: bytes) -> bytes:
         """Give the packet."""
         return packet
 
-    protect_control = open = open_control = authenticator
+    protect_control = open = open_control = protect
 
 
 class SrtpCipher:
@@ -57,7 +57,7 @@ class SrtpCipher:
     def __init__(self, end: End, token: bytes, challenge: bytes) -> None:
         other: End = "client" if end == "server" else "server"
         protector, unprotector = Protector(_key(end, token, challenge)), Unprotector(_key(other, token, challenge))
-        self.authenticator, self.protect_control = protector.protect, protector.protect_control
+        self.protect, self.protect_control = protector.protect, protector.protect_control
         self.open, self.open_control = unprotector.unprotect, unprotector.unprotect_control
 
 
