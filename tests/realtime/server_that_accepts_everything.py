@@ -1,4 +1,4 @@
-"""`lavt server` without its checks: it obeys every command that it can read, and so the tests of outages can fail."""
+"""Run `lavt server` without its checks of commands, to show that the tests of outages can fail."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from lavt.safety.gate import SafetyGate
 from lavt.safety.issued_stamps import IssuedStamps
 
 
-def no_objection(*_: object) -> str:
+def no_rejection_reason(*_: object) -> str:
     return ""
 
 
-def number_if_known(written: IssuedStamps, stamp_ns: int) -> int:
-    """Give the number of a frame that was written lately; others are older than all."""
-    return written._written.get(stamp_ns, (-1, 0))[0]
+def number_or_oldest(issued: IssuedStamps, stamp_ns: int) -> int:
+    """Return the number of a recent frame, or -1, older than all others, for an unknown stamp."""
+    return issued._written.get(stamp_ns, (-1, 0))[0]
 
 
-with patch.object(SafetyGate, "rejection_reason", no_objection), patch.object(IssuedStamps, "number", number_if_known):
+with (
+    patch.object(SafetyGate, "rejection_reason", no_rejection_reason),
+    patch.object(IssuedStamps, "number", number_or_oldest),
+):
     main()

@@ -1,4 +1,4 @@
-"""The main job, as a person at a terminal sees it."""
+"""`lavt demo` as a user at a terminal sees it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
 
 
 def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
-    """Every run, condition and group in summary.json has the keys that others rely on."""
+    """Every run, condition and group in summary.json has the documented keys."""
     assert set(demo.summary) == {
         "schema",
         "speed",
@@ -57,8 +57,8 @@ def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
     assert demo.summary["groups"]
 
 
-def test_the_delay_shows(demo: Demo, stalls: Stalls) -> None:
-    """At L0 the lane is kept within 0.3 m; at L5 it is left, in real as in virtual time."""
+def test_delay_degrades_lane_keeping(demo: Demo, stalls: Stalls) -> None:
+    """At L0 the P95 cross-track error is below 0.3 m; at L5 the car leaves the lane, in real and in virtual time."""
     for run in demo.summary["runs"]:
         if run["condition"] == "L0":
             with stalls.judging(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
@@ -69,14 +69,14 @@ def test_the_delay_shows(demo: Demo, stalls: Stalls) -> None:
 
 
 def test_the_terminal_shows_the_drive(demo: Demo) -> None:
-    """On a terminal the demo shows speed, tau_v, tau_c and cross-track error, then a table and the report's place."""
+    """On a terminal the demo shows speed, tau_v, tau_c and cross-track error, then a table and the report's path."""
     for text in ("km/h", "tau_v", "tau_c", "cross-track", "225 + 100", "the report is"):
-        assert text in demo.said
+        assert text in demo.output
     assert (demo.out / "report" / "index.html").is_file()
 
 
 def test_every_run_can_be_computed_again(demo: Demo) -> None:
-    """`lavt report` makes the same summary again from the records alone."""
+    """`lavt report` computes the same summary from the records alone."""
     before = demo.summary
     subprocess.run([sys.executable, "-m", "lavt", "report", str(demo.out)], check=True, capture_output=True)
     after = json.loads((demo.out / "summary.json").read_text())
