@@ -22,21 +22,71 @@ INTEGERS: Final = (*SMALL_INTEGERS, *LARGE_INTEGERS, -(2**31), -(2**63))
 FINITE: Final = (0.0, -0.0, 0.1, 1.0, -1.0, 1.0000001, 100.0, 1e308, -1e308, 5e-324)
 NUMBERS: Final = (*FINITE, float("inf"), -float("inf"), float("nan"))
 WORDS: Final = (
-    "", "a", "arm", "drive", "stop", "hold", "ask", "release", "emergency_stop", "clear_emergency_stop", "driving",
-    "arming", "degraded", "safe_stop", "disarmed", "park", "reverse", "pareto", "uniform", "**", "lavt/**", "\x00",
-    "x" * 33, "x" * 200, "x" * 201, "é" * 100, "\U0001f697" * 50, "1e5", "None",
-)  # fmt: skip
+    "",
+    "a",
+    "arm",
+    "drive",
+    "stop",
+    "hold",
+    "ask",
+    "release",
+    "emergency_stop",
+    "clear_emergency_stop",
+    "driving",
+    "arming",
+    "degraded",
+    "safe_stop",
+    "disarmed",
+    "park",
+    "reverse",
+    "pareto",
+    "uniform",
+    "**",
+    "lavt/**",
+    "\x00",
+    "x" * 33,
+    "x" * 200,
+    "x" * 201,
+    "é" * 100,
+    "\U0001f697" * 50,
+    "1e5",
+    "None",
+)
 OTHERS: Final[tuple[Any, ...]] = (
-    None, True, False, b"", bytes(16), bytes(32), b"\xff\xfe", bytes(300), [], [0] * 10, [float("nan")] * 10,
-    [1.0] * 9 + [float("inf")], ["x"] * 10, [[[[]]]], {}, {"a": 1}, {1: 2}, msgpack.ExtType(5, b"x"),
+    None,
+    True,
+    False,
+    b"",
+    bytes(16),
+    bytes(32),
+    b"\xff\xfe",
+    bytes(300),
+    [],
+    [0] * 10,
+    [float("nan")] * 10,
+    [1.0] * 9 + [float("inf")],
+    ["x"] * 10,
+    [[[[]]]],
+    {},
+    {"a": 1},
+    {1: 2},
+    msgpack.ExtType(5, b"x"),
     msgpack.Timestamp(0),
-)  # fmt: skip
+)
 VALUES: Final[tuple[Any, ...]] = (*INTEGERS, *NUMBERS, *WORDS, *OTHERS)
 
 BOMBS: Final = (
-    b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 1000,
-    b"\x81" * 1000, b"\xc7\xff\x01", b"\xc1", b"\xd8\xff", b"",
-)  # fmt: skip
+    b"\xdd\xff\xff\xff\xff",
+    b"\xdf\xff\xff\xff\xff",
+    b"\xdb\xff\xff\xff\xff",
+    b"\xc6\xff\xff\xff\xff",
+    b"\x91" * 1000,
+    b"\x81" * 1000,
+    b"\xc7\xff\x01",
+    b"\xc1",
+    b"\xd8\xff",
+    b"",
+)
 """Prefixes that claim more data than there is, or nest deeper than any message does."""
 
 Item = TypeVar("Item")
