@@ -26,7 +26,7 @@ CHANGES = (
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The output directory of a drive of some seconds."""
+    """Return the output directory of a drive of some seconds."""
     directory = tmp_path_factory.mktemp("real") / "run"
     run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), CHANGES)), directory)
     return directory
@@ -34,7 +34,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def records(out: Path) -> tuple[Record, Record]:
-    """The records of server and client."""
+    """Return the records of server and client."""
     return read_record(out / "server.mcap"), read_record(out / "client.mcap")
 
 

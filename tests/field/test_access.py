@@ -66,7 +66,7 @@ CONNECT = f"import os, socket, sys; os.setgroups([]); os.setgid({NOBODY}); os.se
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys of a site, made by `lavt keys`."""
+    """Make the keys of a site with `lavt keys`."""
     directory = tmp_path_factory.mktemp("authority") / "keys"
     names = ("--vehicle=vehicle-1", "--operator=operator-1", "--operator=operator-2", "--monitor=monitor-1")
     make_keys(directory, *names, "--cloud=cloud-1")
@@ -75,7 +75,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def others_keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys with the same names from another authority of the same name."""
+    """Make keys with the same names from another authority of the same name."""
     directory = tmp_path_factory.mktemp("other") / "keys"
     make_keys(directory, "--vehicle=vehicle-1", "--operator=operator-1")
     return directory
@@ -140,21 +140,21 @@ def start_site(stack: ExitStack, keys: Path, *changes: str, cloud: bool) -> Site
 
 @pytest.fixture(scope="module")
 def direct_site(keys: Path) -> Iterator[Site]:
-    """A site whose operator's router dials the vehicle's."""
+    """Start a site whose operator's router dials the vehicle's."""
     with ExitStack() as stack:
         yield start_site(stack, keys, cloud=False)
 
 
 @pytest.fixture(scope="module")
 def cloud_site(keys: Path) -> Iterator[Site]:
-    """A site whose routers both dial a router in the cloud."""
+    """Start a site whose routers both dial a router in the cloud."""
     with ExitStack() as stack:
         yield start_site(stack, keys, cloud=True)
 
 
 @pytest.fixture(params=["direct_site", "cloud_site"])
 def site(request: pytest.FixtureRequest) -> Site:
-    """Each kind of site in turn, without the messages of earlier tests."""
+    """Return each kind of site in turn, without the messages of earlier tests."""
     site: Site = request.getfixturevalue(request.param)
     for messages in (
         site.vehicle.commands,
@@ -283,7 +283,7 @@ def test_local_process_with_rights(direct_site: Site) -> None:
 
 @pytest.fixture(scope="module")
 def attacked_drives(keys: Path, tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[attacked.Drive]:
-    """A drive with the secure configs, without an attack at first and then under one attack after the other."""
+    """Drive with the secure configs, without an attack at first and then under one attack after the other."""
     pytest.importorskip("pylibsrtp")
     return Shared(stalls, lambda: attacked.drive(tmp_path_factory.mktemp("attacked"), keys))
 

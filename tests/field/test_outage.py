@@ -101,7 +101,7 @@ def finish(drive: Drive, work: Path, tell: Tell, title: str) -> Driven:
 
 @pytest.fixture(scope="module")
 def all_outages(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
-    """One drive with all outages in turn, the killed server last."""
+    """Drive through all outages in turn, the killed server last."""
     work = tmp_path_factory.mktemp("outages")
     with driven(field, work) as drive:
         cut(drive, (*SHORT, *LONG))
@@ -125,13 +125,13 @@ def drive_with_buffering_link(field: Field, work: Path, tell: Tell, title: str, 
 
 @pytest.fixture(scope="module")
 def buffered(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
-    """A drive with routers linked by TCP with a lease of 10 s."""
+    """Drive with routers linked by TCP with a lease of 10 s."""
     return drive_with_buffering_link(field, tmp_path_factory.mktemp("kept"), tell, "TCP, lease 10 s", LAVT)
 
 
 @pytest.fixture(scope="module")
 def buffered_unguarded(field: Field, tmp_path_factory: pytest.TempPathFactory, tell: Tell) -> Driven:
-    """A drive with the same routers, and a server that accepts every command."""
+    """Drive with the same routers and a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
     return drive_with_buffering_link(field, work, tell, "TCP, lease 10 s, no checks", (ACCEPTS_EVERYTHING,))
 

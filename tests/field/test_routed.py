@@ -47,7 +47,7 @@ RECOVERY_S = 10.0
 
 @pytest.fixture(scope="module", params=["forwarded ports", "rendezvous"])
 def way(request: pytest.FixtureRequest) -> str:
-    """The way of video and probe to the vehicle."""
+    """Return the way of video and probe to the vehicle."""
     return str(request.param)
 
 
@@ -61,7 +61,7 @@ def field(namespaces: None, way: str) -> Iterator[Field]:  # noqa: ARG001 (skips
 
 @pytest.fixture(scope="module")
 def links(way: str, tmp_path_factory: pytest.TempPathFactory) -> Links:
-    """The links of the ends."""
+    """Return the links of both ends."""
     if way == "forwarded ports":
         return CLOUD
     keys: Path = tmp_path_factory.mktemp("signing") / "keys"
@@ -104,7 +104,7 @@ class Routed:
 def routed(
     field: Field, links: Links, way: str, tmp_path_factory: pytest.TempPathFactory, tell: Callable[[str], None]
 ) -> Routed:
-    """A drive during which the operator's address changes."""
+    """Drive while the operator's address changes."""
     work: Path = tmp_path_factory.mktemp("routed")
     field.count("to_old", f"ip daddr {OPERATOR} udp sport {VIDEO_PORT}")
     field.count("to_new", f"ip daddr {NEXT_OPERATOR} udp sport {VIDEO_PORT}")

@@ -136,5 +136,5 @@ def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[De
 
 @pytest.fixture
 def demo(demos: Shared[Demo]) -> Demo:
-    """A demo, run once per session unless the host stalled it."""
+    """Return the demo, run once per session unless the host stalled it."""
     return demos.get()

@@ -160,7 +160,7 @@ def drives(
 
 @pytest.fixture
 def attacked(drives: Shared[SimpleNamespace]) -> SimpleNamespace:
-    """A drive that was attacked for some seconds and then ended by Ctrl-C on both sides."""
+    """Return a drive that was attacked for some seconds and then ended by Ctrl-C on both sides."""
     return drives.get()
 
 

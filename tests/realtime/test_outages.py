@@ -136,7 +136,7 @@ def break_network(drive: Drive) -> None:
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan, stalls: Stalls) -> Shared[Drive]:
-    """One drive with all outages in turn, the killed server last."""
+    """Drive through all outages in turn, the killed server last."""
 
     def drive_with_outages() -> Drive:
         work = tmp_path_factory.mktemp("outages")
@@ -165,7 +165,7 @@ def drive(drives: Shared[Drive]) -> Drive:
 
 @pytest.fixture(scope="module")
 def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
-    """A drive with the same network outages and a server that accepts every command."""
+    """Drive through the same network outages with a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
         drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(ACCEPTS_EVERYTHING),))

@@ -111,7 +111,7 @@ class Session:
 def sessions(
     tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Callable[..., PlannedRun], stalls: Stalls
 ) -> Shared[Session]:
-    """A session in which control of the vehicle goes from one client to another."""
+    """Run a session in which control of the vehicle goes from one client to another."""
 
     def run() -> Session:
         work = tmp_path_factory.mktemp("session")

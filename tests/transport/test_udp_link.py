@@ -42,7 +42,7 @@ def open_link(received: Received, clock: Clock | None = None, remote: tuple[str,
 
 @pytest.fixture
 def sender() -> Iterator[socket.socket]:
-    """A socket on the loopback that belongs to no link."""
+    """Open a socket on the loopback that belongs to no link."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened_socket:
         opened_socket.bind(ANY)
         opened_socket.settimeout(ARRIVES_S)

@@ -62,7 +62,7 @@ def local(router: Router) -> str:
 
 @pytest.fixture(scope="module")
 def routers() -> Iterator[tuple[str, str]]:
-    """The shipped routers on free ports, the client's linked to the server's: the endpoint of each side's router."""
+    """Start the shipped routers on free ports, linked to each other; yield the endpoint of each side's router."""
     quiet_logs()
     with ExitStack() as stack:
         server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, BETWEEN]})
@@ -115,7 +115,7 @@ class Pair:
 
 @pytest.fixture(scope="module")
 def pair(routers: tuple[str, str]) -> Iterator[Pair]:
-    """A server's and a client's link, each at the router of its own side."""
+    """Start a server's and a client's link, each at the router of its own side."""
     with closing(Pair(routers, "vehicle-1")) as opened:
         yield opened
 
@@ -429,7 +429,7 @@ ENDPOINTS = {
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys that the shipped configs need, in a directory `keys`."""
+    """Make the keys that the shipped configs need, in a directory `keys`."""
     pytest.importorskip("cryptography")
     from lavt.cli.keys import keys
 

@@ -34,7 +34,7 @@ T = 100 * NS_PER_S
 
 @pytest.fixture(scope="module")
 def key() -> PrivateKey:
-    """The vehicle's signing key."""
+    """Make the vehicle's signing key."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     return PrivateKey(Ed25519PrivateKey.generate())

@@ -46,14 +46,14 @@ class Setup:
 
 @pytest.fixture
 def setup() -> Iterator[Setup]:
-    """A rendezvous and a vehicle's link, open but not started."""
+    """Make a rendezvous and a vehicle's link, open but not started."""
     with ExitStack() as stack:
         yield Setup(stack)
 
 
 @pytest.fixture
 def client() -> Iterator[socket.socket]:
-    """A client's socket."""
+    """Open a client's socket."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(ANY)
         opened.settimeout(ARRIVES_S)

@@ -12,7 +12,7 @@ NOW_NS = 1_800_000_000 * NS_PER_S
 
 
 def test_expired_authority() -> None:
-    """An authority signs certificates until the second it expires, and then is refused."""
+    """An authority signs certificates until the second it expires, and is rejected afterwards."""
     authority = certificates.new_authority(NOW_NS, 10)
     last = NOW_NS + 10 * certificates.NS_PER_DAY
     for now_ns in (NOW_NS, last - NS_PER_S):

@@ -204,7 +204,7 @@ class VehicleAuthenticator(NullVehicleAuthenticator):
         return VerifiedRequest(channel, operator, body, _digest(data), *agreed, stale)
 
     def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
-        """Return whether a request names the operator that signed it; an empty one names nobody and passes."""
+        """Return whether a request names the operator that signed it; an empty one passes."""
         kind: Any = REQUESTS[channel]
         try:
             return body == b"" or bool(decode(kind, body).who == operator)
