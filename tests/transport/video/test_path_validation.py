@@ -257,10 +257,10 @@ def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
     """What either end seals the other opens, and nothing of a picture can be read in between."""
     server, client = encrypted()
     reopened(server, client, HOME, T0)
-    signed = server.cipher.protect(RTP)
-    assert b"a picture" not in signed
-    assert client.open(signed) == RTP
-    assert client.open(signed) is None
+    protected = server.cipher.protect(RTP)
+    assert b"a picture" not in protected
+    assert client.open(protected) == RTP
+    assert client.open(protected) is None
     assert client.open(RTP) is None
     assert client.open_control(server.cipher.protect_control(RTCP)) == RTCP
     assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
