@@ -365,7 +365,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pair = certificates.new_signing_pair()
         (folder / f"{name}.key").write_bytes(pair.private)
         (folder / f"{name}.key").chmod(0o600)
-        (folder / f"{name}.pub").write_bytes(pair.shown)
+        (folder / f"{name}.pub").write_bytes(pair.public)
     return folder
 
 

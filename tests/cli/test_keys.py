@@ -172,7 +172,7 @@ def test_damaged_authority(run: Run, made: Path) -> None:
     assert "PEM" in run("keys", "--operator", "two").rejected()
     (made / "authority.key").write_bytes(key)
     (made / "authority.pem").write_bytes(b"nonsense")
-    assert "no certificate in PEM" in run("keys", "--operator", "two").rejected()
+    assert "authority's certificate" in run("keys", "--operator", "two").rejected()
     assert not list(made.glob("two*"))
 
 

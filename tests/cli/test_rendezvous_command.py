@@ -13,7 +13,7 @@ import pytest
 
 from lavt.config_file import shipped
 from lavt.transport.clock_sync.probe import encode_request
-from lavt.transport.rendezvous.forwarder import wrap, write_registration
+from lavt.transport.rendezvous.forwarder import encode_registration, wrap
 
 HERE = "127.0.0.1"
 ENDS_S = 30.0
@@ -49,7 +49,7 @@ def test_says_where_it_is_and_where_the_vehicle_is(vehicle: socket.socket) -> No
         assert process.stdout is not None
         first = re.search(r"video at port (\d+)", process.stdout.readline())
         assert first is not None
-        vehicle.sendto(write_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
+        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
         assert f"{HERE}:{vehicle.getsockname()[1]}" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=ENDS_S)
@@ -64,7 +64,7 @@ def test_what_it_says_to_programs(vehicle: socket.socket) -> None:
         assert process.stdout is not None
         ports = json.loads(process.stdout.readline())["ready"]
         there = (HERE, ports["probe_port"])
-        vehicle.sendto(write_registration("vehicle-1", "probe", 1, None), there)
+        vehicle.sendto(encode_registration("vehicle-1", "probe", 1, None), there)
         at = {"flow": "probe", "vehicle_at": list(vehicle.getsockname())}
         assert json.loads(process.stdout.readline()) == at
         client.sendto(encode_request(1, 2), there)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lavt.errors import UserError
-from lavt.transport.udp_link import look_up
+from lavt.transport.udp_link import resolve_host
 
 
 def parse_address(key: str, text: str) -> tuple[str, int]:
@@ -17,4 +17,4 @@ def parse_address(key: str, text: str) -> tuple[str, int]:
 def resolved_address(key: str, text: str) -> tuple[str, int]:
     """Read `host:port` and look the host up; raises `UserError` naming `key`."""
     host, port = parse_address(key, text)
-    return look_up(key, host), port
+    return resolve_host(key, host), port

@@ -8,10 +8,10 @@ from lavt.clock import Clock
 from lavt.config import ClientConfig, RendezvousConfig, ServerConfig
 from lavt.errors import UserError
 from lavt.transport.messages import NAME
-from lavt.transport.rendezvous.forwarder import Address, FlowName, Forwarder, write_registration
+from lavt.transport.rendezvous.forwarder import Address, FlowName, Forwarder, encode_registration
 from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.security.keys import load_private, load_public
-from lavt.transport.udp_link import Deliver, UdpLink, look_up
+from lavt.transport.udp_link import Deliver, UdpLink, resolve_host
 
 
 def open_flow(
@@ -32,11 +32,11 @@ def open_flow(
         return UdpLink(clock, channel, deliver, bind=bind, remote=remote, name=flow)
     there = config.rendezvous
     key = load_private(Path(config.security.key)) if config.security.key else None
-    host = look_up("rendezvous.host", there.host)
+    host = resolve_host("rendezvous.host", there.host)
     return RendezvousLink(
         clock, channel, deliver, bind=bind, name=flow,
         rendezvous=(host, {"video": there.video_port, "probe": there.probe_port}[flow]),
-        registration=lambda wall_ns: write_registration(config.vehicle_id, flow, wall_ns, key),
+        registration=lambda wall_ns: encode_registration(config.vehicle_id, flow, wall_ns, key),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lavt.config import ClientConfig, ServerConfig
 from lavt.transport.rtp.srtp import check_srtp
-from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
 from lavt.transport.security.gateway import Carry, ClientGateway, Deliver, OpenClientGateway, ServerGateway
 from lavt.transport.security.keys import load_private, load_public
 from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
@@ -35,11 +35,11 @@ def gateway_of(
     return OpenClientGateway(deliver, carry) if authenticator is None else ClientGateway(deliver, carry, authenticator)
 
 
-def vehicle_authenticator(config: ServerConfig) -> NoVehicleAuthenticator:
+def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
     """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
     security = config.security
     if not security.key:
-        return NoVehicleAuthenticator()
+        return NullVehicleAuthenticator()
     operators = {name: load_public(Path(file)) for name, file in security.operators.items()}
     return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
 

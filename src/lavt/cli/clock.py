@@ -21,7 +21,7 @@ from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
-from lavt.transport.udp_link import UdpLink, look_up
+from lavt.transport.udp_link import UdpLink, resolve_host
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS
 LAST_REPLY_NS = 500 * NS_PER_MS
@@ -54,7 +54,7 @@ def clock(
     """
     requested = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
     config = parse_config(ClockConfig, requested, "lavt clock")
-    address = None if server is None else look_up("--server", server)
+    address = None if server is None else resolve_host("--server", server)
     machine = MachineClock()
     with closing(interpreter(config)) as requested_by:
         ask = clock_source(config, machine, requested_by.run)

@@ -31,7 +31,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
 from lavt.transport.clock_sync.clock_report import ClockReport
-from lavt.transport.udp_link import look_up
+from lavt.transport.udp_link import resolve_host
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PROBING_NS = NS_PER_S
@@ -221,7 +221,7 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
 def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClock) -> Check:
     host, port = settings.video.server, settings.clock.probe_port
     try:
-        address = look_up("video.server", host)
+        address = resolve_host("video.server", host)
     except UserError as error:
         return Check("clock probe", "problem", str(error), "put the vehicle's address into video.server")
     probed, latest = probe(clock, address, port, PROBING_NS)

@@ -67,15 +67,15 @@ def keys(
     authority = _authority(certificates, directory, now_wall_ns, days)
     for role, names in roles.items():
         for name in names:
-            dialled_at = hosts if role in DIALLED else None
+            server_hosts = hosts if role in DIALLED else None
             pair = certificates.new_certificate(
-                authority, name, role, dialled_at=dialled_at, now_wall_ns=now_wall_ns, days=days
+                authority, name, role, server_hosts=server_hosts, now_wall_ns=now_wall_ns, days=days
             )
             _write_pair(directory, name, (".key", ".pem"), pair)
             _write_pair(directory, name, (".sign.key", ".sign.pub"), certificates.new_signing_pair())
     console.show(
         "\n".join(
-            _told(directory, certificates.described(authority.shown, AUTHORITY), _everybody(certificates, directory))
+            _told(directory, certificates.summarize(authority.public, AUTHORITY), _everybody(certificates, directory))
         )
     )
 
@@ -145,7 +145,7 @@ def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days
 
 def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: KeyPair) -> None:
     """Write a private file, which only its owner may read, and the one that may be shown."""
-    for ending, content, mode in zip(endings, (pair.private, pair.shown), (0o600, 0o644), strict=True):
+    for ending, content, mode in zip(endings, (pair.private, pair.public), (0o600, 0o644), strict=True):
         created = os.open(directory / (name + ending), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(created, "wb") as file:
             file.write(content)
@@ -154,7 +154,7 @@ def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: KeyP
 def _everybody(certificates: ModuleType, directory: Path) -> list[CertificateSummary]:
     """Give all whose certificates are in the directory, by role and name."""
     found = [
-        certificates.described(path.read_bytes(), str(path))
+        certificates.summarize(path.read_bytes(), str(path))
         for path in directory.glob("*.pem")
         if path.name != f"{AUTHORITY}.pem"
     ]

@@ -46,7 +46,7 @@ def rendezvous(
             console.show(f"forwarding video at port {opened['video'].port} and probes at {opened['probe'].port}; "
                          "Ctrl-C ends it")  # fmt: skip
         while not told.wait(LOOK_S):
-            now_there = {flow: each.vehicle_at() for flow, each in opened.items()}
+            now_there = {flow: each.vehicle_address() for flow, each in opened.items()}
             for flow in (each for each in opened if now_there[each] != there[each]):
                 _tell(settings.vehicle_id, flow, now_there[flow], as_json=as_json)
             there.update(now_there)

@@ -17,7 +17,7 @@ from lavt.domain import NS_PER_S
 from lavt.errors import WorkError
 from lavt.runtime import process_priority
 from lavt.runtime.realtime import RealRuntime
-from lavt.transport.udp_link import UdpLink, look_up
+from lavt.transport.udp_link import UdpLink, resolve_host
 
 PATIENCE_S = 5
 """After so long without a packet it is said what to look for."""
@@ -60,7 +60,7 @@ def watch(
     Example: lavt watch --port 5004 --sender foreign
     """
     process_priority.raise_priority()
-    only_from = None if sent_from is None else look_up("--from", sent_from)
+    only_from = None if sent_from is None else resolve_host("--from", sent_from)
     clock, watched = MachineClock(), WatchNodes(sender, reorder_hold_ms)
     runtime = RealRuntime(clock, watched.nodes, watched, lambda: None)
     link = UdpLink(clock, "rtp", runtime.deliver, bind=(bind, port), only_from=only_from)

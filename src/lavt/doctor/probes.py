@@ -27,7 +27,7 @@ from lavt.doctor.checks import SHOWN, CameraSample, CodecTimes, StateSample
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, Picture, State
 from lavt.errors import BadMessage, LavtError, UserError, WorkError
 from lavt.streams import stream
-from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, want_arrival_times
+from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, enable_arrival_times
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.messages import decode
 from lavt.transport.netem.netem import NetemInterface, run_tc
@@ -126,7 +126,7 @@ def arrivals_are_stamped() -> bool:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.settimeout(1.0)
         opened.bind(("127.0.0.1", 0))
-        want_arrival_times(opened)
+        enable_arrival_times(opened)
         opened.sendto(b"doctor", opened.getsockname())
         _, ancillary, _, _ = opened.recvmsg(64, ANCILLARY_BYTES)
     return any((level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS) for level, kind, _ in ancillary)

@@ -19,7 +19,7 @@ from statistics import median
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
+from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, enable_arrival_times
 from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
@@ -306,7 +306,7 @@ def _always(_datagram: bytes) -> bool:
 
 def _bound_socket(address: Address, name: str) -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    want_arrival_times(opened)
+    enable_arrival_times(opened)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
         opened.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
     try:
