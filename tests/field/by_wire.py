@@ -48,7 +48,7 @@ def proved(profile: str, work: Path, stalls: Stalls) -> RunConfig:
     run = run_config(profile, work / f"{profile}.json")
     config = write_config(run, work / f"{profile}.yaml")
     with software_car(config) as car:
-        command = [sys.executable, "-m", "lavt", "can", "prove", str(config), "--yes"]
+        command = [sys.executable, "-m", "lavt", "can", "test-watchdog", str(config), "--yes"]
         since_ns = CLOCK.now().mono_ns
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         stalls.require(done.returncode == 0, f"{done.stderr}, {car.events}", since_ns, CLOCK.now().mono_ns)

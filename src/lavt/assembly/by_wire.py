@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from lavt.assembly.addresses import resolved_address
 from lavt.assembly.dbw import load_profile
-from lavt.assembly.dbw_proof import check_proof
 from lavt.assembly.software_car import build_software_car
+from lavt.assembly.watchdog_proof import proof_rejection
 from lavt.clock import Clock, pause
 from lavt.config import ServerConfig, VehicleConfig
 from lavt.config.dbw import DbwConfig
@@ -112,7 +112,7 @@ def inhibit_reason_of(config: DbwConfig, profile: Profile) -> str:
             f"{profile.name} brakes with {braking_mps2:g} m/s2 at most, and a safe stop needs "
             f"{LIMITS.stop_deceleration_mps2:g}: raise limits.brake, if vehicle.max_braking_mps2 is right"
         )
-    return check_proof(config.watchdog_proof, profile, config)
+    return proof_rejection(config.watchdog_proof, profile, config)
 
 
 def _vehicle(

@@ -144,7 +144,7 @@ class ProfileConfig(Section):
     sent: SentConfig
     reports: ReportsConfig
     watchdog: OwnBrakeConfig = OwnBrakeConfig()
-    """By what `lavt can prove` sees that the kit's watchdog brakes."""
+    """By what `lavt can test-watchdog` sees that the kit's watchdog brakes."""
 
 
 class DbwConfig(Section):
@@ -162,7 +162,7 @@ class DbwConfig(Section):
     truth: str = ""
     """`host:port` of UDP where a software car's truth is heard; empty: a real car."""
     watchdog_proof: str = ""
-    """File that `lavt can prove` wrote."""
+    """File that `lavt can test-watchdog` wrote."""
     steering_sign: Literal[1, -1] | None = None
     """1: left is positive on the bus; for a profile that leaves it open."""
 
@@ -177,7 +177,7 @@ class DbwConfig(Section):
 
 
 class WatchdogProof(Section):
-    """The file of `lavt can prove`: on this bus, by this profile, the kit's watchdog was seen to brake."""
+    """The file of `lavt can test-watchdog`: on this bus, by this profile, the kit's watchdog was seen to brake."""
 
     version: Literal[1] = 1
     at: str
