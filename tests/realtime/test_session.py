@@ -30,7 +30,7 @@ Wait = Callable[[str, Callable[[], bool], float], None]
 BEGINS_S = 90.0
 """Programs start, routers find each other, a client asks, arms and speeds up: about 10 s on a quiet machine."""
 HELD = "held by operator-1, and the vehicle is not disarmed at standstill"
-ASKS = "operator-2 asks for the vehicle; SIGUSR2 hands it over"
+ASKS = "operator-2 requests control; SIGUSR2 hands the vehicle over"
 
 
 def status(process: Process) -> dict[str, Any]:
@@ -208,7 +208,7 @@ def test_ctrl_c_of_the_active_operator_frees_the_vehicle(session: Session, serve
 
 def test_a_server_ends_with_its_vehicle_stopped(session: Session, server: Record) -> None:
     """After Ctrl-C the server waits for standstill, says so, and ends with 0 and a complete record."""
-    assert session.seen["last of server"]["said"][-1] == "the vehicle stands; the server ends"
+    assert session.seen["last of server"]["said"][-1] == "the vehicle is stationary; the server ends"
     assert abs(server.table("truth").floats("speed_mps")[-1]) < 0.05
     assert session.codes["server"] == 0
     assert server.complete
