@@ -131,7 +131,7 @@ def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
     bare = tmp_path / "bare.dbc"
     bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
     assert rejected("dataspeed_gen1", dbc=str(bare)) == (
-        "dataspeed_gen1: a step of PCMD_PERCENT of BrakeCmd is 100% of a pedal: give it its scale or its unit in "
+        "dataspeed_gen1: a step of PCMD_PERCENT of BrakeCmd is 100% of a pedal: its scale or its unit in "
         "the DBC"
     )
 
@@ -141,20 +141,20 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("dataspeed_gen1", {"sent__brake__message": "BreakCmd"}, "its DBC has no message 'BreakCmd'"),
     ("dataspeed_gen1", {"sent__brake__value": "PCMD_TORQUE"}, "PCMD_TORQUE of BrakeCmd is in 'Nm': name a signal in"),
     ("dataspeed_gen1", {"sent__steering__value": "SCMD_TORQUE"}, "is in 'Nm': name a signal in 'deg' or 'rad'"),
-    ("dataspeed_gen1", {"limits__steering_wheel_deg": 600.0}, "600 does not fit SCMD_ANGLE of SteeringCmd"),
+    ("dataspeed_gen1", {"limits__steering_wheel_deg": 600.0}, "600 is out of range for SCMD_ANGLE of SteeringCmd"),
     (
         "dataspeed_gen1",
         {"limits__steering_wheel_rate_degps": 3.0},
-        "limits.steering_wheel_rate_degps is less than one of SVEL: raise it",
+        "limits.steering_wheel_rate_degps is less than one step of SVEL",
     ),
-    ("dataspeed_gen1", {"sent__gears": {"park": 1}}, "sent.gears has no drive: give its number"),
-    ("dataspeed_gen1", {"sent__gears": {"park": 1, "drive": 9}}, "9 does not fit GCMD of GearCmd"),
+    ("dataspeed_gen1", {"sent__gears": {"park": 1}}, "sent.gears has no drive"),
+    ("dataspeed_gen1", {"sent__gears": {"park": 1, "drive": 9}}, "9 is out of range for GCMD of GearCmd"),
     ("dataspeed_gen1", {"sent__brake__checksum": "CLEAR"}, "CLEAR of BrakeCmd is not its last byte"),
     ("dataspeed_gen1", {"reports__brake__values": {}}, "reports.brake.values has no enabled: name its signal"),
     ("dataspeed_gen1", {"reports__gear__values": {}}, "reports.gear.values has no gear: name its signal"),
     ("dataspeed_gen2", {"reports__speed__values": {}}, "no report has a speed: name its signal"),
-    ("dataspeed_gen2", {"reports__system__trip": {"STATE=x": "no"}}, "'STATE=x' of SystemReport is no sign"),
-    ("dataspeed_gen2", {"commands": None}, "is for remote or user: say in commands which"),
+    ("dataspeed_gen2", {"reports__system__trip": {"STATE=x": "no"}}, "'STATE=x' of SystemReport"),
+    ("dataspeed_gen2", {"commands": None}, "is for remote or user"),
     ("dataspeed_gen2", {"sent__system__value": ""}, "SystemCmd of its DBC has no signal ''"),
     ("dataspeed_gen2", {"sent__stearing": {}}, "unknown key 'sent.stearing': did you mean 'steering'?"),
     ("dataspeed_gen2", {"limits__brake": 2.0}, "'limits.brake': Input should be less than or equal to 1"),
