@@ -130,10 +130,8 @@ def test_a_pedal_without_its_scale(tmp_path: Path) -> None:
     text = shipped_profiles()["dataspeed_gen1"].with_suffix(".dbc").read_text()
     bare = tmp_path / "bare.dbc"
     bare.write_text(text.replace("m2 : 0|16@1+ (0.000015259021896696421,0) [0|1]", "m2 : 0|16@1+ (1,0) [0|65535]"))
-    assert rejected("dataspeed_gen1", dbc=str(bare)) == (
-        "dataspeed_gen1: a step of PCMD_PERCENT of BrakeCmd is 100% of a pedal: its scale or its unit in "
-        "the DBC"
-    )
+    sentence = rejected("dataspeed_gen1", dbc=str(bare))
+    assert all(part in sentence for part in ("PCMD_PERCENT of BrakeCmd", "100%"))
 
 
 REJECTED: list[tuple[str, dict[str, Any], str]] = [
