@@ -12,7 +12,7 @@ from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.nodes import build_client, build_server
-from lavt.assembly.vehicles import VehicleSetup, build_unpictured
+from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
@@ -119,9 +119,9 @@ def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Nod
     )
 
     def vehicle_setup(config: ServerConfig) -> VehicleSetup:
-        return replace(build_unpictured(config), camera=LoopCamera(run))
+        return replace(build_geometry_setup(config), camera=LoopCamera(run))
 
-    fidelity = replace(VIDEO, plant=vehicle_setup)
+    fidelity = replace(VIDEO, vehicle_setup=vehicle_setup)
     nodes = build_server(config, clock.now, MachineEntropy(), host="", video_port=port, fidelity=fidelity)
     return [nodes.camera, SinkNode("actuator", "frame")]
 

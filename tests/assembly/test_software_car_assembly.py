@@ -1,4 +1,4 @@
-"""Software cars made of a server's config."""
+"""The construction of software cars from a server's config."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.car import SoftwareCar
 
 
-def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
+def build(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
     return build_software_car(config or ServerConfig(), load_profile(profile), load_road("a_key"), START_NS)
 
 
@@ -34,23 +34,23 @@ def test_the_kit_is_the_profiles(profile: str, accepted: str) -> None:
         "user": Sender2(first=0x210),
     }
     for name, sender in senders.items():
-        car = built(profile)
+        car = build(profile)
         for frame in sender.commands(CommandValues(brake=0.5)):
             car.receive(frame, START_NS)
         assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted)
 
 
-def test_the_car_is_the_servers() -> None:
-    """The car begins where a simulator of the same config begins, with its seed and its lags."""
+def test_the_car_matches_the_config() -> None:
+    """The car starts where a simulator of the same config starts, with its seed and its lags."""
     config = ServerConfig(seed=7, vehicle=VehicleConfig(steering_lag_ms=250.0))
-    car, simulator = built("dataspeed_gen2", config), simulator_of(config, load_road("a_key"), START_NS)
+    car, simulator = build("dataspeed_gen2", config), simulator_of(config, load_road("a_key"), START_NS)
     assert car.simulator.ground_truth() == simulator.ground_truth()
-    assert car.simulator.ground_truth() != built("dataspeed_gen2").simulator.ground_truth()
+    assert car.simulator.ground_truth() != build("dataspeed_gen2").simulator.ground_truth()
     assert car.simulator._parameters.steering_lag_s == 0.25
 
 
-def test_a_config_with_options_of_a_bus_can_be_compared() -> None:
-    """Configs of equal options are equal and have one hash, as whoever remembers by them needs."""
+def test_a_config_with_bus_options_is_hashable() -> None:
+    """Configs with equal bus options are equal and have equal hashes, so that they can be keys of a cache."""
     one, same, other = (VehicleConfig(dbw=DbwConfig(options={"port": port})) for port in (1, 1, 2))
     assert hash(one) == hash(same)
     assert len({one, same, other}) == 2

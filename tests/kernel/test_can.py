@@ -97,11 +97,11 @@ def sets(changes: tuple[str, ...]) -> list[str]:
 
 
 def prove(machine: Machine, changes: tuple[str, ...], stalls: Stalls) -> None:
-    """Let `lavt can prove` see that the kit's watchdog brakes."""
+    """Let `lavt can test-watchdog` see that the kit's watchdog brakes."""
     with software_car(BY_WIRE, *sets(changes)) as car:
         since_ns = CLOCK.now().mono_ns
         try:
-            machine.run([machine.python, "-B", "-m", "lavt", "can", "prove", BY_WIRE, *sets(changes), "--yes"])
+            machine.run([machine.python, "-B", "-m", "lavt", "can", "test-watchdog", BY_WIRE, *sets(changes), "--yes"])
         except MachineError as failed:
             said = f"{failed}, {car.events}"
             raise stalls.verdict(said, since_ns, CLOCK.now().mono_ns, stall_ms=KIT_STALL_MS) from None

@@ -1,4 +1,4 @@
-"""From the keys that a config names to the ends of what is signed."""
+"""The construction of gateways, authenticators and ciphers from the keys in configs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
 
 
 def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
-    """Say what happens to the video: where messages are signed it is encrypted."""
+    """Return the cipher of the video, which is encrypted if the config has a key."""
     if not config.security.key:
         return plain_cipher
     check_srtp()
@@ -28,7 +28,7 @@ def gateway_of(
     carry: Carry,
     in_force: Callable[[], tuple[int, int]] = lambda: (0, -1),
 ) -> ServerGateway | ClientGateway | OpenClientGateway:
-    """Make a side's door; raises `UserError` for a key that cannot be read. Only the server asks what is `in_force`."""
+    """Build a side's gateway; raise `UserError` for an unreadable key. Only the server's gateway calls `in_force`."""
     if isinstance(config, ServerConfig):
         return ServerGateway(deliver, carry, in_force, vehicle_authenticator(config))
     authenticator = operator_authenticator(config)
@@ -36,7 +36,7 @@ def gateway_of(
 
 
 def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
-    """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
+    """Build the vehicle's authenticator; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:
         return NullVehicleAuthenticator()
@@ -45,7 +45,7 @@ def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
 
 
 def operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
-    """Make the operator's end; raises `UserError` for a key that cannot be read. None where nothing is signed."""
+    """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:
         return None

@@ -336,7 +336,7 @@ def test_each_client_has_a_link_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("link", "said"),
     [
-        (LinkConfig(trace="nowhere"), "there is no trace 'nowhere'"),
+        (LinkConfig(trace="nowhere"), "unknown trace 'nowhere'"),
         (LinkConfig(reorder=0.1), "reorder needs a delay"),
         (LinkConfig(rate_bps=1000, trace="fading.mahimahi"), "give one of the two"),
     ],

@@ -106,7 +106,7 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
         server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
-        host="virtual-server", video_port=SERVER_VIDEO_PORT, fidelity=fidelity, lives_on_demand=True,
+        host="virtual-server", video_port=SERVER_VIDEO_PORT, fidelity=fidelity, lazy_physics=True,
     )  # fmt: skip
     client = build_client(
         client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
