@@ -10,7 +10,7 @@ from lavt.perception.lane_detector import LaneDetector
 from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayModel, DelayLine
 from lavt.transport.messages import decode, encode
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
@@ -82,7 +82,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
 
     # 5. The packets travel: all of one frame take the same time, and nothing overtakes.
-    video = DelayLine(DelayLaw(VIDEO_DELAY_MS))
+    video = DelayLine(DelayModel(VIDEO_DELAY_MS))
     now_ns = START_NS + 75 * NS_PER_MS
     assert {video.push(packet, START_NS, index=0) for packet in packets} == {now_ns}
     assert video.pop_due(now_ns - 1) == []
@@ -127,7 +127,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one walk, from end to end)
     )  # fmt: skip
 
     # 11. The command travels, as bytes, and is checked before anybody looks at it.
-    control = DelayLine(DelayLaw(CONTROL_DELAY_MS))
+    control = DelayLine(DelayModel(CONTROL_DELAY_MS))
     assert control.push(encode(command), now_ns, index=0) == now_ns + 20 * NS_PER_MS
     now_ns += 20 * NS_PER_MS
     (datagram,) = control.pop_due(now_ns)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, DelayLine, Lognormal
 
 MS = NS_PER_MS
 
@@ -49,7 +49,7 @@ class Nothing:
 
 
 def talk(
-    law: DelayLaw, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
+    law: DelayModel, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
 ) -> tuple[VirtualRuntime, Talker]:
     """Let a driver say `control` to an actuator."""
     clock = HostClock(0, 0)
@@ -83,10 +83,10 @@ def test_offset_drift_and_steps_are_those_requested_for() -> None:
 
 def test_links_delay_exactly_and_keep_order() -> None:
     """A constant link delays by its constant; one with jitter lets nothing overtake."""
-    runtime, actuator = talk(DelayLaw(75.0))
+    runtime, actuator = talk(DelayModel(75.0))
     runtime.run(NS_PER_S, lambda: False)
     assert [arrived for _, arrived, _ in actuator.heard] == [(20 * i + 75) * MS for i in range(47)]
-    runtime, actuator = talk(DelayLaw(0.0, Lognormal(40.0, 1.0), 1, "jitter"))
+    runtime, actuator = talk(DelayModel(0.0, Lognormal(40.0, 1.0), 1, "jitter"))
     runtime.run(2 * NS_PER_S, lambda: False)
     numbers = [payload for payload, _, _ in actuator.heard]
     arrivals = [arrived for _, arrived, _ in actuator.heard]
@@ -97,7 +97,7 @@ def test_links_delay_exactly_and_keep_order() -> None:
 
 def test_costs_add_up_and_a_busy_node_queues() -> None:
     """A hop that takes 30 ms delays what comes every 20 ms more each time; messages wait with their own arrival."""
-    runtime, actuator = talk(DelayLaw(0.0), costs_ns={("actuator", "hear"): 30 * MS, ("driver", "say"): 3 * MS})
+    runtime, actuator = talk(DelayModel(0.0), costs_ns={("actuator", "hear"): 30 * MS, ("driver", "say"): 3 * MS})
     runtime.run(200 * MS, lambda: False)
     assert [arrived // MS for _, arrived, _ in actuator.heard[:4]] == [3, 23, 43, 63]
     assert [begun // MS for _, _, begun in actuator.heard[:4]] == [3, 33, 63, 93]
@@ -105,7 +105,7 @@ def test_costs_add_up_and_a_busy_node_queues() -> None:
 
 def test_a_closed_link_loses() -> None:
     """What is sent over a closed link never arrives; what was under way does, and so does what comes after."""
-    runtime, actuator = talk(DelayLaw(50.0))
+    runtime, actuator = talk(DelayModel(50.0))
     link = runtime.links["control"]
     runtime.at(110 * MS, lambda: setattr(link, "open", False))
     runtime.at(210 * MS, lambda: setattr(link, "open", True))
@@ -118,7 +118,7 @@ def test_two_runs_are_equal() -> None:
     """The same seed gives the same times to the nanosecond; another seed gives others."""
 
     def heard(seed: int) -> list[tuple[Any, int, int]]:
-        runtime, actuator = talk(DelayLaw(5.0, Lognormal(12.0, 0.6), seed, "jitter"))
+        runtime, actuator = talk(DelayModel(5.0, Lognormal(12.0, 0.6), seed, "jitter"))
         runtime.run(NS_PER_S, lambda: False)
         return actuator.heard
 
@@ -128,7 +128,7 @@ def test_two_runs_are_equal() -> None:
 
 def test_it_ends_when_finished() -> None:
     """A run ends as soon as it is finished, or at its limit, and tells which."""
-    runtime, actuator = talk(DelayLaw(0.0))
+    runtime, actuator = talk(DelayModel(0.0))
     assert runtime.run(NS_PER_S, lambda: len(actuator.heard) == 3)
     assert runtime.true_ns == 40 * MS
     assert not runtime.run(100 * MS, lambda: False)

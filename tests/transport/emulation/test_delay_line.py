@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, DelayLine, Lognormal
 
 WIFI = Lognormal(median_ms=12.0, sigma=0.668)
 
@@ -14,12 +14,12 @@ WIFI = Lognormal(median_ms=12.0, sigma=0.668)
 @pytest.mark.parametrize(("constant_ms", "delay_ns"), [(0.0, 0), (75.0, 75_000_000), (0.25, 250_000), (-3.0, 0)])
 def test_constant(constant_ms: float, delay_ns: int) -> None:
     """A constant delay is exact to the nanosecond, the same for every index, and never negative."""
-    assert {DelayLaw(constant_ms).delay_ns(index) for index in (0, 1, 2**32 - 1)} == {delay_ns}
+    assert {DelayModel(constant_ms).delay_ns(index) for index in (0, 1, 2**32 - 1)} == {delay_ns}
 
 
 def test_lognormal() -> None:
     """The jitter of the paper's WiFi adds 12 ms in the median and 36 ms at the 95th percentile to the constant."""
-    law = DelayLaw(50.0, WIFI, seed=1, name="video")
+    law = DelayModel(50.0, WIFI, seed=1, name="video")
     added_ms = np.array([law.delay_ns(index) for index in range(20_000)]) / NS_PER_MS - 50.0
     assert np.median(added_ms) == pytest.approx(12.0, abs=0.3)
     assert np.percentile(added_ms, 95) == pytest.approx(36.0, abs=1.2)
@@ -29,30 +29,30 @@ def test_lognormal() -> None:
 
 def test_same_index_same_delay() -> None:
     """The delay of an index does not depend on what was asked before, nor on which object is asked."""
-    forwards = [DelayLaw(0.0, WIFI, 5, "video").delay_ns(index) for index in range(1000)]
-    law = DelayLaw(0.0, WIFI, 5, "video")
+    forwards = [DelayModel(0.0, WIFI, 5, "video").delay_ns(index) for index in range(1000)]
+    law = DelayModel(0.0, WIFI, 5, "video")
     backwards = [law.delay_ns(index) for index in reversed(range(1000))]
     assert forwards == backwards[::-1]
 
 
-@pytest.mark.parametrize("other", [DelayLaw(0.0, WIFI, 2, "video"), DelayLaw(0.0, WIFI, 1, "control")])
-def test_independent(other: DelayLaw) -> None:
+@pytest.mark.parametrize("other", [DelayModel(0.0, WIFI, 2, "video"), DelayModel(0.0, WIFI, 1, "control")])
+def test_independent(other: DelayModel) -> None:
     """Another seed or another name gives other delays that have nothing to do with the first."""
-    law = DelayLaw(0.0, WIFI, 1, "video")
+    law = DelayModel(0.0, WIFI, 1, "video")
     ours, theirs = (np.log([each.delay_ns(index) for index in range(5_000)]) for each in (law, other))
     assert abs(float(np.corrcoef(ours, theirs)[0, 1])) < 0.05
 
 
 def test_neighbours_are_independent() -> None:
     """Consecutive indices have nothing to do with each other."""
-    law = DelayLaw(0.0, WIFI, 1, "video")
+    law = DelayModel(0.0, WIFI, 1, "video")
     delays = np.log([law.delay_ns(index) for index in range(5_000)])
     assert abs(float(np.corrcoef(delays[:-1], delays[1:])[0, 1])) < 0.05
 
 
 def test_constant_does_not_change_the_jitter() -> None:
     """Runs under two conditions are paired: the constant is on top of the same jitter."""
-    without, on_top = DelayLaw(0.0, WIFI, 1, "video"), DelayLaw(75.0, WIFI, 1, "video")
+    without, on_top = DelayModel(0.0, WIFI, 1, "video"), DelayModel(75.0, WIFI, 1, "video")
     assert {on_top.delay_ns(index) - without.delay_ns(index) for index in range(200)} <= {
         75 * NS_PER_MS - 1, 75 * NS_PER_MS, 75 * NS_PER_MS + 1,
     }  # fmt: skip
@@ -64,7 +64,7 @@ def test_constant_does_not_change_the_jitter() -> None:
 )
 def test_nothing_overtakes(arrivals: list[tuple[int, int]], seed: int) -> None:
     """What went into a line comes out whole, in order, never before its delay, and when the line said."""
-    law = DelayLaw(5.0, WIFI, seed, "line")
+    law = DelayModel(5.0, WIFI, seed, "line")
     line = DelayLine(law)
     now_ns = 0
     due: list[int] = []
@@ -90,7 +90,7 @@ def test_nothing_overtakes(arrivals: list[tuple[int, int]], seed: int) -> None:
 
 def test_same_index_stays_together() -> None:
     """Packets that came in together with one index, as those of one frame, come out together."""
-    line = DelayLine(DelayLaw(50.0, WIFI, 1, "video"))
+    line = DelayLine(DelayModel(50.0, WIFI, 1, "video"))
     due = {line.push(packet, 0, 90_000) for packet in range(10)}
     assert due == {line.next_due_ns()}
     assert line.pop_due(line.next_due_ns() or 0) == list(range(10))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayModel, DelayLine
 from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
 from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injected
 from lavt.transport.emulation.random_process import LARGEST, quantiles
@@ -315,7 +315,7 @@ def test_loss_does_not_move_overtaking() -> None:
 def test_a_line_with_a_link() -> None:
     """A line gives out what its link lets through when that says, early ones first, and tells when each is due."""
     law = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
-    line, made = DelayLine(DelayLaw(12.0), link(law)), link(law)
+    line, made = DelayLine(DelayModel(12.0), link(law)), link(law)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
     assert due == [made.leaves_ns(number * MS, 12 * MS, 100) for number in range(500)]
     order = sorted((each, number) for number, each in enumerate(due) if each is not None)

@@ -26,7 +26,7 @@ class Lognormal:
 
 
 @dataclass(frozen=True, slots=True)
-class DelayLaw:
+class DelayModel:
     """A constant delay and, on top, one drawn for each index from the stream `name` of `seed`."""
 
     constant_ms: float
@@ -58,7 +58,7 @@ def _jitter(seed: int, name: str) -> IndexedStream:
 class DelayLine:
     """A queue that delays each item and keeps order; an `EmulatedLink` may also drop, spread or reorder items."""
 
-    def __init__(self, law: DelayLaw, link: EmulatedLink | None = None) -> None:
+    def __init__(self, law: DelayModel, link: EmulatedLink | None = None) -> None:
         self.law = law
         self.link = link
         self._waiting: list[tuple[int, int, Any]] = []

@@ -20,7 +20,7 @@ from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayModel, DelayLine
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
 
@@ -36,7 +36,7 @@ REMEMBERED = 20_000
 """So many datagrams count for what the relay says it did."""
 
 Address = tuple[str, int]
-NONE = DelayLaw(0.0)
+NONE = DelayModel(0.0)
 
 
 def is_delayed_video(datagram: bytes) -> bool:
@@ -60,8 +60,8 @@ class RelayedFlow:
     name: str
     listen: Address
     server: Address
-    upstream: DelayLaw
-    downstream: DelayLaw
+    upstream: DelayModel
+    downstream: DelayModel
     held_downstream: Callable[[bytes], bool] = lambda _datagram: True
     index_downstream: Callable[[bytes], int] | None = None
     """From a datagram to the index of its delay; None: datagrams are counted."""
@@ -263,7 +263,7 @@ class _OpenFlow:
         self._relay.watch(towards_server, lambda: self._from_server(client))
         return client
 
-    def _line(self, law: DelayLaw, injected: LinkInjection | None) -> DelayLine:
+    def _line(self, law: DelayModel, injected: LinkInjection | None) -> DelayLine:
         return DelayLine(law, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
 
     def _from_server(self, client: _Client) -> None:
