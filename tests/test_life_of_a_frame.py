@@ -10,7 +10,7 @@ from lavt.perception.lane_detector import LaneDetector
 from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.messages import decode, encode
 from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer

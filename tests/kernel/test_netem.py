@@ -87,9 +87,9 @@ def hold(sides: dict[str, NetemInterface], name: str) -> None:
         inside(role, lambda role=role, flows=flows: sides[role].apply(flows, never=NEVER, condition=name))  # type: ignore[misc]
 
 
-def hold_video(sides: dict[str, NetemInterface], law: Impairment) -> None:
+def hold_video(sides: dict[str, NetemInterface], impairment: Impairment) -> None:
     """Give the server's video a law."""
-    inside("server", lambda: sides["server"].apply([ImpairedFlow("video", "udp", VIDEO, "source", law)]))
+    inside("server", lambda: sides["server"].apply([ImpairedFlow("video", "udp", VIDEO, "source", impairment)]))
 
 
 def queues(side: str) -> Any:

@@ -66,7 +66,7 @@ def test_a_condition_is_granted_when_the_queues_do_it() -> None:
 def test_the_state_goes_with_the_video_where_that_is_requested() -> None:
     """A state delay is that of what the server's router sends, from the port at which it listens."""
     [send] = ask(server(), replace(L4, state_delay_ms=150.0))
-    assert send.payload.flows == (VIDEO, replace(STATE, law=Impairment(150.0)))
+    assert send.payload.flows == (VIDEO, replace(STATE, impairment=Impairment(150.0)))
 
 
 def test_asking_again_renews_the_lease_and_changes_nothing() -> None:
@@ -93,7 +93,7 @@ def test_a_lease_that_is_not_renewed_clears_everything_and_somebody_else_may_ask
 def test_a_change_of_the_condition_is_made_live() -> None:
     """Another condition by the same client is told to the queues, which change without being cleared in between."""
     [send] = ask(in_force(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
-    assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, law=Impairment(225.0)), STATE)))
+    assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, impairment=Impairment(225.0)), STATE)))
 
 
 def test_what_is_in_force_is_measured_again_and_again() -> None:
@@ -224,7 +224,7 @@ def test_garbage_is_counted() -> None:
 
 def asking(control: ImpairedFlow = CONTROL) -> InjectionClient:
     return InjectionClient(
-        "alice", 7, condition="L4", control=control, video=VIDEO.law, state_delay_ms=0.0, start_ns=at(0).mono_ns
+        "alice", 7, condition="L4", control=control, video=VIDEO.impairment, state_delay_ms=0.0, start_ns=at(0).mono_ns
     )
 
 

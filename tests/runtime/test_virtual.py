@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.node import WAKE, Hop, Message, Send
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine, Lognormal
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel, Lognormal
 
 MS = NS_PER_MS
 

@@ -39,17 +39,21 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
     """
     shown = NetemInterface(interface).shown()
     applied = shown["applied"] if shown["ours"] else None
-    laws = {name: asdict(law) for name, law in shown["laws"].items()} if shown["ours"] else {}
+    impairments = (
+        {name: asdict(impairment) for name, impairment in shown["impairments"].items()} if shown["ours"] else {}
+    )
     if as_json:
         whose = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
-        console.show_json({**shown, "laws": laws, "applied": whose})
+        console.show_json({**shown, "impairments": impairments, "applied": whose})
         return
     if not shown["ours"]:
         console.show(f"{interface} holds nothing of ours: {', '.join(shown['queues']) or 'no queue'}")
         return
     console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.words}")
-    for name, law in laws.items():
-        told = ", ".join(f"{key} {value:g}" for key, value in law.items() if isinstance(value, int | float) and value)
+    for name, impairment in impairments.items():
+        told = ", ".join(
+            f"{key} {value:g}" for key, value in impairment.items() if isinstance(value, int | float) and value
+        )
         console.show(f"  {name}: {told or 'nothing'}")
 
 

@@ -61,7 +61,7 @@ class _Queues:
             self.again_ns = now.mono_ns + ASK_PERIOD_NS
         elif self.condition:
             self.again_ns = now.mono_ns + MEASURE_PERIOD_NS
-        requested_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
+        requested_ms: dict[str, float] = {flow.name: flow.impairment.delay_ms for flow in self.flows} or {"": 0.0}
         measured_ms = dict(done.measured_ms)
         return [
             Send(

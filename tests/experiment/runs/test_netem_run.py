@@ -44,7 +44,7 @@ class Kernel(NetemInterface):
     ) -> dict[str, ProbeResult]:
         """Measure nothing."""
         return {
-            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
+            each.name: ProbeResult(count, 0, 0, 0, *[each.impairment.delay_ms + self.more_ms] * 3)
             for each in probes(flows, never)
         }
 

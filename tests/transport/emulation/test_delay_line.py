@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine, Lognormal
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel, Lognormal
 
 WIFI = Lognormal(median_ms=12.0, sigma=0.668)
 
@@ -19,8 +19,8 @@ def test_constant(constant_ms: float, delay_ns: int) -> None:
 
 def test_lognormal() -> None:
     """The jitter of the paper's WiFi adds 12 ms in the median and 36 ms at the 95th percentile to the constant."""
-    law = DelayModel(50.0, WIFI, seed=1, name="video")
-    added_ms = np.array([law.delay_ns(index) for index in range(20_000)]) / NS_PER_MS - 50.0
+    delay = DelayModel(50.0, WIFI, seed=1, name="video")
+    added_ms = np.array([delay.delay_ns(index) for index in range(20_000)]) / NS_PER_MS - 50.0
     assert np.median(added_ms) == pytest.approx(12.0, abs=0.3)
     assert np.percentile(added_ms, 95) == pytest.approx(36.0, abs=1.2)
     assert np.log(added_ms).std() == pytest.approx(0.668, abs=0.01)
@@ -30,23 +30,23 @@ def test_lognormal() -> None:
 def test_same_index_same_delay() -> None:
     """The delay of an index does not depend on what was asked before, nor on which object is asked."""
     forwards = [DelayModel(0.0, WIFI, 5, "video").delay_ns(index) for index in range(1000)]
-    law = DelayModel(0.0, WIFI, 5, "video")
-    backwards = [law.delay_ns(index) for index in reversed(range(1000))]
+    delay = DelayModel(0.0, WIFI, 5, "video")
+    backwards = [delay.delay_ns(index) for index in reversed(range(1000))]
     assert forwards == backwards[::-1]
 
 
 @pytest.mark.parametrize("other", [DelayModel(0.0, WIFI, 2, "video"), DelayModel(0.0, WIFI, 1, "control")])
 def test_independent(other: DelayModel) -> None:
     """Another seed or another name gives other delays that have nothing to do with the first."""
-    law = DelayModel(0.0, WIFI, 1, "video")
-    ours, theirs = (np.log([each.delay_ns(index) for index in range(5_000)]) for each in (law, other))
+    delay = DelayModel(0.0, WIFI, 1, "video")
+    ours, theirs = (np.log([each.delay_ns(index) for index in range(5_000)]) for each in (delay, other))
     assert abs(float(np.corrcoef(ours, theirs)[0, 1])) < 0.05
 
 
 def test_neighbours_are_independent() -> None:
     """Consecutive indices have nothing to do with each other."""
-    law = DelayModel(0.0, WIFI, 1, "video")
-    delays = np.log([law.delay_ns(index) for index in range(5_000)])
+    delay = DelayModel(0.0, WIFI, 1, "video")
+    delays = np.log([delay.delay_ns(index) for index in range(5_000)])
     assert abs(float(np.corrcoef(delays[:-1], delays[1:])[0, 1])) < 0.05
 
 
@@ -64,8 +64,8 @@ def test_constant_does_not_change_the_jitter() -> None:
 )
 def test_nothing_overtakes(arrivals: list[tuple[int, int]], seed: int) -> None:
     """What went into a line comes out whole, in order, never before its delay, and when the line said."""
-    law = DelayModel(5.0, WIFI, seed, "line")
-    line = DelayLine(law)
+    delay = DelayModel(5.0, WIFI, seed, "line")
+    line = DelayLine(delay)
     now_ns = 0
     due: list[int] = []
     least: list[int] = []
@@ -74,7 +74,7 @@ def test_nothing_overtakes(arrivals: list[tuple[int, int]], seed: int) -> None:
         due_ns = line.push(number, now_ns, index)
         assert due_ns is not None
         due.append(due_ns)
-        least.append(now_ns + law.delay_ns(index))
+        least.append(now_ns + delay.delay_ns(index))
     assert due == sorted(due)
     assert all(a >= b for a, b in zip(due, least, strict=True))
     assert due == np.maximum.accumulate(np.array(least, dtype=np.int64)).tolist()

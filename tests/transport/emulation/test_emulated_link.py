@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
-from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injected
+from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
 from lavt.transport.emulation.random_process import LARGEST, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
@@ -27,9 +27,9 @@ TABLES = Path("/usr/lib/x86_64-linux-gnu/tc")
 
 
 def link(
-    law: Impairment, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any
+    impairment: Impairment, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any
 ) -> EmulatedLink:
-    return EmulatedLink(LinkInjection(law, seed, name, trace, **keys))
+    return EmulatedLink(LinkInjection(impairment, seed, name, trace, **keys))
 
 
 def times(
@@ -128,8 +128,8 @@ def test_tables_are_those_of_tc(distribution: Distribution) -> None:
 
 def test_correlated_jitter() -> None:
     """Correlated jitter has the deviation asked for, and the correlation with itself 20 ms before, 40 ms before, ..."""
-    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
-    delays = held_ms(link(law), count=5 * COUNT, period_ns=20 * MS) - 1000
+    impairment = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    delays = held_ms(link(impairment), count=5 * COUNT, period_ns=20 * MS) - 1000
     assert delays.std() == pytest.approx(1, rel=0.03)
     for steps in (1, 2, 3):
         found = float(np.corrcoef(delays[:-steps], delays[steps:])[0, 1])
@@ -138,9 +138,9 @@ def test_correlated_jitter() -> None:
 
 def test_correlated_jitter_goes_by_time() -> None:
     """Within 20 ms the delay stays; how many packets come does not change how it goes on."""
-    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
-    many = held_ms(link(law), count=1000, period_ns=4 * MS)
-    few = held_ms(link(law), count=200, period_ns=20 * MS)
+    impairment = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    many = held_ms(link(impairment), count=1000, period_ns=4 * MS)
+    few = held_ms(link(impairment), count=200, period_ns=20 * MS)
     assert (many.reshape(200, 5)[:, 0] == few).all()
     assert (np.ptp(many.reshape(200, 5), axis=1) == 0).all()
 
@@ -250,7 +250,7 @@ def test_delays_by_hand() -> None:
     assert [each and each / MS for each in left] == [20, 570, 1120, 1120, 1120, 1120, 1520, 2570]
 
 
-LAWS: dict[str, dict[str, Any]] = {
+IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "loss": {"loss": 0.1},
     "bursts": {"loss": 0.1, "loss_burst_packets": 5.0},
     "reorder": {"reorder": 0.2},
@@ -261,12 +261,12 @@ LAWS: dict[str, dict[str, Any]] = {
 
 
 @given(
-    st.lists(st.sampled_from(sorted(set(LAWS) - {"reorder"})), max_size=3, unique=True),
+    st.lists(st.sampled_from(sorted(set(IMPAIRMENTS) - {"reorder"})), max_size=3, unique=True),
     st.lists(st.tuples(st.integers(0, 30 * MS), st.integers(0, 20 * MS), st.integers(0, 1500)), max_size=60),
 )
 def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) -> None:
     """Nothing overtakes but by `reorder`, and nothing leaves before it came, whatever else is asked for."""
-    made = link(Impairment(delay_ms=10, **{key: value for name in names for key, value in LAWS[name].items()}))
+    made = link(Impairment(delay_ms=10, **{key: value for name in names for key, value in IMPAIRMENTS[name].items()}))
     now_ns, last_ns = 0, 0
     for pause_ns, inherent_ns, size_bytes in packets:
         now_ns += pause_ns
@@ -277,13 +277,13 @@ def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) ->
     assert made.overtook == 0
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", IMPAIRMENTS)
 def test_it_repeats(name: str) -> None:
     """One seed gives the same to the nanosecond; another seed or flow gives something else where there is chance."""
-    law = Impairment(delay_ms=75, **LAWS[name])
-    first = times(link(law), count=2000)
-    assert times(link(law), count=2000) == first
-    for other in (link(law, seed=2), link(law, name="control")):
+    impairment = Impairment(delay_ms=75, **IMPAIRMENTS[name])
+    first = times(link(impairment), count=2000)
+    assert times(link(impairment), count=2000) == first
+    for other in (link(impairment, seed=2), link(impairment, name="control")):
         assert (times(other, count=2000) == first) == (name == "rate")
 
 
@@ -291,9 +291,9 @@ def test_it_repeats(name: str) -> None:
 @pytest.mark.parametrize("added", ["loss", "bursts", "reorder"])
 def test_runs_stay_paired(name: str, added: str) -> None:
     """A law more leaves the delays of the packets that it does not concern as they were."""
-    law = Impairment(delay_ms=75, **LAWS[name])
-    alone = times(link(law), count=2000)
-    both = times(link(replace(law, **LAWS[added])), count=2000)
+    impairment = Impairment(delay_ms=75, **IMPAIRMENTS[name])
+    alone = times(link(impairment), count=2000)
+    both = times(link(replace(impairment, **IMPAIRMENTS[added])), count=2000)
     assert sum(each in (None, 0) for each in both) > 50
     assert all(each in (None, 0, before) for before, each in zip(alone, both, strict=True))
 
@@ -307,15 +307,15 @@ def test_more_loss_takes_more() -> None:
 
 def test_loss_does_not_move_overtaking() -> None:
     """The same packets overtake whether others are lost or not."""
-    law = Impairment(delay_ms=75, reorder=0.2)
-    alone, both = times(link(law), count=2000), times(link(replace(law, loss=0.1)), count=2000)
+    impairment = Impairment(delay_ms=75, reorder=0.2)
+    alone, both = times(link(impairment), count=2000), times(link(replace(impairment, loss=0.1)), count=2000)
     assert all(each in (None, before) for before, each in zip(alone, both, strict=True))
 
 
 def test_a_line_with_a_link() -> None:
     """A line gives out what its link lets through when that says, early ones first, and tells when each is due."""
-    law = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
-    line, made = DelayLine(DelayModel(12.0), link(law)), link(law)
+    impairment = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
+    line, made = DelayLine(DelayModel(12.0), link(impairment)), link(impairment)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
     assert due == [made.leaves_ns(number * MS, 12 * MS, 100) for number in range(500)]
     order = sorted((each, number) for number, each in enumerate(due) if each is not None)
@@ -339,19 +339,19 @@ CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("law", "trace", "said"), CONTRADICTIONS)
-def test_contradictions(law: Impairment, trace: str | None, said: str) -> None:
+@pytest.mark.parametrize(("impairment", "trace", "said"), CONTRADICTIONS)
+def test_contradictions(impairment: Impairment, trace: str | None, said: str) -> None:
     """What contradicts itself is refused with the flow's name."""
-    requested = LinkInjection(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
+    requested = LinkInjection(impairment, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
     with pytest.raises(UserError, match=rf"^video: .*{said}"):
-        check_injected(requested)
+        check_injection(requested)
 
 
 def test_what_the_kernel_rejects_is_allowed() -> None:
     """Jitter beyond the delay, correlation without jitter, and overtaking what only a trace delays are no nonsense."""
-    check_injected(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
-    check_injected(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))
-    check_injected(LinkInjection(Impairment(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
+    check_injection(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
+    check_injection(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))
+    check_injection(LinkInjection(Impairment(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
 
 
 def test_early_ones_keep_their_order() -> None:

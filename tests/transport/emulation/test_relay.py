@@ -207,8 +207,8 @@ def test_stranger(net: Net) -> None:
 
 def test_frames_stay_whole_and_in_order() -> None:
     """All packets of one frame share a delay, a frame with a shorter delay waits for the one before it."""
-    law = DelayConfig(constant_ms=10.0, jitter_median_ms=12.0, jitter_sigma=0.668)
-    with closing(Net(video=law)) as net:
+    delay = DelayConfig(constant_ms=10.0, jitter_median_ms=12.0, jitter_sigma=0.668)
+    with closing(Net(video=delay)) as net:
         client, seen_at = net.connect("video")
         sent = [rtp(timestamp, sequence) for timestamp in range(0, 60_000, 3_000) for sequence in range(3)]
         for datagram in sent:
@@ -255,12 +255,12 @@ def test_held(net: Net) -> None:
     }  # fmt: skip
 
 
-def through(net: Net, law: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
+def through(net: Net, impairments: LinkConfig, count: int, period_ms: float) -> list[tuple[int, float]]:
     """Send numbered packets through a net of this law at a period; gives the number of each that came, and when."""
     client, seen_at = net.connect("video")
     came, begin_ns = [], net.clock.mono_ns
     steps_a_period = round(period_ms * 2)
-    for step in range(count * steps_a_period + round(2 * (law.delay_ms + 8 * law.jitter_ms)) + 400):
+    for step in range(count * steps_a_period + round(2 * (impairments.delay_ms + 8 * impairments.jitter_ms)) + 400):
         number, rest = divmod(step, steps_a_period)
         if rest == 0 and number < count:
             net.server["video"].send(rtp(3000 * number, number), seen_at)
@@ -287,12 +287,14 @@ LINKS = {
 @pytest.mark.parametrize("name", LINKS)
 def test_the_relay_does_what_the_link_says(name: str) -> None:
     """Through the relay each packet is lost, or leaves, as the model of the link has it, and that is counted."""
-    law = LINKS[name]
-    with closing(Net(video=DelayConfig(link=law))) as net:
-        requested = injected("video", law.delay_ms, ImpairmentConfig(**law.model_dump(exclude={"delay_ms"})), 1)
+    impairments = LINKS[name]
+    with closing(Net(video=DelayConfig(link=impairments))) as net:
+        requested = injected(
+            "video", impairments.delay_ms, ImpairmentConfig(**impairments.model_dump(exclude={"delay_ms"})), 1
+        )
         assert requested is not None
         model = EmulatedLink(requested)
-        came = through(net, law, count := 60, 10.0)
+        came = through(net, impairments, count := 60, 10.0)
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]
     left = [model.leaves_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]

@@ -28,7 +28,7 @@ from lavt.transport.emulation.impairment import (
     ImpairedFlow,
     Impairment,
     check_flows,
-    check_law,
+    check_netem_impairment,
 )
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter, wandering
 from lavt.transport.netem.netem import NetemInterface, run_tc
@@ -54,9 +54,9 @@ from lavt.transport.netem.tc import (
     first_commands,
     netem_arguments,
     parse_filters,
+    parse_impairment,
     parse_qdiscs,
-    read_law,
-    set_law,
+    set_impairment,
 )
 
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150))
@@ -111,7 +111,7 @@ def test_the_commands_of_a_condition_are_these() -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "words"),
+    ("impairment", "words"),
     [
         (Impairment(), "delay 0ms rate 10gbit"),
         (Impairment(75, 10), "delay 75ms 10ms distribution normal rate 10gbit"),
@@ -124,9 +124,9 @@ def test_the_commands_of_a_condition_are_these() -> None:
         (Impairment(0.123), "delay 0.123ms rate 10gbit"),
     ],
 )
-def test_a_law_in_the_words_of_netem(law: Impairment, words: str) -> None:
+def test_a_law_in_the_words_of_netem(impairment: Impairment, words: str) -> None:
     """Each law has exactly these arguments, always with limit, delay and rate, as a change keeps what is not named."""
-    assert " ".join(netem_arguments(law)) == f"netem limit 10000 {words}"
+    assert " ".join(netem_arguments(impairment)) == f"netem limit 10000 {words}"
 
 
 def test_a_long_delay_has_room_for_its_packets() -> None:
@@ -137,7 +137,7 @@ def test_a_long_delay_has_room_for_its_packets() -> None:
 
 def test_a_uniform_law_names_the_directory_of_its_table() -> None:
     """A uniform jitter is given by a table of ours: without any, a change would keep that of the law before."""
-    command = set_law(
+    command = set_impairment(
         "lo", "video", Impairment(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt"
     )
     assert command[:3] == ["env", "TC_LIB_DIR=/run/lavt", "tc"]
@@ -163,7 +163,7 @@ def options_of(words: list[str]) -> dict[str, Any]:
     return options
 
 
-LAWS = st.builds(
+IMPAIRMENTS = st.builds(
     Impairment,
     delay_ms=st.floats(1, 1000),
     jitter_ms=st.just(0.0) | st.floats(0.1, 1),
@@ -175,15 +175,15 @@ LAWS = st.builds(
 )
 
 
-@given(LAWS)
-def test_any_law_is_read_back_as_it_was_told(law: Impairment) -> None:
+@given(IMPAIRMENTS)
+def test_any_law_is_read_back_as_it_was_told(impairment: Impairment) -> None:
     """What a netem tells that was given the arguments of a law does not differ from that law."""
-    options = options_of(netem_arguments(law))
+    options = options_of(netem_arguments(impairment))
     there = [Qdisc("prio", "4c56:", "root", {}, 0), Qdisc("netem", "4c01:", "4c56:4", options, 0)]
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
     assert difference(flow, there, [expected_filter(each) for each in filters(flow)]) == []
-    if law.loss and law.loss_burst_packets > 1:
-        assert read_law(options).loss_burst_packets == pytest.approx(law.loss_burst_packets, rel=1e-3)
+    if impairment.loss and impairment.loss_burst_packets > 1:
+        assert parse_impairment(options).loss_burst_packets == pytest.approx(impairment.loss_burst_packets, rel=1e-3)
 
 
 def test_what_tc_tells_is_read() -> None:
@@ -194,7 +194,7 @@ def test_what_tc_tells_is_read() -> None:
         ("prio", "4c56:", "root", 0),
         ("netem", "4c01:", "4c56:4", 7),
     ]
-    assert read_law(qdiscs[1].options) == Impairment(150)
+    assert parse_impairment(qdiscs[1].options) == Impairment(150)
     assert found == [expected_filter(each) for each in filters(VIDEO)]
     assert difference(VIDEO, qdiscs, found) == []
 
@@ -241,11 +241,11 @@ def test_other_json_from_tc_is_an_error_of_ours(text: str) -> None:
 def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> None:
     """Options that are not a netem's are a `WorkError`."""
     with pytest.raises(WorkError, match="not understood"):
-        read_law(options)
+        parse_impairment(options)
 
 
 @pytest.mark.parametrize(
-    ("law", "said"),
+    ("impairment", "said"),
     [
         (Impairment(-1), "below zero"),
         (Impairment(float("nan")), "below zero or infinite"),
@@ -258,10 +258,10 @@ def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> 
         (Impairment(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
     ],
 )
-def test_what_netem_cannot_do_is_rejected(law: Impairment, said: str) -> None:
+def test_what_netem_cannot_do_is_rejected(impairment: Impairment, said: str) -> None:
     """A law that netem cannot do is refused in one sentence that names the flow."""
     with pytest.raises(UserError, match=said) as rejected:
-        check_law("video", law)
+        check_netem_impairment("video", impairment)
     assert str(rejected.value).startswith("video: ")
 
 
@@ -550,7 +550,7 @@ def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pyte
 def test_what_is_probed_beside_the_flows() -> None:
     """Beside L4's flows are probed: challenges, the other directions, NTP, ssh and the clock probe."""
     requested = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
-    assert [(each.name, each.source, each.destination, each.law.delay_ms) for each in requested] == [
+    assert [(each.name, each.source, each.destination, each.impairment.delay_ms) for each in requested] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
         ("video, other direction", 9, 5600, 0),
@@ -574,13 +574,13 @@ def test_frames_are_summed_up() -> None:
 
 
 JUDGED = {
-    each.name: ProbeResult(50, 0, 0, 0, each.law.delay_ms, each.law.delay_ms, each.law.delay_ms)
+    each.name: ProbeResult(50, 0, 0, 0, each.impairment.delay_ms, each.impairment.delay_ms, each.impairment.delay_ms)
     for each in probes([VIDEO])
 }
 
 
 @pytest.mark.parametrize(
-    ("law", "name", "found", "said"),
+    ("impairment", "name", "found", "said"),
     [
         (Impairment(150), "video", ProbeResult(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms where 150 ms"),
         (
@@ -627,11 +627,19 @@ JUDGED = {
     ],
 )
 def test_what_is_measured_otherwise_than_requested_is_said(
-    law: Impairment, name: str, found: ProbeResult, said: str
+    impairment: Impairment, name: str, found: ProbeResult, said: str
 ) -> None:
     """Each quantity that is not as asked is one sentence, and what is as asked is none."""
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
-    good = ProbeResult(50, round(50 * law.loss), 5 * bool(law.reorder), round(50 * law.reorder), 140.0, 150.0, 160.0)
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
+    good = ProbeResult(
+        50,
+        round(50 * impairment.loss),
+        5 * bool(impairment.reorder),
+        round(50 * impairment.reorder),
+        140.0,
+        150.0,
+        160.0,
+    )
     reasons = judge([flow], [], {**JUDGED, "video": good, name: found})
 
     assert len(reasons) == 1
@@ -640,7 +648,7 @@ def test_what_is_measured_otherwise_than_requested_is_said(
 
 
 @pytest.mark.parametrize(
-    ("law", "found"),
+    ("impairment", "found"),
     [
         (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(10, 10, 0, 0, None, None, None)),
         (Impairment(150, loss=0.5), ProbeResult(10, 9, 0, 0, None, None, None)),
@@ -649,9 +657,9 @@ def test_what_is_measured_otherwise_than_requested_is_said(
         (Impairment(150, 10, rate_bps=20_000), ProbeResult(50, 0, 0, 0, 150.0, 400.0, 600.0)),
     ],
 )
-def test_what_a_law_may_do_is_no_reason(law: Impairment, found: ProbeResult) -> None:
+def test_what_a_law_may_do_is_no_reason(impairment: Impairment, found: ProbeResult) -> None:
     """Possible shares of losses and overtaking, a late median that jitter allows, and any where there is a rate."""
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
     assert judge([flow], [], {**JUDGED, "video": found}) == []
 
 

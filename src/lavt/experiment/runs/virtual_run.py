@@ -26,7 +26,7 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.emulation.relay import video_index
 

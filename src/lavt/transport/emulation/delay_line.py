@@ -45,9 +45,9 @@ class DelayModel:
 
 
 @lru_cache(maxsize=256)
-def _lognormal_ms(seed: int, name: str, index: int, law: Lognormal) -> float:
+def _lognormal_ms(seed: int, name: str, index: int, delay: Lognormal) -> float:
     """The packets of one frame ask for the same index one after the other, hence the cache."""
-    return law.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, law.sigma))
+    return delay.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, delay.sigma))
 
 
 @lru_cache(maxsize=4)
@@ -58,8 +58,8 @@ def _jitter(seed: int, name: str) -> IndexedStream:
 class DelayLine:
     """A queue that delays each item and keeps order; an `EmulatedLink` may also drop, spread or reorder items."""
 
-    def __init__(self, law: DelayModel, link: EmulatedLink | None = None) -> None:
-        self.law = law
+    def __init__(self, delay: DelayModel, link: EmulatedLink | None = None) -> None:
+        self.delay = delay
         self.link = link
         self._waiting: list[tuple[int, int, Any]] = []
         self._number = 0
@@ -70,7 +70,7 @@ class DelayLine:
 
         Without a link that is after its delay, and not before what came in earlier.
         """
-        delay_ns = self.law.delay_ns(index)
+        delay_ns = self.delay.delay_ns(index)
         if self.link is None:
             due_ns = self._last_ns = max(now_ns + delay_ns, self._last_ns)
         elif (left_ns := self.link.leaves_ns(now_ns, delay_ns, size_bytes)) is None:

@@ -54,7 +54,7 @@ class ImpairedFlow:
     protocol: Literal["udp", "tcp"]
     port: int
     end: Literal["source", "destination"]
-    law: Impairment
+    impairment: Impairment
 
     @property
     def words(self) -> str:
@@ -75,37 +75,39 @@ NEVER: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
 """Never held on any machine; the clock probe's port is added by whoever knows it."""
 
 
-def check_sense(name: str, law: Impairment) -> None:
+def check_impairment(name: str, impairment: Impairment) -> None:
     """Raise `UserError` for what contradicts itself, whoever is to do it."""
-    numbers = [getattr(law, each.name) for each in fields(law) if each.name != "jitter_distribution"]
+    numbers = [getattr(impairment, each.name) for each in fields(impairment) if each.name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise UserError(f"{name}: no quantity of a law is below zero or infinite: correct {law}")
-    if max(law.loss, law.reorder, law.jitter_correlation) >= 1:
-        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {law}")
-    if law.jitter_distribution not in DISTRIBUTIONS:
+        raise UserError(f"{name}: no quantity of a impairment is below zero or infinite: correct {impairment}")
+    if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
+        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {impairment}")
+    if impairment.jitter_distribution not in DISTRIBUTIONS:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
-    if law.jitter_correlation and law.jitter_distribution != "normal":
+    if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
         raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
-    if law.loss_burst_packets > 1 and gilbert(law)[0] > 1:
+    if impairment.loss_burst_packets > 1 and gilbert(impairment)[0] > 1:
         raise UserError(
-            f"{name}: a loss of {law.loss:g} in bursts of {law.loss_burst_packets:g} packets leaves no room between "
+            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves no room between "
             "them: give longer bursts or less loss"
         )
-    if law.rate_bps and not 8 <= law.rate_bps <= ORDER_RATE_BPS:
-        raise UserError(f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {law.rate_bps}")
-
-
-def check_law(name: str, law: Impairment) -> None:
-    """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
-    check_sense(name, law)
-    if law.jitter_ms > law.delay_ms:
+    if impairment.rate_bps and not 8 <= impairment.rate_bps <= ORDER_RATE_BPS:
         raise UserError(
-            f"{name}: a jitter of {law.jitter_ms:g} ms on a delay of {law.delay_ms:g} ms would need delays below zero: "
+            f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {impairment.rate_bps}"
+        )
+
+
+def check_netem_impairment(name: str, impairment: Impairment) -> None:
+    """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
+    check_impairment(name, impairment)
+    if impairment.jitter_ms > impairment.delay_ms:
+        raise UserError(
+            f"{name}: a jitter of {impairment.jitter_ms:g} ms on a delay of {impairment.delay_ms:g} ms would need delays below zero: "
             "give a longer delay or less jitter"
         )
-    if law.reorder and not law.delay_ms:
+    if impairment.reorder and not impairment.delay_ms:
         raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
-    if law.jitter_correlation and not law.jitter_ms:
+    if impairment.jitter_correlation and not impairment.jitter_ms:
         raise UserError(f"{name}: correlated jitter needs jitter_ms: give it, or no correlation")
 
 
@@ -115,7 +117,7 @@ def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ())
         raise UserError("there is no flow to hold: name at least one")
     taken: dict[tuple[str, int, str], ImpairedFlow] = {}
     for flow in flows:
-        check_law(flow.name, flow.law)
+        check_netem_impairment(flow.name, flow.impairment)
         if not 1 <= flow.port <= 65_535:
             raise UserError(f"{flow.name}: {flow.port} is no port: give one between 1 and 65535")
         for port in (*NEVER, *never):
@@ -131,12 +133,12 @@ def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ())
         raise UserError("two flows have one name: name each once")
 
 
-def bursts(law: Impairment) -> bool:
+def bursts(impairment: Impairment) -> bool:
     """Whether packets are lost in bursts."""
-    return law.loss > 0 and law.loss_burst_packets > 1
+    return impairment.loss > 0 and impairment.loss_burst_packets > 1
 
 
-def gilbert(law: Impairment) -> tuple[float, float]:
+def gilbert(impairment: Impairment) -> tuple[float, float]:
     """Give the chances of a burst's begin and end at a packet that lead to a law's loss and mean burst."""
-    ends = 1 / law.loss_burst_packets
-    return law.loss * ends / (1 - law.loss), ends
+    ends = 1 / impairment.loss_burst_packets
+    return impairment.loss * ends / (1 - impairment.loss), ends

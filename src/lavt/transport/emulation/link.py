@@ -3,7 +3,7 @@
 Virtual time and the relay use it. It does what netem does as `docs/netem.md` has it, in the kernel's order: a packet is
 lost or not; of the others a share overtakes; the rest take their delay in order, and then the rate. Beyond netem a
 trace gives delay or capacity. All chance is drawn by the packet's number, or by the time slot, from a stream for each
-law: one law more leaves what the others do as it was, and runs with one seed stay paired.
+impairment: one law more leaves what the others do as it was, and runs with one seed stay paired.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.impairment import Impairment, bursts, check_sense, gilbert
+from lavt.transport.emulation.impairment import Impairment, bursts, check_impairment, gilbert
 from lavt.transport.emulation.random_process import QUANTILES, CorrelatedProcess, Draws, LossProcess, quantiles
 from lavt.transport.emulation.trace import OPPORTUNITY_BYTES, CapacityTrace, DelayTrace, Trace
 
@@ -30,7 +30,7 @@ SLOT_NS: Final = 20 * NS_PER_MS
 class LinkInjection:
     """What is injected into one direction of a flow; `name` begins the names of its streams of `seed`."""
 
-    law: Impairment
+    impairment: Impairment
     seed: int
     name: str
     trace: Trace | None = None
@@ -38,13 +38,15 @@ class LinkInjection:
     """So many wait for rate or capacity; what comes then is dropped."""
 
 
-def check_injected(injected: LinkInjection) -> None:
+def check_injection(injected: LinkInjection) -> None:
     """Raise `UserError` for what contradicts itself. Jitter beyond the delay does not: no delay is below zero."""
-    law, name = injected.law, injected.name
-    check_sense(name, law)
-    if law.reorder and not (law.delay_ms or law.jitter_ms or isinstance(injected.trace, DelayTrace)):
+    impairment, name = injected.impairment, injected.name
+    check_impairment(name, impairment)
+    if impairment.reorder and not (
+        impairment.delay_ms or impairment.jitter_ms or isinstance(injected.trace, DelayTrace)
+    ):
         raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
-    if law.rate_bps and isinstance(injected.trace, CapacityTrace):
+    if impairment.rate_bps and isinstance(injected.trace, CapacityTrace):
         raise UserError(f"{name}: rate_bps and a trace of capacity both say how much passes: give one of the two")
 
 
@@ -55,17 +57,19 @@ class EmulatedLink:
     """
 
     def __init__(self, injected: LinkInjection, start_ns: int = 0) -> None:
-        law, seed, name = injected.law, injected.seed, injected.name
+        impairment, seed, name = injected.impairment, injected.seed, injected.name
         self.lost = self.dropped = self.overtook = self.packets = 0
-        self._law, self._start_ns = law, start_ns
-        self._losses = LossProcess(seed, f"{name} loss", law.loss, gilbert(law) if bursts(law) else None)
+        self._law, self._start_ns = impairment, start_ns
+        self._losses = LossProcess(
+            seed, f"{name} loss", impairment.loss, gilbert(impairment) if bursts(impairment) else None
+        )
         self._early = Draws(seed, f"{name} reorder")
         self._jitter = Draws(seed, f"{name} jitter")
-        self._wander = CorrelatedProcess(seed, f"{name} wander", law.jitter_correlation)
-        self._deviations = quantiles(law.jitter_distribution)
+        self._wander = CorrelatedProcess(seed, f"{name} wander", impairment.jitter_correlation)
+        self._deviations = quantiles(impairment.jitter_distribution)
         self._delays = injected.trace if isinstance(injected.trace, DelayTrace) else None
         capacity = injected.trace if isinstance(injected.trace, CapacityTrace) else None
-        self._bottleneck = Bottleneck(injected.queue_packets, law.rate_bps, capacity, start_ns)
+        self._bottleneck = Bottleneck(injected.queue_packets, impairment.rate_bps, capacity, start_ns)
         self._early_ns = self._delayed_ns = self._last_ns = start_ns
         """When the last early one left, when the last one had its delay behind it, and when it left."""
 
@@ -81,11 +85,11 @@ class EmulatedLink:
         """
         number = self.packets
         self.packets += 1
-        law = self._law
-        if law.loss and self._losses.takes(number):
+        impairment = self._law
+        if impairment.loss and self._losses.takes(number):
             self.lost += 1
             return None
-        if law.reorder and self._early.at(number) < law.reorder:
+        if impairment.reorder and self._early.at(number) < impairment.reorder:
             self._early_ns = max(arrived_ns + inherent_ns, self._early_ns)
             self.overtook += self._early_ns < self._last_ns
             return self._early_ns
@@ -100,12 +104,12 @@ class EmulatedLink:
 
     def _injected_ns(self, arrived_ns: int, number: int) -> int:
         """Give the delay that is injected; with jitter it can be below zero."""
-        law, gone_ns = self._law, max(0, arrived_ns - self._start_ns)
-        delay_ms = law.delay_ms
-        if law.jitter_ms and law.jitter_correlation:
-            delay_ms += law.jitter_ms * self._wander.at(gone_ns // SLOT_NS)
-        elif law.jitter_ms:
-            delay_ms += law.jitter_ms * self._deviations[int(self._jitter.at(number) * QUANTILES)]
+        impairment, gone_ns = self._law, max(0, arrived_ns - self._start_ns)
+        delay_ms = impairment.delay_ms
+        if impairment.jitter_ms and impairment.jitter_correlation:
+            delay_ms += impairment.jitter_ms * self._wander.at(gone_ns // SLOT_NS)
+        elif impairment.jitter_ms:
+            delay_ms += impairment.jitter_ms * self._deviations[int(self._jitter.at(number) * QUANTILES)]
         return round(delay_ms * NS_PER_MS) + (0 if self._delays is None else self._delays.delay_ns(gone_ns))
 
 

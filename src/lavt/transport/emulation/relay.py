@@ -20,7 +20,7 @@ from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
-from lavt.transport.emulation.delay_line import DelayModel, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
 
@@ -263,8 +263,8 @@ class _OpenFlow:
         self._relay.watch(towards_server, lambda: self._from_server(client))
         return client
 
-    def _line(self, law: DelayModel, injected: LinkInjection | None) -> DelayLine:
-        return DelayLine(law, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
+    def _line(self, delay: DelayModel, injected: LinkInjection | None) -> DelayLine:
+        return DelayLine(delay, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
 
     def _from_server(self, client: _Client) -> None:
         for datagram, ancillary, address in _drain(client.upstream_socket):

@@ -18,7 +18,7 @@ from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.streams import stream
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
-from lavt.transport.netem.tc import set_law
+from lavt.transport.netem.tc import set_impairment
 
 STEP_NS: Final = 20 * NS_PER_MS
 LATE_NS: Final = NS_PER_S
@@ -26,12 +26,12 @@ LATE_NS: Final = NS_PER_S
 END_S: Final = 5.0
 
 
-def wandering(law: Impairment, seed: int, name: str, index: int, before: tuple[int, float] | None) -> float:
+def wandering(impairment: Impairment, seed: int, name: str, index: int, before: tuple[int, float] | None) -> float:
     """Give a delay's deviation at step `index`, in standard deviations; `before` is an earlier (index, deviation)."""
     drawn = float(stream(seed, f"{name} wander", index).standard_normal())
     if before is None:
         return drawn
-    correlation = law.jitter_correlation ** (index - before[0])
+    correlation = impairment.jitter_correlation ** (index - before[0])
     return correlation * before[1] + float((1 - correlation**2) ** 0.5) * drawn
 
 
@@ -51,7 +51,7 @@ class CorrelatedJitter:
         clock: Clock | None = None,
     ) -> None:
         self._interface = interface
-        self._flows = [flow for flow in flows if flow.law.jitter_correlation]
+        self._flows = [flow for flow in flows if flow.impairment.jitter_correlation]
         self._seed = seed
         self._clock = clock or MachineClock()
         self._told = threading.Event()
@@ -90,7 +90,7 @@ class CorrelatedJitter:
         while not self._told.is_set():
             index = (self._clock.now().mono_ns - begin_ns) // STEP_NS  # what came late is left out, not caught up
             for flow in self._flows:
-                deviations = wandering(flow.law, self._seed, flow.name, index, at.get(flow.name))
+                deviations = wandering(flow.impairment, self._seed, flow.name, index, at.get(flow.name))
                 at[flow.name] = index, deviations
                 self._say(flow, deviations)
             self._stepped_ns = self._clock.now().mono_ns
@@ -98,9 +98,9 @@ class CorrelatedJitter:
             self._told.wait(max(0, next_ns - self._clock.now().mono_ns) / NS_PER_S)
 
     def _say(self, flow: ImpairedFlow, deviations: float) -> None:
-        delay_ms = max(0.0, flow.law.delay_ms + deviations * flow.law.jitter_ms)
-        law = replace(flow.law, delay_ms=delay_ms, jitter_ms=0.0, jitter_correlation=0.0)
-        words = set_law(self._interface, flow.name, law, verb="change")[1:]
+        delay_ms = max(0.0, flow.impairment.delay_ms + deviations * flow.impairment.jitter_ms)
+        impairment = replace(flow.impairment, delay_ms=delay_ms, jitter_ms=0.0, jitter_correlation=0.0)
+        words = set_impairment(self._interface, flow.name, impairment, verb="change")[1:]
         try:
             assert self._tc.stdin is not None  # noqa: S101 (a pipe was asked for)
             self._tc.stdin.write(" ".join(words) + "\n")

@@ -128,7 +128,7 @@ class Injector:
         flows = order.flows
         if self._queues is None:
             return InjectionResult(
-                order.number, "" if all(flow.law.is_nothing for flow in flows) else NO_INTERFACE, "", ()
+                order.number, "" if all(flow.impairment.is_nothing for flow in flows) else NO_INTERFACE, "", ()
             )
         try:
             if not flows:

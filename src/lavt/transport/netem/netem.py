@@ -40,9 +40,9 @@ from lavt.transport.netem.tc import (
     expected_filter,
     filters,
     parse_filters,
+    parse_impairment,
     parse_qdiscs,
-    read_law,
-    set_law,
+    set_impairment,
     show_filters,
     show_qdiscs,
     uniform_table,
@@ -179,7 +179,7 @@ class NetemInterface:
         interface that carries somebody else's queue, or a delay that another program of ours owns.
         """
         check_flows(flows, never)
-        wanders = any(flow.law.jitter_correlation for flow in flows)
+        wanders = any(flow.impairment.jitter_correlation for flow in flows)
         if wanders and self._owner == NOBODY:
             raise UserError(
                 "correlated jitter needs a program that stays: `lavt netem apply --hold`, or network.injection: netem"
@@ -188,7 +188,7 @@ class NetemInterface:
         with self._files.alone():
             self._check_owner()
             qdiscs = self._ours_or_free(self.interface)
-            if any(flow.law.jitter_distribution == "uniform" for flow in flows):
+            if any(flow.impairment.jitter_distribution == "uniform" for flow in flows):
                 self._files.write_text("uniform.dist", uniform_table())
             self._files.write(AppliedState(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
             self._stand_still()
@@ -221,12 +221,14 @@ class NetemInterface:
     def shown(self) -> dict[str, Any]:
         """Tell what is there, as it is read back: whether it is ours, and the law of each flow that has one."""
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
-        laws = {name: _netem_at(place.handle, qdiscs) for name, place in PLACES.items()}
+        netems = {name: _netem_at(place.handle, qdiscs) for name, place in PLACES.items()}
         return {
             "interface": self.interface,
             "ours": _is_ours(qdiscs),
             "queues": [f"{each.kind} {each.handle} {each.parent}" for each in qdiscs],
-            "laws": {name: read_law(found.options) for name, found in laws.items() if found is not None},
+            "impairments": {
+                name: parse_impairment(found.options) for name, found in netems.items() if found is not None
+            },
             "applied": self.applied(),
         }
 
@@ -328,9 +330,9 @@ class NetemInterface:
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
             if exists or name in requested:
-                law = requested[name].law if name in requested else Impairment()
+                impairment = requested[name].impairment if name in requested else Impairment()
                 verb = "change" if exists else "add"
-                commands.append(set_law(self.interface, name, law, verb=verb, tables=self._tables))  # type: ignore[arg-type]
+                commands.append(set_impairment(self.interface, name, impairment, verb=verb, tables=self._tables))  # type: ignore[arg-type]
         commands += [delete_filter(self.interface, *each[:2]) for each in sorted(found - set(wanted), key=str)]
         commands += [add_filter(self.interface, each) for key, each in wanted.items() if key not in found]
         return self._do(commands)
@@ -342,8 +344,8 @@ class NetemInterface:
         held = {name: found for name, place in PLACES.items() if (found := _netem_at(place.handle, qdiscs)) is not None}
         if at_once or not held:
             return self._do([delete_root(interface)])
-        longest_ms = max(read_law(found.options).longest_ms for found in held.values())
-        ran = self._do([set_law(interface, name, Impairment(), verb="change") for name in held])
+        longest_ms = max(parse_impairment(found.options).longest_ms for found in held.values())
+        ran = self._do([set_impairment(interface, name, Impairment(), verb="change") for name in held])
         self._wait_until_empty(interface, round(longest_ms * NS_PER_MS))
         ran += self._do([delete_filters(interface)])
         self._wait_until_empty(interface, 0)

@@ -61,7 +61,7 @@ class ProbeSpec:
     protocol: Literal["udp", "tcp"]
     source: int
     destination: int
-    law: Impairment
+    impairment: Impairment
     first_byte: int = RTP
 
 
@@ -90,7 +90,7 @@ def probes(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> l
         there, back = (flow.port, OTHER_PORT), (OTHER_PORT, flow.port)
         if flow.end == "destination":
             there, back = back, there
-        held.append(ProbeSpec(flow.name, flow.protocol, *there, flow.law))
+        held.append(ProbeSpec(flow.name, flow.protocol, *there, flow.impairment))
         other_end: Literal["source", "destination"] = "source" if flow.end == "destination" else "destination"
         if (flow.protocol, flow.port, other_end) not in taken:
             beside.append(ProbeSpec(f"{flow.name}, other direction", flow.protocol, *back, Impairment()))
@@ -132,22 +132,22 @@ def _measure(
                 _send(sender, _frame(probe, seen.mark(number, index, clock.now().wall_ns)), link)
             pause(begin_ns + (number + 1) * period_ns - clock.now().mono_ns)
             seen.take()  # when is the kernel's to say: there is no hurry
-        longest_ns = round(max(probe.law.longest_ms for probe in requested) * NS_PER_MS)
+        longest_ns = round(max(probe.impairment.longest_ms for probe in requested) * NS_PER_MS)
         limit_ns = clock.now().mono_ns + longest_ns + AFTER_LONGEST_NS
         while seen.count < count * len(requested) and clock.now().mono_ns < limit_ns:
             pause(AFTERWARDS_NS)
             seen.take()
-    return {probe.name: summary(probe.law, count, seen.delays[index]) for index, probe in enumerate(requested)}
+    return {probe.name: summary(probe.impairment, count, seen.delays[index]) for index, probe in enumerate(requested)}
 
 
-def summary(law: Impairment, sent: int, delays: Sequence[tuple[int, float]]) -> ProbeResult:
+def summary(impairment: Impairment, sent: int, delays: Sequence[tuple[int, float]]) -> ProbeResult:
     """Sum up (number, delay in milliseconds) of the frames of a probe, in the order in which they left."""
     newest, reordered = -1, 0
     for number, _ in delays:
         reordered += number < newest
         newest = max(newest, number)
     all_ms = [delay_ms for _, delay_ms in delays]
-    held_ms = [delay_ms for delay_ms in all_ms if not law.reorder or delay_ms > law.delay_ms / 2]
+    held_ms = [delay_ms for delay_ms in all_ms if not impairment.reorder or delay_ms > impairment.delay_ms / 2]
     early = len(all_ms) - len(held_ms)
     if len(held_ms) < 2:
         return ProbeResult(sent, sent - len(delays), reordered, early, None, None, None)
@@ -161,35 +161,45 @@ def judge(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort], measured: 
 
 
 def _judge(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:
-    name, law = probe.name, probe.law
+    name, impairment = probe.name, probe.impairment
     if found is None:
         return [f"{name}: no packet came through"]
     if found.median_ms is None or found.p5_ms is None or found.p95_ms is None:
-        return _judge_counts(probe, found) if law.loss or law.reorder else [f"{name}: no packet came through"]
+        return (
+            _judge_counts(probe, found)
+            if impairment.loss or impairment.reorder
+            else [f"{name}: no packet came through"]
+        )
     reasons = []
-    if not (law.jitter_ms or law.rate_bps) and abs(found.median_ms - law.delay_ms) > LIMIT_MS:
-        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms where {law.delay_ms:g} ms was asked")
-    least_ms = law.delay_ms - 4 * law.jitter_ms - LIMIT_MS
-    if (law.jitter_ms or law.rate_bps) and found.p5_ms < least_ms:
+    if not (impairment.jitter_ms or impairment.rate_bps) and abs(found.median_ms - impairment.delay_ms) > LIMIT_MS:
+        reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms where {impairment.delay_ms:g} ms was asked")
+    least_ms = impairment.delay_ms - 4 * impairment.jitter_ms - LIMIT_MS
+    if (impairment.jitter_ms or impairment.rate_bps) and found.p5_ms < least_ms:
         reasons.append(f"{name} was delayed by {found.p5_ms:.2f} ms (p5) where {least_ms:.2f} ms is the least")
-    most_ms = law.longest_ms + LIMIT_MS
-    if law.jitter_ms and not law.rate_bps and found.median_ms > most_ms:
+    most_ms = impairment.longest_ms + LIMIT_MS
+    if impairment.jitter_ms and not impairment.rate_bps and found.median_ms > most_ms:
         reasons.append(f"{name} was delayed by {found.median_ms:.2f} ms (median) where {most_ms:.2f} ms is the most")
-    if law.jitter_ms and not law.jitter_correlation and found.p95_ms - found.p5_ms < law.jitter_ms / 2:
+    if (
+        impairment.jitter_ms
+        and not impairment.jitter_correlation
+        and found.p95_ms - found.p5_ms < impairment.jitter_ms / 2
+    ):
         spread_ms = found.p95_ms - found.p5_ms
-        reasons.append(f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) where {law.jitter_ms:g} ms was asked")
+        reasons.append(
+            f"{name} has a jitter of {spread_ms:.2f} ms (p5 to p95) where {impairment.jitter_ms:g} ms was asked"
+        )
     return reasons + _judge_counts(probe, found)
 
 
 def _judge_counts(probe: ProbeSpec, found: ProbeResult) -> list[str]:
-    name, law = probe.name, probe.law
+    name, impairment = probe.name, probe.impairment
     reasons = []
-    if not _is_share(found.lost, found.sent, law.loss, _clumping(law)):
-        reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost where {law.loss:.1%} was asked")
+    if not _is_share(found.lost, found.sent, impairment.loss, _clumping(impairment)):
+        reasons.append(f"{name}: {found.lost} of {found.sent} packets were lost where {impairment.loss:.1%} was asked")
     arrived = found.sent - found.lost
-    if not _is_share(found.early, arrived, law.reorder, 1.0):
-        reasons.append(f"{name}: {found.early} of {arrived} packets overtook where {law.reorder:.1%} was asked")
-    if found.reordered and not law.reorder:
+    if not _is_share(found.early, arrived, impairment.reorder, 1.0):
+        reasons.append(f"{name}: {found.early} of {arrived} packets overtook where {impairment.reorder:.1%} was asked")
+    if found.reordered and not impairment.reorder:
         reasons.append(f"{name}: {found.reordered} packets were overtaken")
     return reasons
 
@@ -201,11 +211,11 @@ def _is_share(count: int, of: int, share: float, clumping: float) -> bool:
     return abs(count - of * share) <= SIGMAS * math.sqrt(of * share * (1 - share) * clumping) + 1
 
 
-def _clumping(law: Impairment) -> float:
+def _clumping(impairment: Impairment) -> float:
     """Tell how much more variable a count of losses is in bursts: (1 + r) / (1 - r), r from one packet to the next."""
-    if not bursts(law):
+    if not bursts(impairment):
         return 1.0
-    correlation = 1 - sum(gilbert(law))
+    correlation = 1 - sum(gilbert(impairment))
     return (1 + correlation) / (1 - correlation)
 
 

@@ -153,4 +153,4 @@ class StateFiles:
 
 def flows_from(data: Sequence[Any]) -> tuple[ImpairedFlow, ...]:
     """Make flows of what `dataclasses.asdict` made of them; raises `TypeError` or `KeyError` for anything else."""
-    return tuple(ImpairedFlow(**{**each, "law": Impairment(**each["law"])}) for each in data)
+    return tuple(ImpairedFlow(**{**each, "impairment": Impairment(**each["impairment"])}) for each in data)

@@ -120,33 +120,37 @@ def add_root(interface: str) -> Command:
     return ["tc", "qdisc", "add", "dev", interface, "root", "handle", ROOT, "prio", "bands", str(BANDS)]
 
 
-def set_law(interface: str, name: str, law: Impairment, *, verb: Literal["add", "change"], tables: str = "") -> Command:
+def set_impairment(
+    interface: str, name: str, impairment: Impairment, *, verb: Literal["add", "change"], tables: str = ""
+) -> Command:
     """Give the command that gives a flow its law, with all arguments: `change` keeps some that are not named.
 
     `tables` is the directory of our own table of the uniform distribution, which tc has not: without any table a
     change would keep that of the law before.
     """
     place = PLACES[name]
-    uniform = ["env", f"TC_LIB_DIR={tables}"] if law.jitter_ms and law.jitter_distribution == "uniform" else []
+    uniform = (
+        ["env", f"TC_LIB_DIR={tables}"] if impairment.jitter_ms and impairment.jitter_distribution == "uniform" else []
+    )
     return [
         *uniform, "tc", "qdisc", verb, "dev", interface, "parent", place.parent, "handle", place.handle,
-        *netem_arguments(law),
+        *netem_arguments(impairment),
     ]  # fmt: skip
 
 
-def netem_arguments(law: Impairment) -> list[str]:
+def netem_arguments(impairment: Impairment) -> list[str]:
     """Give netem's own arguments for a law; what wanders (correlated jitter) is not netem's."""
-    limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * law.longest_ms / 1000))
-    words = ["netem", "limit", str(limit), "delay", f"{_plain(law.delay_ms)}ms"]
-    if law.jitter_ms and not law.jitter_correlation:
-        words += [f"{_plain(law.jitter_ms)}ms", "distribution", law.jitter_distribution]
-    if law.loss and law.loss_burst_packets > 1:
-        words += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in gilbert(law))]
-    elif law.loss:
-        words += ["loss", "random", f"{_plain(100 * law.loss)}%"]
-    if law.reorder:
-        words += ["reorder", f"{_plain(100 * law.reorder)}%"]
-    return [*words, "rate", f"{law.rate_bps}bit" if law.rate_bps else "10gbit"]
+    limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * impairment.longest_ms / 1000))
+    words = ["netem", "limit", str(limit), "delay", f"{_plain(impairment.delay_ms)}ms"]
+    if impairment.jitter_ms and not impairment.jitter_correlation:
+        words += [f"{_plain(impairment.jitter_ms)}ms", "distribution", impairment.jitter_distribution]
+    if impairment.loss and impairment.loss_burst_packets > 1:
+        words += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in gilbert(impairment))]
+    elif impairment.loss:
+        words += ["loss", "random", f"{_plain(100 * impairment.loss)}%"]
+    if impairment.reorder:
+        words += ["reorder", f"{_plain(100 * impairment.reorder)}%"]
+    return [*words, "rate", f"{impairment.rate_bps}bit" if impairment.rate_bps else "10gbit"]
 
 
 def add_filter(interface: str, each: TcFilter) -> Command:
@@ -189,7 +193,7 @@ def first_commands(interface: str, flows: Sequence[ImpairedFlow], *, tables: str
     """Give all commands for an interface that has nothing of ours."""
     commands = [add_root(interface)]
     for flow in flows:
-        commands.append(set_law(interface, flow.name, flow.law, verb="add", tables=tables))
+        commands.append(set_impairment(interface, flow.name, flow.impairment, verb="add", tables=tables))
         commands += [add_filter(interface, each) for each in filters(flow)]
     return commands
 
@@ -250,7 +254,7 @@ def expected_filter(each: TcFilter) -> FoundFilter:
     return each.number, each.version, each.parent, frozenset(match.read_back for match in each.matches)
 
 
-def read_law(options: Mapping[str, Any]) -> Impairment:
+def parse_impairment(options: Mapping[str, Any]) -> Impairment:
     """Give the law that a netem's options tell; the distribution is not told, and counts as normal.
 
     Raises `WorkError` for options that are not netem's.
@@ -276,11 +280,11 @@ def read_law(options: Mapping[str, Any]) -> Impairment:
 
 def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
     """Compare a flow with what was read back, in sentences; an empty list is as asked."""
-    place, requested = PLACES[flow.name], flow.law
+    place, requested = PLACES[flow.name], flow.impairment
     netem = next((each for each in qdiscs if each.handle == place.handle), None)
     if netem is None or netem.kind != "netem" or netem.parent != place.parent:
         return [f"{flow.words} has no netem"]
-    is_ = read_law(netem.options)
+    is_ = parse_impairment(netem.options)
     wanders = bool(requested.jitter_correlation)  # then the delay is where it has got to, and no jitter of netem's
     reasons = [
         f"{flow.words}: {name} is {there:g} where {wanted:g} was asked"
