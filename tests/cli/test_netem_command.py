@@ -17,7 +17,7 @@ class Kernel(NetemInterface):
     """A netem whose tc notes what it is told; whatever `rejects` says is refused, and what is measured is as asked."""
 
     def __init__(self, directory: Path, *, held: bool) -> None:
-        super().__init__("eth0", directory=directory, run=self.told, stays=True)
+        super().__init__("eth0", directory=directory, run=self.told, persistent=True)
         self.commands = ["tc qdisc add dev eth0 root"] if held else list[str]()
         self.held = held
         self.rejects: Callable[[str], bool] = lambda _words: False

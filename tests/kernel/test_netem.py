@@ -34,7 +34,7 @@ from lavt.transport.netem.netem import NetemInterface
 
 CLOCK = MachineClock()
 VIDEO, CONTROL, PROBE = 5600, 7448, 5602
-NEVER = [ExemptPort("udp", PROBE, "the clock probe")]
+ALWAYS_EXEMPT = [ExemptPort("udp", PROBE, "the clock probe")]
 L = ("L0", "L1", "L2", "L3", "L4", "L5")
 MEDIANS = pytest.mark.judges_times(share=MEDIAN_SHARE)
 """For tests whose assertions are about medians or other quantiles of delays."""
@@ -76,7 +76,7 @@ def sides(baseline: dict[str, float], tmp_path: Path) -> Iterator[dict[str, Nete
     made = {name: NetemInterface(device, directory=tmp_path) for name, device in DEVICES.items()}
     yield made
     for name, netem in made.items():
-        inside(name, lambda netem=netem: netem.clear(at_once=True, of_anybody=True))  # type: ignore[misc]
+        inside(name, lambda netem=netem: netem.clear(at_once=True, any_owner=True))  # type: ignore[misc]
 
 
 def hold(sides: dict[str, NetemInterface], name: str) -> None:
@@ -84,7 +84,7 @@ def hold(sides: dict[str, NetemInterface], name: str) -> None:
     roles: Sequence[Role] = ("server", "client")
     for role in roles:
         flows = netem_flows(condition(name), role, video_port=VIDEO, control_port=CONTROL)
-        inside(role, lambda role=role, flows=flows: sides[role].apply(flows, never=NEVER, condition=name))  # type: ignore[misc]
+        inside(role, lambda role=role, flows=flows: sides[role].apply(flows, exempt=ALWAYS_EXEMPT, condition=name))  # type: ignore[misc]
 
 
 def hold_video(sides: dict[str, NetemInterface], impairment: Impairment) -> None:
@@ -219,7 +219,7 @@ def test_somebody_elses_queue_is_rejected_and_left_alone(sides: dict[str, NetemI
         with pytest.raises(UserError, match="va has a queue that is not ours"):
             hold_video(sides, Impairment(75))
         with pytest.raises(UserError, match="va has a queue that is not ours"):
-            inside("server", lambda: sides["server"].clear(of_anybody=True))
+            inside("server", lambda: sides["server"].clear(any_owner=True))
         assert queues("server") == there
     finally:
         command("tc -n server qdisc del dev va root")

@@ -37,19 +37,19 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
 
     Example: lavt netem show --interface eth0
     """
-    shown = NetemInterface(interface).shown()
-    applied = shown["applied"] if shown["ours"] else None
+    status = NetemInterface(interface).status()
+    applied = status["applied"] if status["ours"] else None
     impairments = (
-        {name: asdict(impairment) for name, impairment in shown["impairments"].items()} if shown["ours"] else {}
+        {name: asdict(impairment) for name, impairment in status["impairments"].items()} if status["ours"] else {}
     )
     if as_json:
         whose = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
-        console.show_json({**shown, "impairments": impairments, "applied": whose})
+        console.show_json({**status, "impairments": impairments, "applied": whose})
         return
-    if not shown["ours"]:
-        console.show(f"{interface} holds nothing of ours: {', '.join(shown['queues']) or 'no queue'}")
+    if not status["ours"]:
+        console.show(f"{interface} holds nothing of ours: {', '.join(status['queues']) or 'no queue'}")
         return
-    console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.words}")
+    console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.description}")
     for name, impairment in impairments.items():
         told = ", ".join(
             f"{key} {value:g}" for key, value in impairment.items() if isinstance(value, int | float) and value
@@ -83,20 +83,20 @@ def apply(
         condition(name), role, video_port=video_port, control_port=control_port, protocol=protocol,
         state_delay=state_delay,
     )  # fmt: skip
-    never = [ExemptPort("udp", probe_port, "the clock probe")]
-    check_flows(flows, never)
-    netem = NetemInterface(interface, stays=not hold)
+    exempt = [ExemptPort("udp", probe_port, "the clock probe")]
+    check_flows(flows, exempt)
+    netem = NetemInterface(interface, persistent=not hold)
     if dry_run:
         _tell_commands(first_commands(interface, flows, tables=str(DIRECTORY)), as_json, interface, name)
         return
     _say_restored(netem.check())
     with console.until_told() as told:
-        was_held = netem.shown()["ours"]
+        was_held = netem.status()["ours"]
         try:
-            commands = netem.apply(flows, never=never, condition=name)
+            commands = netem.apply(flows, exempt=exempt, condition=name)
             if not as_json:
                 _show_commands(commands)
-            found = netem.verify(flows, never=never)
+            found = netem.verify(flows, exempt=exempt)
             _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
             if hold and not found.reasons:
                 told.wait()
@@ -120,8 +120,8 @@ def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_
     applied = netem.applied()
     if applied is None:
         raise UserError(f"nothing was applied to {interface}: apply a condition first (`lavt netem apply`)")
-    never = [ExemptPort("udp", probe_port, "the clock probe")]
-    found = netem.verify(applied.flows, never=never)
+    exempt = [ExemptPort("udp", probe_port, "the clock probe")]
+    found = netem.verify(applied.flows, exempt=exempt)
     _tell(found, as_json, {"interface": interface, "condition": applied.condition})
     _fail(found)
 
@@ -138,9 +138,9 @@ def clear(
     netem = NetemInterface(interface)
     _say_restored(netem.restore())
     applied = netem.applied()
-    commands = netem.clear(at_once=at_once, of_anybody=True)
+    commands = netem.clear(at_once=at_once, any_owner=True)
     if commands:
-        console.say(f"lavt: taken away: {MADE_BY_HAND if applied is None else applied.words}")
+        console.say(f"lavt: taken away: {MADE_BY_HAND if applied is None else applied.description}")
     _tell_commands(commands, as_json, interface, "")
     if not as_json:
         console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")

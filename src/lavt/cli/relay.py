@@ -60,7 +60,7 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         RelayedFlow(
             "video", _resolved("video_listen", config.video_listen), _resolved("video_server", config.video_server),
             upstream=NONE, downstream=_law(config.video, seed, "video inherent"),
-            held_downstream=is_delayed_video, index_downstream=video_index,
+            delays_downstream=is_delayed_video, index_downstream=video_index,
             downstream_injected=_link("video", config.video, seed),
         ),
         RelayedFlow(

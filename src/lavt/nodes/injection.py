@@ -67,7 +67,7 @@ class _Queues:
             Send(
                 "injection",
                 InjectionSample(
-                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.reason or done.doubts
+                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.reason or done.problems
                 ),
             )
             for name, each_ms in requested_ms.items()

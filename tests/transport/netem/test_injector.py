@@ -24,34 +24,34 @@ ANSWERS_S = 10.0
 class NamedQueues:
     """A stand-in for the kernel's queues, which have tests of their own in `tests/kernel`."""
 
-    def __init__(self, failure: Exception | None = None, doubts: tuple[str, ...] = ()) -> None:
+    def __init__(self, failure: Exception | None = None, problems: tuple[str, ...] = ()) -> None:
         self.did: list[Any] = []
         self.begun, self.go = threading.Event(), threading.Event()
         self.go.set()
         self._failure = failure
-        self._doubts = doubts
+        self._problems = problems
 
-    def apply(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], condition: str) -> None:
+    def apply(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], condition: str) -> None:
         """Note it, when it may, or fail."""
         self.begun.set()
         self.go.wait(ANSWERS_S)
         if self._failure:
             raise self._failure
-        self.did.append((condition, tuple(flows), tuple(never)))
+        self.did.append((condition, tuple(flows), tuple(exempt)))
 
-    def verify(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int) -> Verification:
+    def verify(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int) -> Verification:
         """Give what is always found, beside what is asked about."""
-        self.did.append(("verify", tuple(flows), tuple(never), count))
-        return Verification(list(self._doubts), FOUND)
+        self.did.append(("verify", tuple(flows), tuple(exempt), count))
+        return Verification(list(self._problems), FOUND)
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int
     ) -> dict[str, ProbeResult]:
         """Give the same."""
-        self.did.append(("measure", tuple(flows), tuple(never), count))
+        self.did.append(("measure", tuple(flows), tuple(exempt), count))
         return FOUND
 
-    def doubts(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Have one."""
         return ["its jitter has stopped"]
 
@@ -92,8 +92,8 @@ def test_an_order_is_applied_once_and_measured_whenever_it_comes() -> None:
     )
     assert said[0] == InjectionResult(1, "", "", (("video", 150.1),))
     assert (said[1].number, said[1].reason, said[1].measured_ms) == (1, "", (("video", 150.1),))
-    assert said[1].doubts.startswith("its jitter has stopped; ")
-    assert "NTP: no packet came through" in said[1].doubts
+    assert said[1].problems.startswith("its jitter has stopped; ")
+    assert "NTP: no packet came through" in said[1].problems
     assert said[2] == InjectionResult(2, "", "", ())
     both = ((VIDEO,), (PROBE,))
     assert queues.did == [("L2", *both), ("verify", *both, 10), ("measure", *both, 10), "clear", "clear"]
@@ -111,7 +111,7 @@ def test_a_failure_is_told_and_the_next_order_is_done() -> None:
 
 def test_a_condition_that_is_not_as_requested_when_it_is_applied_is_not_in_force() -> None:
     """Where verifying finds otherwise than asked, the order has failed, with what was found."""
-    assert ordered(NamedQueues(doubts=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
+    assert ordered(NamedQueues(problems=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
         InjectionResult(1, "video was late; no filter", "", ())
     ]
 

@@ -34,15 +34,15 @@ from lavt.transport.netem.correlated_jitter import CorrelatedJitter, wandering
 from lavt.transport.netem.netem import NetemInterface, run_tc
 from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summary
 from lavt.transport.netem.state import (
-    NOBODY,
+    NO_OWNER,
     AppliedState,
     Owner,
     StateFiles,
-    boot,
+    boot_id,
+    current_process,
     flows_from,
-    namespace,
-    started,
-    this_process,
+    network_namespace,
+    start_ticks,
 )
 from lavt.transport.netem.tc import (
     Command,
@@ -303,7 +303,7 @@ class Tc:
 def test_a_change_touches_only_what_differs(tmp_path: Path) -> None:
     """A new delay is one change and no filter; what is no longer asked for is held no more, and its filters go."""
     tc = Tc(QDISCS, FILTERS)
-    netem = NetemInterface("eth0", directory=tmp_path, run=tc, stays=True)
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True)
     netem.apply([ImpairedFlow("video", "udp", 5600, "source", Impairment(30))])
     one = list(tc.told)
     netem.apply([CONTROL])
@@ -335,7 +335,7 @@ def test_somebody_elses_root_is_rejected(tmp_path: Path) -> None:
     """A root with a handle that is not ours is refused, and tc is told nothing."""
     tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
-    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(of_anybody=True), netem.check]
+    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(any_owner=True), netem.check]
     for use in uses:
         with pytest.raises(UserError, match=r"\(fq_codel 8001:\)"):
             use()
@@ -345,8 +345,8 @@ def test_somebody_elses_root_is_rejected(tmp_path: Path) -> None:
 def test_what_another_program_owns_is_rejected(tmp_path: Path) -> None:
     """A delay that a living process owns, or that was left in place, is not changed by another program of ours."""
     tc = Tc(QDISCS, FILTERS)
-    owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+    owner = os.getppid(), start_ticks(os.getppid())
+    StateFiles(tmp_path).write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
     with pytest.raises(UserError, match=f"there is L3 on eth0, of process {owner[0]}"):
         NetemInterface("eth0", directory=tmp_path, run=tc).apply([VIDEO])
     StateFiles(tmp_path).forget("eth0")
@@ -355,12 +355,12 @@ def test_what_another_program_owns_is_rejected(tmp_path: Path) -> None:
     assert tc.told == []
 
 
-@pytest.mark.parametrize("owner", [(os.getppid(), started(os.getppid())), NOBODY, None])
+@pytest.mark.parametrize("owner", [(os.getppid(), start_ticks(os.getppid())), NO_OWNER, None])
 def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner: Owner | None) -> None:
     """A program clears neither another's delay nor one left in place, with a file or without; on demand it does."""
     tc, files = Tc(QDISCS, FILTERS), StateFiles(tmp_path)
     if owner is not None:
-        files.write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
+        files.write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
     there = files.read("eth0")
     with pytest.raises(UserError, match="there is"), NetemInterface("eth0", directory=tmp_path, run=tc) as netem:
         netem.check()
@@ -368,7 +368,7 @@ def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner
     assert netem.clear() == []
     assert tc.told == []
     assert files.read("eth0") == there
-    assert netem.clear(at_once=True, of_anybody=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
+    assert netem.clear(at_once=True, any_owner=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
     assert files.read("eth0") is None
 
 
@@ -377,16 +377,18 @@ def test_what_was_left_in_place_is_cleared_by_who_leaves_in_place(tmp_path: Path
     """What `lavt netem apply` or a script left, the command that leaves in place owns, and clears."""
     tc = Tc(QDISCS, FILTERS)
     if written:
-        StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
-    assert NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
+        StateFiles(tmp_path).write(AppliedState("eth0", network_namespace(), boot_id(), NO_OWNER, "L3", (VIDEO,)))
+    assert NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True).clear(at_once=True) != []
 
 
 @pytest.mark.parametrize("dead", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}])
 def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) -> None:
     """What belongs to an earlier boot, or a process that is no more, is cleared, also where its number came again."""
     tc = Tc(QDISCS, FILTERS)
-    fields = {"boot": boot(), "owner": this_process(), **dead}
-    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,)))
+    fields = {"boot": boot_id(), "owner": current_process(), **dead}
+    StateFiles(tmp_path).write(
+        AppliedState("eth0", network_namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,))
+    )
     said = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
 
     assert len(said) == 1
@@ -407,7 +409,7 @@ def test_what_cannot_be_put_back_is_said_and_kept(
     tmp_path: Path, interface: str, qdiscs: str, became: str, kept: bool
 ) -> None:
     """What cannot be put back is said with its reason and tried again; an interface that is gone is forgotten."""
-    dead = AppliedState(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
+    dead = AppliedState(interface, network_namespace(), "an earlier boot", current_process(), "L3", (VIDEO,))
     StateFiles(tmp_path).write(dead)
     said = NetemInterface("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
 
@@ -422,14 +424,14 @@ def test_what_cannot_be_put_back_is_said_and_kept(
 def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: str) -> None:
     """Where a file of ours cannot be written, that is said before tc is told anything, and what is held goes on."""
     tc = Tc(QDISCS, FILTERS)
-    file = {"state": f"netem-{namespace()}-eth0.json", "table": "uniform.dist"}[name]
+    file = {"state": f"netem-{network_namespace()}-eth0.json", "table": "uniform.dist"}[name]
     (tmp_path / f"{file}.part").mkdir()
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, jitter_distribution="uniform"))
     with pytest.raises(UserError, match=r"\(Is a directory\)"):
-        NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
+        NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True).apply([flow])
 
     assert tc.told == []
-    assert not (tmp_path / f"netem-{namespace()}-eth0.json").exists()
+    assert not (tmp_path / f"netem-{network_namespace()}-eth0.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -437,13 +439,13 @@ def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: 
 )
 def test_a_broken_file_is_no_application(tmp_path: Path, text: str) -> None:
     """A file that is not one of ours counts as nothing, and is written anew."""
-    (tmp_path / f"netem-{namespace()}-eth0.json").write_text(text)
+    (tmp_path / f"netem-{network_namespace()}-eth0.json").write_text(text)
     netem = NetemInterface("eth0", directory=tmp_path, run=Tc())
     assert netem.applied() is None
     netem.apply([VIDEO], condition="L2")
     applied = netem.applied()
     assert applied is not None
-    assert (applied.condition, applied.flows, applied.owner) == ("L2", (VIDEO,), this_process())
+    assert (applied.condition, applied.flows, applied.owner) == ("L2", (VIDEO,), current_process())
 
 
 def test_flows_are_read_as_they_were_written() -> None:
@@ -461,7 +463,7 @@ def test_a_name_that_no_interface_has_is_rejected(name: str) -> None:
 def test_correlated_jitter_needs_somebody_who_stays(tmp_path: Path) -> None:
     """What ends at once cannot let a delay wander: refused with what to do instead."""
     with pytest.raises(UserError, match="--hold"):
-        NetemInterface("eth0", directory=tmp_path, run=Tc(), stays=True).apply(
+        NetemInterface("eth0", directory=tmp_path, run=Tc(), persistent=True).apply(
             [ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 5, 0.9))]
         )
 
@@ -507,32 +509,32 @@ def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) ->
 
 
 def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the tc that steps a delay has ended by itself, that is a doubt of its flow, and clearing goes on."""
+    """Where the tc that steps a delay has ended by itself, that is a problem of its flow, and clearing goes on."""
     monkeypatch.setenv("PATH", tc_that("exit 1", tmp_path)["PATH"])
     tc = Tc()
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     netem.apply([WANDERING, CONTROL])
     limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
-    while not netem.doubts() and MachineClock().now().mono_ns < limit_ns:
+    while not netem.problems() and MachineClock().now().mono_ns < limit_ns:
         pause(NS_PER_MS)
-    doubts, tc.qdiscs = netem.doubts(), QDISCS.replace('"qlen": 7', '"qlen": 0')
+    problems, tc.qdiscs = netem.problems(), QDISCS.replace('"qlen": 7', '"qlen": 0')
 
-    (doubt,) = doubts
-    assert doubt.startswith("video (udp source port 5600): ")
+    (problem,) = problems
+    assert problem.startswith("video (udp source port 5600): ")
     assert netem.clear()[-1] == ["tc", "qdisc", "del", "dev", "eth0", "root"]
-    assert netem.doubts() == []
+    assert netem.problems() == []
 
 
 def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wander that steps is in no doubt; one whose thread has died is, a second after its last step, not before."""
+    """A wander that steps is in no problem; one whose thread has died is, a second after its last step, not before."""
     monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
     monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
     clock = ManualClock()
     wander = CorrelatedJitter("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
     clock.mono_ns = NS_PER_S
-    now = wander.doubts()
+    now = wander.problems()
     clock.mono_ns += 1
-    later = wander.doubts()
+    later = wander.problems()
     wander.end()
 
     assert now == []
@@ -543,7 +545,7 @@ def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pyte
     """A verification tells what has stopped, beside what was read back and measured."""
     netem = NetemInterface("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
     monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: JUDGED)
-    monkeypatch.setattr(netem, "doubts", lambda: ["stopped"])
+    monkeypatch.setattr(netem, "problems", lambda: ["stopped"])
     assert netem.verify([VIDEO]).reasons == ["stopped"]
 
 

@@ -36,7 +36,7 @@ class Impairment:
     """Share of packets that are not delayed, and so overtake."""
 
     @property
-    def is_nothing(self) -> bool:
+    def is_transparent(self) -> bool:
         """Whether nothing happens to a packet."""
         return not (self.delay_ms or self.jitter_ms or self.loss or self.rate_bps or self.reorder)
 
@@ -57,21 +57,21 @@ class ImpairedFlow:
     impairment: Impairment
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The flow in words."""
         return f"{self.name} ({self.protocol} {self.end} port {self.port})"
 
 
 @value
 class ExemptPort:
-    """A port that must never be held, and whose it is."""
+    """A port that must never be held, and service it is."""
 
     protocol: Literal["udp", "tcp"]
     port: int
-    whose: str
+    service: str
 
 
-NEVER: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
+ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
 """Never held on any machine; the clock probe's port is added by whoever knows it."""
 
 
@@ -111,7 +111,7 @@ def check_netem_impairment(name: str, impairment: Impairment) -> None:
         raise UserError(f"{name}: correlated jitter needs jitter_ms: give it, or no correlation")
 
 
-def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> None:
+def check_flows(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> None:
     """Raise `UserError` for a law that netem cannot do, and for a flow that covers what must never be held."""
     if not flows:
         raise UserError("there is no flow to hold: name at least one")
@@ -120,15 +120,17 @@ def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ())
         check_netem_impairment(flow.name, flow.impairment)
         if not 1 <= flow.port <= 65_535:
             raise UserError(f"{flow.name}: {flow.port} is no port: give one between 1 and 65535")
-        for port in (*NEVER, *never):
+        for port in (*ALWAYS_EXEMPT, *exempt):
             if (flow.protocol, flow.port) == (port.protocol, port.port):
                 raise UserError(
-                    f"{flow.words} would cover {port.whose} (port {port.port}), which must never be delayed: "
+                    f"{flow.description} would cover {port.service} (port {port.port}), which must never be delayed: "
                     "give one of the two another port"
                 )
         other = taken.setdefault((flow.protocol, flow.port, flow.end), flow)
         if other is not flow:
-            raise UserError(f"{flow.words} has the same packets as {other.words}: give one of the two another port")
+            raise UserError(
+                f"{flow.description} has the same packets as {other.description}: give one of the two another port"
+            )
     if len({flow.name for flow in flows}) < len(flows):
         raise UserError("two flows have one name: name each once")
 

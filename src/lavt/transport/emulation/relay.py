@@ -62,7 +62,7 @@ class RelayedFlow:
     server: Address
     upstream: DelayModel
     downstream: DelayModel
-    held_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    delays_downstream: Callable[[bytes], bool] = lambda _datagram: True
     index_downstream: Callable[[bytes], int] | None = None
     """From a datagram to the index of its delay; None: datagrams are counted."""
     upstream_injected: LinkInjection | None = None
@@ -255,7 +255,7 @@ class _OpenFlow:
             _Way(upstream, lambda data: towards_server.sendto(data, flow.server), None, _always),
             _Way(
                 downstream, lambda data: self._socket.sendto(data, address), flow.index_downstream,
-                flow.held_downstream,
+                flow.delays_downstream,
             ),
             self._relay.now_ns(),
         )  # fmt: skip

@@ -78,11 +78,11 @@ class CorrelatedJitter:
             self._tc.kill()
             self._tc.wait()
 
-    def doubts(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Say in sentences which flows wander no more: tc has ended by itself, or there was no step for a second."""
         if not self._failed and self._clock.now().mono_ns - self._stepped_ns <= LATE_NS:
             return []
-        return [f"{flow.words}: its correlated jitter has stopped" for flow in self._flows]
+        return [f"{flow.description}: its correlated jitter has stopped" for flow in self._flows]
 
     def _run(self) -> None:
         at: dict[str, tuple[int, float]] = {}

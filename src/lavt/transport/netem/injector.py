@@ -42,7 +42,7 @@ class InjectionResult:
     number: int
     reason: str
     """Why it is not in force; empty: it is."""
-    doubts: str
+    problems: str
     """What was measured to be otherwise than asked."""
     measured_ms: tuple[tuple[str, float | None], ...]
     """The median of each flow."""
@@ -51,21 +51,21 @@ class InjectionResult:
 class NetemQueues(Protocol):
     """What can delay what this machine sends."""
 
-    def apply(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], condition: str) -> object:
+    def apply(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], condition: str) -> object:
         """Put flows in force, or change them; raises `LavtError`."""
         ...
 
-    def verify(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int) -> Verification:
+    def verify(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int) -> Verification:
         """Read back what is in force, and measure what happens to packets of flows, and of what must not be held."""
         ...
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int
     ) -> dict[str, ProbeResult]:
         """Measure the same, and read nothing back."""
         ...
 
-    def doubts(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Tell what is known to be otherwise than asked without measuring."""
         ...
 
@@ -77,16 +77,16 @@ class NetemQueues(Protocol):
 class Injector:
     """Does one order after the other, where there are `queues`; without them only no delay can be ordered.
 
-    `never` are ports that no order may cover.
+    `exempt` are ports that no order may cover.
     """
 
     def __init__(
-        self, clock: Clock, deliver: Deliver, queues: NetemQueues | None, never: Sequence[ExemptPort] = ()
+        self, clock: Clock, deliver: Deliver, queues: NetemQueues | None, exempt: Sequence[ExemptPort] = ()
     ) -> None:
         self._clock = clock
         self._deliver = deliver
         self._queues = queues
-        self._never = tuple(never)
+        self._exempt = tuple(exempt)
         self._applied = 0
         """Number of the order in force: one that comes again is only measured."""
         self._orders: queue.Queue[InjectionOrder | None] = queue.Queue()
@@ -128,20 +128,20 @@ class Injector:
         flows = order.flows
         if self._queues is None:
             return InjectionResult(
-                order.number, "" if all(flow.impairment.is_nothing for flow in flows) else NO_INTERFACE, "", ()
+                order.number, "" if all(flow.impairment.is_transparent for flow in flows) else NO_INTERFACE, "", ()
             )
         try:
             if not flows:
                 self._queues.clear()
                 return InjectionResult(order.number, "", "", ())
             if order.number != self._applied:
-                self._queues.apply(flows, never=self._never, condition=order.condition)
-                found = self._queues.verify(flows, never=self._never, count=FRAMES)
+                self._queues.apply(flows, exempt=self._exempt, condition=order.condition)
+                found = self._queues.verify(flows, exempt=self._exempt, count=FRAMES)
                 if found.reasons:
                     return InjectionResult(order.number, "; ".join(found.reasons), "", ())
             else:  # while it is driven: without starting programs, which would hold it up
-                measured = self._queues.measure(flows, never=self._never, count=FRAMES)
-                found = Verification(self._queues.doubts() + judge(flows, self._never, measured), measured)
+                measured = self._queues.measure(flows, exempt=self._exempt, count=FRAMES)
+                found = Verification(self._queues.problems() + judge(flows, self._exempt, measured), measured)
             self._applied = order.number
         except LavtError as error:
             return InjectionResult(order.number, str(error), "", ())

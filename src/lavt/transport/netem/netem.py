@@ -23,7 +23,15 @@ from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment, check_flows
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter
 from lavt.transport.netem.probe import ProbeResult, judge, measure, probes
-from lavt.transport.netem.state import DIRECTORY, NOBODY, AppliedState, Owner, StateFiles, boot, namespace, this_process
+from lavt.transport.netem.state import (
+    DIRECTORY,
+    NO_OWNER,
+    AppliedState,
+    Owner,
+    StateFiles,
+    boot_id,
+    current_process,
+)
 from lavt.transport.netem.tc import (
     PLACES,
     ROOT,
@@ -117,7 +125,7 @@ class Verification:
 class NetemInterface:
     """The delay of one interface. As a context it puts the interface back at its end, however it ends.
 
-    `stays`: what is applied outlives this process, as no program owns it. `directory` holds what is written down for a
+    `persistent`: what is applied outlives this process, as no program owns it. `directory` holds what is written down for a
     restart. `seed` is that of correlated jitter. Raises `UserError` for a name that no interface can have.
     """
 
@@ -125,7 +133,7 @@ class NetemInterface:
         self,
         interface: str,
         *,
-        stays: bool = False,
+        persistent: bool = False,
         directory: Path = DIRECTORY,
         run: RunCommand = run_tc,
         clock: Clock | None = None,
@@ -136,7 +144,7 @@ class NetemInterface:
         self.interface = interface
         self._files = StateFiles(directory)
         self._tables = str(directory)
-        self._owner = NOBODY if stays else this_process()
+        self._owner = NO_OWNER if persistent else current_process()
         self._run = run
         self._clock = clock or MachineClock()
         self._seed = seed
@@ -164,23 +172,23 @@ class NetemInterface:
         """
         with self._files.alone():
             return [
-                f"{each.interface} was still held ({each.words}, which has died): {self._restored(each.interface)}"
+                f"{each.interface} was still held ({each.description}, which has died): {self._restored(each.interface)}"
                 for each in self._files.all()
                 if each.is_abandoned
             ]
 
     def apply(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), condition: str = ""
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), condition: str = ""
     ) -> list[Command]:
         """Hold `flows` as their laws say, from now on; give the commands that did it.
 
         What is there already is changed without losing a packet, and what is no longer asked for is held no more.
-        `never` names ports that no flow may cover. Raises `UserError` for flows that cannot be had, and for an
+        `exempt` names ports that no flow may cover. Raises `UserError` for flows that cannot be had, and for an
         interface that carries somebody else's queue, or a delay that another program of ours owns.
         """
-        check_flows(flows, never)
+        check_flows(flows, exempt)
         wanders = any(flow.impairment.jitter_correlation for flow in flows)
-        if wanders and self._owner == NOBODY:
+        if wanders and self._owner == NO_OWNER:
             raise UserError(
                 "correlated jitter needs a program that stays: `lavt netem apply --hold`, or network.injection: netem"
             )
@@ -190,7 +198,9 @@ class NetemInterface:
             qdiscs = self._ours_or_free(self.interface)
             if any(flow.impairment.jitter_distribution == "uniform" for flow in flows):
                 self._files.write_text("uniform.dist", uniform_table())
-            self._files.write(AppliedState(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
+            self._files.write(
+                AppliedState(self.interface, network_namespace(), boot_id(), self._owner, condition, tuple(flows))
+            )
             self._stand_still()
             ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
             if wanders:
@@ -199,16 +209,16 @@ class NetemInterface:
                 )
             return ran
 
-    def clear(self, *, at_once: bool = False, of_anybody: bool = False) -> list[Command]:
+    def clear(self, *, at_once: bool = False, any_owner: bool = False) -> list[Command]:
         """Put the interface back as it was; give the commands that did it, none where nothing of this owner was there.
 
         What is under way is waited for, in order; lost is only what a rate has piled up beyond the longest delay and
-        two seconds, and with `at_once` all of it. `of_anybody` also clears
+        two seconds, and with `at_once` all of it. `any_owner` also clears
         what another program of ours owns, or was left in place; raises `UserError` for a queue that is not ours.
         """
         with self._files.alone():
             self._stand_still()
-            if not of_anybody and self._owner_of_what_is_there() != self._owner:
+            if not any_owner and self._owner_of_what_is_there() != self._owner:
                 return []
             ran = self._clear(self.interface, at_once=at_once)
             self._files.forget(self.interface)
@@ -218,7 +228,7 @@ class NetemInterface:
         """Tell what was applied, by whom; None where nothing was written down."""
         return self._files.read(self.interface)
 
-    def shown(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         """Tell what is there, as it is read back: whether it is ours, and the law of each flow that has one."""
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
         netems = {name: _netem_at(place.handle, qdiscs) for name, place in PLACES.items()}
@@ -245,22 +255,22 @@ class NetemInterface:
         ]
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
         """Measure what happens to packets of each flow, and of what must not be held, on their way out."""
-        return measure(self.interface, probes(flows, never), count=count, clock=self._clock)
+        return measure(self.interface, probes(flows, exempt), count=count, clock=self._clock)
 
     def verify(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> Verification:
         """Verify by reading back and by measuring, and tell what has stopped."""
         reasons = self.read_back(flows)
-        measured = self.measure(flows, never=never, count=count)
-        return Verification(reasons + self.doubts() + judge(flows, never, measured), measured)
+        measured = self.measure(flows, exempt=exempt, count=count)
+        return Verification(reasons + self.problems() + judge(flows, exempt, measured), measured)
 
-    def doubts(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Say in sentences what of ours has stopped by itself since it was applied; no program is started for it."""
-        return [] if self._wander is None else self._wander.doubts()
+        return [] if self._wander is None else self._wander.problems()
 
     def _restored(self, interface: str) -> str:
         """Put back what the dead left, and say what came of it."""
@@ -280,14 +290,14 @@ class NetemInterface:
             return
         if self._owner_of_what_is_there() != self._owner:
             there = self._files.read(self.interface)
-            words = f"a delay on {self.interface}, left in place" if there is None else there.words
+            words = f"a delay on {self.interface}, left in place" if there is None else there.description
             raise UserError(
                 f"there is {words}: clear it with `lavt netem clear --interface {self.interface}`, or let it end"
             )
 
     def _owner_of_what_is_there(self) -> Owner:
         there = self._files.read(self.interface)
-        return NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
+        return NO_OWNER if there is None else there.owner  # without a file it was made by hand, with the scripts
 
     def _ours_or_free(self, interface: str) -> list[Qdisc]:
         """Give the queues where the root is ours, and none where it is the kernel's own.

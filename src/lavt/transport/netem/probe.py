@@ -22,7 +22,7 @@ from lavt.clock import Clock, MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
 from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS
-from lavt.transport.emulation.impairment import NEVER, ExemptPort, ImpairedFlow, Impairment, bursts, gilbert
+from lavt.transport.emulation.impairment import ALWAYS_EXEMPT, ExemptPort, ImpairedFlow, Impairment, bursts, gilbert
 from lavt.value import value
 
 PERIOD_NS: Final = 20 * NS_PER_MS
@@ -82,7 +82,7 @@ class ProbeResult:
     p95_ms: float | None
 
 
-def probes(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> list[ProbeSpec]:
+def probes(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> list[ProbeSpec]:
     """Give the probes for flows, and for what must not be held beside them."""
     held, beside = [], []
     taken = {(flow.protocol, flow.port, flow.end) for flow in flows}
@@ -96,7 +96,9 @@ def probes(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> l
             beside.append(ProbeSpec(f"{flow.name}, other direction", flow.protocol, *back, Impairment()))
         if flow.name == "video":
             beside.append(ProbeSpec("challenges of the video's path", flow.protocol, *there, Impairment(), PATH))
-    beside += [ProbeSpec(port.whose, port.protocol, port.port, port.port, Impairment()) for port in (*NEVER, *never)]
+    beside += [
+        ProbeSpec(port.service, port.protocol, port.port, port.port, Impairment()) for port in (*ALWAYS_EXEMPT, *exempt)
+    ]
     return held + beside
 
 
@@ -155,9 +157,11 @@ def summary(impairment: Impairment, sent: int, delays: Sequence[tuple[int, float
     return ProbeResult(sent, sent - len(delays), reordered, early, twentieths[0], median(held_ms), twentieths[-1])
 
 
-def judge(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort], measured: Mapping[str, ProbeResult]) -> list[str]:
+def judge(
+    flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort], measured: Mapping[str, ProbeResult]
+) -> list[str]:
     """Say in sentences what was measured to be otherwise than asked; an empty list is as asked."""
-    return [reason for probe in probes(flows, never) for reason in _judge(probe, measured.get(probe.name))]
+    return [reason for probe in probes(flows, exempt) for reason in _judge(probe, measured.get(probe.name))]
 
 
 def _judge(probe: ProbeSpec, found: ProbeResult | None) -> list[str]:

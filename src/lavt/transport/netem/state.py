@@ -20,7 +20,7 @@ from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.value import value
 
 DIRECTORY: Final = Path("/run/lavt")
-NOBODY: Final = (0, 0)
+NO_OWNER: Final = (0, 0)
 """Instead of an owner: left in place."""
 _START_TICKS: Final = 19
 """Index of a process's start among what follows its name in /proc/PID/stat (proc(5): field 22)."""
@@ -43,23 +43,23 @@ class AppliedState:
     @property
     def is_abandoned(self) -> bool:
         """Whether it belongs to a process that is no more, or to an earlier boot of the machine."""
-        if self.boot != boot():
+        if self.boot != boot_id():
             return True
-        return self.owner != NOBODY and self.owner[1] != started(self.owner[0])
+        return self.owner != NO_OWNER and self.owner[1] != start_ticks(self.owner[0])
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What and whose it is."""
-        whose = "left in place" if self.owner == NOBODY else f"of process {self.owner[0]}"
+        whose = "left in place" if self.owner == NO_OWNER else f"of process {self.owner[0]}"
         return f"{self.condition or 'a delay'} on {self.interface}, {whose}"
 
 
-def this_process() -> Owner:
+def current_process() -> Owner:
     """Give this process as an owner."""
-    return os.getpid(), started(os.getpid())
+    return os.getpid(), start_ticks(os.getpid())
 
 
-def started(pid: int) -> int:
+def start_ticks(pid: int) -> int:
     """Tell when a process was started, in the kernel's ticks; 0 where there is none."""
     try:
         words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
@@ -68,12 +68,12 @@ def started(pid: int) -> int:
         return 0
 
 
-def boot() -> str:
+def boot_id() -> str:
     """Tell which boot of the machine this is."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
-def namespace() -> int:
+def network_namespace() -> int:
     """Tell the network namespace of the calling thread."""
     return os.stat("/proc/thread-self/ns/net").st_ino  # noqa: PTH116 (it is a link that leads to no path)
 
@@ -118,7 +118,7 @@ class StateFiles:
 
     def all(self) -> list[AppliedState]:
         """Give everything that was applied in this namespace."""
-        found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{namespace()}-*.json"))]
+        found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{network_namespace()}-*.json"))]
         return [each for each in found if each is not None]
 
     def forget(self, interface: str) -> None:
@@ -136,7 +136,7 @@ class StateFiles:
             ) from error
 
     def _path(self, interface: str) -> Path:
-        return self.directory / f"netem-{namespace()}-{interface}.json"
+        return self.directory / f"netem-{network_namespace()}-{interface}.json"
 
     @staticmethod
     def _read(path: Path) -> AppliedState | None:

@@ -65,7 +65,7 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
 class U32Match:
     """One condition of a u32 filter: as tc is told it, and as it is read back, 32 bits at an offset."""
 
-    words: str
+    text: str
     offset: int
     bits: int
     mask: int
@@ -155,7 +155,7 @@ def netem_arguments(impairment: Impairment) -> list[str]:
 
 def add_filter(interface: str, each: TcFilter) -> Command:
     """Give the command that sends what matches to its band."""
-    words = " ".join(f"match {match.words}" for match in each.matches)
+    words = " ".join(f"match {match.text}" for match in each.matches)
     return [
         "tc", "filter", "add", "dev", interface, "parent", ROOT, "protocol", each.version, "prio", str(each.number),
         "u32", *words.split(), "classid", each.parent,
@@ -283,11 +283,11 @@ def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[Foun
     place, requested = PLACES[flow.name], flow.impairment
     netem = next((each for each in qdiscs if each.handle == place.handle), None)
     if netem is None or netem.kind != "netem" or netem.parent != place.parent:
-        return [f"{flow.words} has no netem"]
+        return [f"{flow.description} has no netem"]
     is_ = parse_impairment(netem.options)
     wanders = bool(requested.jitter_correlation)  # then the delay is where it has got to, and no jitter of netem's
     reasons = [
-        f"{flow.words}: {name} is {there:g} where {wanted:g} was asked"
+        f"{flow.description}: {name} is {there:g} where {wanted:g} was asked"
         for name, there, wanted, step in (
             ("delay_ms", is_.delay_ms, requested.delay_ms, TC_STEP_MS + 8 * requested.jitter_ms * wanders),
             ("jitter_ms", is_.jitter_ms, 0.0 if wanders else requested.jitter_ms, TC_STEP_MS),
@@ -299,12 +299,12 @@ def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[Foun
         if abs(there - wanted) > step + 1e-5 * wanted
     ]  # fmt: skip
     if int(netem.options.get("limit", 0)) < LEAST_LIMIT_PACKETS:
-        reasons.append(f"{flow.words}: room for {netem.options.get('limit')} packets only")
+        reasons.append(f"{flow.description}: room for {netem.options.get('limit')} packets only")
     if not netem.options.get("rate"):
-        reasons.append(f"{flow.words}: has no rate, so packets overtake each other")
+        reasons.append(f"{flow.description}: has no rate, so packets overtake each other")
     there_filters = set(found)
     reasons += [
-        f"{flow.words} has no filter for {each.version}"
+        f"{flow.description} has no filter for {each.version}"
         for each in filters(flow)
         if expected_filter(each) not in there_filters
     ]
