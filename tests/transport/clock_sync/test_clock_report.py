@@ -9,10 +9,10 @@ from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync import clock_report
 from lavt.transport.clock_sync.clock_report import (
     ClockReport,
-    ask,
     host_addresses,
     kernel_identity,
     plain_address,
+    query_clock,
     unknown_clock,
 )
 from lavt.transport.clock_sync.persistent_process import Completed
@@ -81,7 +81,7 @@ def test_an_answer_may_take_two_seconds(took_ns: int, *, in_time: bool) -> None:
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)
 
-    report = ask(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
+    report = query_clock(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
     assert requested == [(("tool",), 2.0)]
     assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 

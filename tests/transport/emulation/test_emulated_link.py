@@ -36,7 +36,7 @@ def times(
     made: EmulatedLink, *, count: int = COUNT, period_ns: int = SLOW_NS, size_bytes: int = 1000
 ) -> list[int | None]:
     """For how long each packet of a steady flow was held; None: it was lost."""
-    left = [made.leaves_ns(number * period_ns, 0, size_bytes) for number in range(count)]
+    left = [made.departure_ns(number * period_ns, 0, size_bytes) for number in range(count)]
     return [None if each is None else each - number * period_ns for number, each in enumerate(left)]
 
 
@@ -48,7 +48,7 @@ def held_ms(made: EmulatedLink, **keys: Any) -> NDArray[np.float64]:
 def test_nothing() -> None:
     """Without a law a packet leaves when it comes, after the delay that is there anyway; a constant is exact."""
     assert set(times(link(Impairment()), count=1000)) == {0}
-    assert link(Impairment()).leaves_ns(5, 7, 1000) == 12
+    assert link(Impairment()).departure_ns(5, 7, 1000) == 12
     assert set(times(link(Impairment(delay_ms=0.25)), count=1000)) == {250_000}
 
 
@@ -152,7 +152,7 @@ def test_jitter_beyond_the_delay() -> None:
     assert delays.min() == 0
     assert (delays == 0).mean() == pytest.approx(0.5, abs=0.01)
     above = link(Impairment(jitter_ms=10))
-    left = [above.leaves_ns(number * SLOW_NS, 50 * MS, 0) for number in range(1000)]
+    left = [above.departure_ns(number * SLOW_NS, 50 * MS, 0) for number in range(1000)]
     assert [each and each - number * SLOW_NS > 10 * MS for number, each in enumerate(left)] == [True] * 1000
 
 
@@ -160,14 +160,16 @@ def test_rate() -> None:
     """Packets that come at once leave one after the other, headers counted; a link that is not full adds one packet."""
     made = link(Impairment(delay_ms=5, rate_bps=2_000_000))
     takes_ns = round(8 * (1000 + HEADER_BYTES) * NS_PER_S / 2_000_000)
-    assert [made.leaves_ns(0, 0, 1000) for _ in range(4)] == [5 * MS + takes_ns * (number + 1) for number in range(4)]
+    assert [made.departure_ns(0, 0, 1000) for _ in range(4)] == [
+        5 * MS + takes_ns * (number + 1) for number in range(4)
+    ]
     assert set(times(link(Impairment(rate_bps=2_000_000)), count=100)) == {takes_ns}
 
 
 def test_throughput() -> None:
     """Through a link that is too slow comes what its rate lets through, however much is sent."""
     made = link(Impairment(rate_bps=1_000_000), queue_packets=20)
-    left = [each for each in (made.leaves_ns(number * MS, 0, 958) for number in range(20_000)) if each is not None]
+    left = [each for each in (made.departure_ns(number * MS, 0, 958) for number in range(20_000)) if each is not None]
     assert 8000 * (len(left) - 1) / ((left[-1] - left[0]) / NS_PER_S) == pytest.approx(1_000_000, rel=1e-6)
     assert made.dropped == 20_000 - len(left) > 0
 
@@ -176,16 +178,16 @@ def test_full_queue() -> None:
     """A queue with room for three holds three, the one being sent among them; the next is dropped and counted."""
     made = link(Impairment(rate_bps=8000), queue_packets=3)  # 1 s for 1000 bytes
     size_bytes = 1000 - HEADER_BYTES
-    assert [made.leaves_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
-    assert made.leaves_ns(NS_PER_S, 0, size_bytes) == 4 * NS_PER_S
-    assert made.leaves_ns(NS_PER_S, 0, size_bytes) is None
+    assert [made.departure_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
+    assert made.departure_ns(NS_PER_S, 0, size_bytes) == 4 * NS_PER_S
+    assert made.departure_ns(NS_PER_S, 0, size_bytes) is None
     assert made.counts == {"packets": 7, "lost": 0, "dropped": 3, "overtook": 0}
 
 
 def test_the_queue_is_behind_the_delay() -> None:
     """What is still under way to the queue takes no room in it."""
     made = link(Impairment(delay_ms=5000, rate_bps=8000), queue_packets=1)
-    left = [made.leaves_ns(number * NS_PER_S, 0, 1000 - HEADER_BYTES) for number in range(5)]
+    left = [made.departure_ns(number * NS_PER_S, 0, 1000 - HEADER_BYTES) for number in range(5)]
     assert left == [(6 + number) * NS_PER_S for number in range(5)]
 
 
@@ -210,7 +212,7 @@ def test_capacity_by_hand() -> None:
     made = link(Impairment(), trace=trace)
 
     def send(at_ms: float, size_bytes: int) -> float:
-        left_ns = made.leaves_ns(round(at_ms * MS), 0, size_bytes - HEADER_BYTES)
+        left_ns = made.departure_ns(round(at_ms * MS), 0, size_bytes - HEADER_BYTES)
         assert left_ns is not None
         return left_ns / MS
 
@@ -230,23 +232,23 @@ def test_capacity_counts_from_the_beginning_of_the_link() -> None:
     made = EmulatedLink(
         LinkInjection(Impairment(delay_ms=3), 1, "video", parse_mahimahi("10\n", "t")), start_ns=500 * MS
     )
-    assert made.leaves_ns(500 * MS, 0, 100) == 510 * MS
-    assert made.leaves_ns(508 * MS, 0, 100) == 520 * MS
+    assert made.departure_ns(500 * MS, 0, 100) == 510 * MS
+    assert made.departure_ns(508 * MS, 0, 100) == 520 * MS
 
 
 def test_a_full_queue_of_capacity() -> None:
     """The queue in front of a capacity has a bound, too."""
     made = link(Impairment(), trace=parse_mahimahi("10\n", "t"), queue_packets=2)
     size_bytes = 1500 - HEADER_BYTES
-    assert [made.leaves_ns(0, 0, size_bytes) for _ in range(3)] == [10 * MS, 20 * MS, None]
-    assert made.leaves_ns(10 * MS, 0, size_bytes) == 30 * MS
+    assert [made.departure_ns(0, 0, size_bytes) for _ in range(3)] == [10 * MS, 20 * MS, None]
+    assert made.departure_ns(10 * MS, 0, size_bytes) == 30 * MS
 
 
 def test_delays_by_hand() -> None:
     """A trace of delay comes on top of the constant; a delay that falls faster than time goes lets nothing overtake."""
     trace = parse_delays("time_s,delay_ms\n0,0\n1,100\n1.05,0\n2,0\n", "t")
     made = link(Impairment(delay_ms=20), trace=trace)
-    left = [made.leaves_ns(at_ms * MS, 0, 100) for at_ms in (0, 500, 1000, 1025, 1050, 1100, 1500, 2500)]
+    left = [made.departure_ns(at_ms * MS, 0, 100) for at_ms in (0, 500, 1000, 1025, 1050, 1100, 1500, 2500)]
     assert [each and each / MS for each in left] == [20, 570, 1120, 1120, 1120, 1120, 1520, 2570]
 
 
@@ -270,7 +272,7 @@ def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) ->
     now_ns, last_ns = 0, 0
     for pause_ns, inherent_ns, size_bytes in packets:
         now_ns += pause_ns
-        left_ns = made.leaves_ns(now_ns, inherent_ns, size_bytes)
+        left_ns = made.departure_ns(now_ns, inherent_ns, size_bytes)
         if left_ns is not None:
             assert left_ns >= max(now_ns, last_ns)
             last_ns = left_ns
@@ -317,7 +319,7 @@ def test_a_line_with_a_link() -> None:
     impairment = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
     line, made = DelayLine(DelayModel(12.0), link(impairment)), link(impairment)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
-    assert due == [made.leaves_ns(number * MS, 12 * MS, 100) for number in range(500)]
+    assert due == [made.departure_ns(number * MS, 12 * MS, 100) for number in range(500)]
     order = sorted((each, number) for number, each in enumerate(due) if each is not None)
     assert line.pop_due(2 * NS_PER_S) == [number for _, number in order]
     assert [number for _, number in order] != sorted(number for _, number in order)
@@ -357,7 +359,9 @@ def test_what_the_kernel_rejects_is_allowed() -> None:
 def test_early_ones_keep_their_order() -> None:
     """What overtakes by not being delayed still has the delay that is there anyway, and keeps order with its like."""
     made = link(Impairment(delay_ms=75, reorder=0.999))
-    early = [made.leaves_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))]
+    early = [
+        made.departure_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))
+    ]
     assert early == [40 * MS, 40 * MS, 52 * MS]
 
 

@@ -297,7 +297,7 @@ def test_the_relay_does_what_the_link_says(name: str) -> None:
         came = through(net, impairments, count := 60, 10.0)
         counts = net.relay.counts()
         late_ms = net.relay.late_ms()["video downstream"]
-    left = [model.leaves_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
+    left = [model.departure_ns(round(10 * NS_PER_MS * number), 0, len(rtp(0))) for number in range(count)]
     # the relay looks every half millisecond here
     expected = sorted((each, number) for number, each in enumerate(left) if each is not None)
     assert [number for number, _ in came] == [number for _, number in expected]

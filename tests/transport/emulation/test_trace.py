@@ -21,14 +21,14 @@ def test_opportunities_go_on_for_ever() -> None:
     trace = parse_mahimahi("1\n5\n5\n10\n", "t")
     assert [trace.time_ns(number) // MS for number in range(10)] == [1, 5, 5, 10, 11, 15, 15, 20, 21, 25]
     firsts = {0: 0, 1: 0, 2: 1, 5: 1, 6: 3, 10: 3, 11: 4, 15: 5, 16: 7, 20: 7, 21: 8}
-    assert {time_ms: trace.first_from(time_ms * MS) for time_ms in firsts} == firsts
+    assert {time_ms: trace.first_at(time_ms * MS) for time_ms in firsts} == firsts
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=8), st.integers(0, 200 * MS))
 def test_the_first_opportunity_is_the_first(times_ms: list[int], time_ns: int) -> None:
     """No opportunity at or after a time comes before the first from it on, for any trace and any time."""
     trace = CapacityTrace(tuple(each * MS for each in (*sorted(times_ms), 31)))
-    first = trace.first_from(time_ns)
+    first = trace.first_at(time_ns)
     assert trace.time_ns(first) >= time_ns
     assert first == 0 or trace.time_ns(first - 1) < time_ns
 

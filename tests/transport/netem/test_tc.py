@@ -30,9 +30,9 @@ from lavt.transport.emulation.impairment import (
     check_flows,
     check_netem_impairment,
 )
-from lavt.transport.netem.correlated_jitter import CorrelatedJitter, wandering
+from lavt.transport.netem.correlated_jitter import CorrelatedJitter, next_deviation
 from lavt.transport.netem.netem import NetemInterface, run_tc
-from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summary
+from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summarize
 from lavt.transport.netem.state import (
     NO_OWNER,
     AppliedState,
@@ -349,7 +349,7 @@ def test_what_another_program_owns_is_rejected(tmp_path: Path) -> None:
     StateFiles(tmp_path).write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
     with pytest.raises(UserError, match=f"there is L3 on eth0, of process {owner[0]}"):
         NetemInterface("eth0", directory=tmp_path, run=tc).apply([VIDEO])
-    StateFiles(tmp_path).forget("eth0")
+    StateFiles(tmp_path).remove("eth0")
     with pytest.raises(UserError, match="a delay on eth0, left in place"):
         NetemInterface("eth0", directory=tmp_path, run=tc).check()
     assert tc.told == []
@@ -474,7 +474,7 @@ def test_a_wandering_delay_is_correlated_as_requested_and_repeats() -> None:
     def walk(seed: int) -> list[float]:
         values, before = [], None
         for index in range(4000):
-            values.append(wandering(Impairment(75, 10, 0.9), seed, "video", index, before))
+            values.append(next_deviation(Impairment(75, 10, 0.9), seed, "video", index, before))
             before = index, values[-1]
         return values
 
@@ -502,7 +502,7 @@ def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) ->
     said = tmp_path / "said"
     does = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
     does += f"; echo $pid $session > {said}"
-    CorrelatedJitter("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
+    CorrelatedJitter("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).stop()
     pid, session = said.read_text().split()
 
     assert session == pid
@@ -530,12 +530,12 @@ def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkey
     monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
     monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
     clock = ManualClock()
-    wander = CorrelatedJitter("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    jitter = CorrelatedJitter("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
     clock.mono_ns = NS_PER_S
-    now = wander.problems()
+    now = jitter.problems()
     clock.mono_ns += 1
-    later = wander.problems()
-    wander.end()
+    later = jitter.problems()
+    jitter.stop()
 
     assert now == []
     assert later == ["video (udp source port 5600): its correlated jitter has stopped"]
@@ -567,12 +567,12 @@ def test_what_is_probed_beside_the_flows() -> None:
 def test_frames_are_summed_up() -> None:
     """Of 10 frames one is lost, one passed by a later one and one early; the delays are of those that were held."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
-    found = summary(Impairment(75, reorder=0.25), 10, delays)
+    found = summarize(Impairment(75, reorder=0.25), 10, delays)
 
     assert (found.sent, found.lost, found.early) == (10, 1, 1)
     assert found.reordered == 5
     assert found.median_ms == 75.0
-    assert summary(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
+    assert summarize(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
 
 
 JUDGED = {

@@ -1,4 +1,4 @@
-"""What netem is to do: laws, the flows that they are for, and what is refused. `netem_tc.py` says it to tc."""
+"""Impairments of a network and the flows that they apply to. `transport/netem/tc.py` translates them for tc."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavt.errors import UserError
 from lavt.value import value
 
 ORDER_RATE_BPS: Final = 10_000_000_000
-"""The rate of a flow without one: netem keeps order only where it has a rate. A packet costs a microsecond."""
+"""The rate of a flow without a rate limit. netem keeps order only with a rate; this one costs 1 us per packet."""
 
 Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
@@ -19,36 +19,36 @@ DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto",
 
 @value
 class Impairment:
-    """What happens to the packets of a flow; all zero is nothing."""
+    """What a network does to the packets of a flow; by default nothing."""
 
     delay_ms: float = 0.0
     jitter_ms: float = 0.0
-    """Standard deviation; of a uniform law the half width."""
+    """Standard deviation of the delay; for a uniform distribution half the width."""
     jitter_correlation: float = 0.0
-    """Of the delay with itself 20 ms before; see `netem_wander.py`."""
+    """Correlation of the delay with the delay 20 ms before; see `transport/netem/correlated_jitter.py`."""
     jitter_distribution: Distribution = "normal"
     loss: float = 0.0
     loss_burst_packets: float = 0.0
-    """Mean length of a burst (Gilbert and Elliott's model); 0 or 1: each packet is lost by itself."""
+    """Mean length of a loss burst (Gilbert-Elliott model); with 0 or 1 each packet is lost independently."""
     rate_bps: int = 0
     """0: no limit."""
     reorder: float = 0.0
-    """Share of packets that are not delayed, and so overtake."""
+    """Share of packets that are not delayed and therefore overtake others."""
 
     @property
     def is_transparent(self) -> bool:
-        """Whether nothing happens to a packet."""
+        """Whether packets pass unchanged."""
         return not (self.delay_ms or self.jitter_ms or self.loss or self.rate_bps or self.reorder)
 
     @property
     def longest_ms(self) -> float:
-        """A delay that next to no packet exceeds."""
+        """A delay that hardly any packet exceeds."""
         return self.delay_ms + 4 * self.jitter_ms
 
 
 @value
 class ImpairedFlow:
-    """Packets of one protocol from (`source`) or to (`destination`) a port, as one machine sends them."""
+    """The packets of one protocol that a machine sends from (`source`) or to (`destination`) a port."""
 
     name: Literal["video", "control", "state"]
     protocol: Literal["udp", "tcp"]
@@ -58,13 +58,13 @@ class ImpairedFlow:
 
     @property
     def description(self) -> str:
-        """The flow in words."""
+        """Name, protocol and port of the flow, for messages."""
         return f"{self.name} ({self.protocol} {self.end} port {self.port})"
 
 
 @value
 class ExemptPort:
-    """A port that must never be held, and service it is."""
+    """A port whose packets must never be delayed, and the service that uses it."""
 
     protocol: Literal["udp", "tcp"]
     port: int
@@ -72,14 +72,14 @@ class ExemptPort:
 
 
 ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
-"""Never held on any machine; the clock probe's port is added by whoever knows it."""
+"""Exempt on every machine; callers add the port of the clock probe."""
 
 
 def check_impairment(name: str, impairment: Impairment) -> None:
-    """Raise `UserError` for what contradicts itself, whoever is to do it."""
+    """Raise `UserError` for values that are out of range or contradict each other."""
     numbers = [getattr(impairment, each.name) for each in fields(impairment) if each.name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise UserError(f"{name}: no quantity of a impairment is below zero or infinite: correct {impairment}")
+        raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
     if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
         raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {impairment}")
     if impairment.jitter_distribution not in DISTRIBUTIONS:
@@ -88,8 +88,8 @@ def check_impairment(name: str, impairment: Impairment) -> None:
         raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
     if impairment.loss_burst_packets > 1 and gilbert(impairment)[0] > 1:
         raise UserError(
-            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves no room between "
-            "them: give longer bursts or less loss"
+            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves "
+            "no room between them: give longer bursts or less loss"
         )
     if impairment.rate_bps and not 8 <= impairment.rate_bps <= ORDER_RATE_BPS:
         raise UserError(
@@ -98,12 +98,12 @@ def check_impairment(name: str, impairment: Impairment) -> None:
 
 
 def check_netem_impairment(name: str, impairment: Impairment) -> None:
-    """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
+    """Raise `UserError` for an inconsistent impairment, and for one that netem cannot produce."""
     check_impairment(name, impairment)
     if impairment.jitter_ms > impairment.delay_ms:
         raise UserError(
-            f"{name}: a jitter of {impairment.jitter_ms:g} ms on a delay of {impairment.delay_ms:g} ms would need delays below zero: "
-            "give a longer delay or less jitter"
+            f"{name}: a jitter of {impairment.jitter_ms:g} ms on a delay of {impairment.delay_ms:g} ms would need "
+            "negative delays: give a longer delay or less jitter"
         )
     if impairment.reorder and not impairment.delay_ms:
         raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
@@ -112,14 +112,14 @@ def check_netem_impairment(name: str, impairment: Impairment) -> None:
 
 
 def check_flows(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> None:
-    """Raise `UserError` for a law that netem cannot do, and for a flow that covers what must never be held."""
+    """Raise `UserError` for an impairment that netem cannot produce, or a flow that covers an exempt port."""
     if not flows:
-        raise UserError("there is no flow to hold: name at least one")
+        raise UserError("there is no flow to delay: name at least one")
     taken: dict[tuple[str, int, str], ImpairedFlow] = {}
     for flow in flows:
         check_netem_impairment(flow.name, flow.impairment)
         if not 1 <= flow.port <= 65_535:
-            raise UserError(f"{flow.name}: {flow.port} is no port: give one between 1 and 65535")
+            raise UserError(f"{flow.name}: {flow.port} is not a port number: give one between 1 and 65535")
         for port in (*ALWAYS_EXEMPT, *exempt):
             if (flow.protocol, flow.port) == (port.protocol, port.port):
                 raise UserError(
@@ -129,18 +129,18 @@ def check_flows(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()
         other = taken.setdefault((flow.protocol, flow.port, flow.end), flow)
         if other is not flow:
             raise UserError(
-                f"{flow.description} has the same packets as {other.description}: give one of the two another port"
+                f"{flow.description} selects the same packets as {other.description}: give one of them another port"
             )
     if len({flow.name for flow in flows}) < len(flows):
-        raise UserError("two flows have one name: name each once")
+        raise UserError("two flows have the same name: name each once")
 
 
-def bursts(impairment: Impairment) -> bool:
-    """Whether packets are lost in bursts."""
+def has_loss_bursts(impairment: Impairment) -> bool:
+    """Return whether packets are lost in bursts."""
     return impairment.loss > 0 and impairment.loss_burst_packets > 1
 
 
 def gilbert(impairment: Impairment) -> tuple[float, float]:
-    """Give the chances of a burst's begin and end at a packet that lead to a law's loss and mean burst."""
+    """Return the probabilities per packet that a burst begins and ends, for the impairment's loss and mean burst."""
     ends = 1 / impairment.loss_burst_packets
     return impairment.loss * ends / (1 - impairment.loss), ends
