@@ -98,7 +98,7 @@ def test_a_run_that_is_rejected_leaves_what_another_holds(tmp_path: Path) -> Non
     kernel.commands = ["tc qdisc add dev lo root"]
     owner = os.getppid(), start_ticks(os.getppid())
     StateFiles(tmp_path).write(AppliedState("lo", network_namespace(), boot_id(), owner, "L3", ()))
-    with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
+    with pytest.raises(UserError, match="L3 on lo"), kernel, run_by(kernel, "L1"):
         pass
     assert kernel.commands == ["tc qdisc add dev lo root"]
 
@@ -111,7 +111,7 @@ def test_what_was_not_done_as_requested_makes_a_run_invalid(tmp_path: Path) -> N
         kernel.more_ms = 3.0
         report = netem.report()
 
-    assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
+    assert "after the drive: video was delayed by 78.00 ms instead of 75 ms" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
     kernel.stopped = ["video: its correlated jitter has stopped"]
     assert netem_reasons(netem.report())[0].startswith("video: ")
