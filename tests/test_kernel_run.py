@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.kernel.lane.command import pytest_arguments, writable
+from tests.kernel.lane.command import pytest_arguments, writable_directories
 
 RUN = Path(__file__).parent / "kernel" / "run"
 
@@ -77,5 +77,5 @@ def test_the_machines_may_write_where_they_are_told_to(
     monkeypatch.delenv("LAVT_PROGRESS", raising=False)
     if told:
         monkeypatch.setenv("LAVT_PROGRESS", str(progress))
-    assert writable(None) == [progress.parent] * told
-    assert writable(tmp_path / "out") == [*[progress.parent] * told, tmp_path / "out"]
+    assert writable_directories(None) == [progress.parent] * told
+    assert writable_directories(tmp_path / "out") == [*[progress.parent] * told, tmp_path / "out"]

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from tests.field.by_wire import STOP_STALL_MS
 from tests.kernel.lane import clocks, host_stalls
-from tests.kernel.lane.host_stalls import AT_ONCE, HostProbe
-from tests.kernel.lane.verdicts import MEDIAN_SHARE, least_stall_ms, least_stop_ms, or_too_slow
+from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
+from tests.kernel.lane.verdicts import MEDIAN_SHARE, excuse_slow_machine, least_stall_ms, least_stop_ms
 from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, stalled_share
 from tests.test_stalls import QUIET, FakeProbe, stalls_of
 
@@ -31,8 +31,8 @@ FAIR_SERVER_MS = 60
 def counter(monkeypatch: pytest.MonkeyPatch) -> None:
     """The counter is another at each reading, and no machine is needed that has one."""
     monkeypatch.setattr(clocks, "counter_hz", lambda: COUNTER_HZ)
-    monkeypatch.setattr(clocks, "monotonic_reading", lambda: HERE)
-    monkeypatch.setattr(host_stalls, "ASK_S", 1000)
+    monkeypatch.setattr(clocks, "read_monotonic_clock", lambda: HERE)
+    monkeypatch.setattr(host_stalls, "POLL_S", 1000)
 
 
 def told(*stalls: tuple[int, int, int], more: bool = False) -> dict[str, Any]:
@@ -100,12 +100,12 @@ def test_the_hosts_share_of_idle_time_counts() -> None:
 
 def test_an_answer_is_short() -> None:
     """An answer has at most 40 stalls and says that there are more; the next one goes on, and none is told twice."""
-    recorded = [Stall(0, number, number + 1) for number in range(AT_ONCE + 1)]
+    recorded = [Stall(0, number, number + 1) for number in range(STALLS_PER_ANSWER + 1)]
     stalls = Stalls([FakeProbe([(0, []), (0, recorded)])], lambda: QUIET)
-    first, second = (host_stalls._answer(stalls) for _ in range(2))
-    assert (len(first["stalls"]), first["more"]) == (AT_ONCE, True)
+    first, second = (host_stalls._query(stalls) for _ in range(2))
+    assert (len(first["stalls"]), first["more"]) == (STALLS_PER_ANSWER, True)
     assert (len(second["stalls"]), second["more"]) == (1, False)
-    longest = told(*((1, 10**18, 10**18) for _ in range(AT_ONCE)))
+    longest = told(*((1, 10**18, 10**18) for _ in range(STALLS_PER_ANSWER)))
     assert len(json.dumps(longest)) < 3900
 
 
@@ -142,11 +142,11 @@ def test_a_machine_that_uses_up_its_processor_is_not_too_slow_by_that() -> None:
     """What the kernel gives ordinary programs then stops no command for 300 ms, and is too small a share."""
     assert STOP_STALL_MS > FAIR_SERVER_MS
     own = stalls_of(*(Stall(0, at_s * NS_PER_S, at_s * NS_PER_S + FAIR_SERVER_MS * NS_PER_MS) for at_s in range(10)))
-    assert isinstance(or_too_slow(AssertionError(), own, 0, 10 * NS_PER_S), AssertionError)
+    assert isinstance(excuse_slow_machine(AssertionError(), own, 0, 10 * NS_PER_S), AssertionError)
     assert stalled_share(own.recorded, 0, 10 * NS_PER_S) < MEDIAN_SHARE
 
 
 def test_many_short_stalls_make_a_machine_too_slow() -> None:
     """A drive of which 15 % was stalled, 3 ms at a time, is run again."""
     many = stalls_of(*(Stall(0, at * 20 * NS_PER_MS, (at * 20 + 3) * NS_PER_MS) for at in range(50)))
-    assert isinstance(or_too_slow(AssertionError(), many, 0, NS_PER_S), HostStalled)
+    assert isinstance(excuse_slow_machine(AssertionError(), many, 0, NS_PER_S), HostStalled)

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.kernel.lane.chrony import SERVING, following
+from tests.kernel.lane.chrony import SERVE_OWN_CLOCK, follow_server
 from tests.require import need
 from typer.testing import CliRunner
 
@@ -86,9 +86,9 @@ def test_who_drives_is_started_by_a_person() -> None:
 
 def test_chrony_is_told_what_was_measured() -> None:
     """The lines for chrony are those with which the tests on a real kernel measure, but for the addresses."""
-    serve, allow = SERVING
+    serve, allow = SERVE_OWN_CLOCK
     assert lines(DEPLOY / "chrony/vehicle.conf") == [serve, f"{allow} 192.0.2.0/24"]
-    assert lines(DEPLOY / "chrony/operator.conf") == [following("192.0.2.7").replace(" port 123", "")]
+    assert lines(DEPLOY / "chrony/operator.conf") == [follow_server("192.0.2.7").replace(" port 123", "")]
 
 
 def test_the_documentation_names_what_exists() -> None:

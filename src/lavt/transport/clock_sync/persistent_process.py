@@ -116,7 +116,7 @@ class Shell(PersistentProcess):
     program = ("/bin/sh",)
     niceness = 10
     """The start of a program must not delay the processes that drive."""
-    END: Final = "lavt: parse_answer with"
+    END: Final = "lavt: ended with"
     """Prefix of the line after a program's output."""
 
     def encode(self, command: Sequence[str]) -> str:
