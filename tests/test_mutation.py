@@ -27,9 +27,7 @@ def sites() -> dict[str, list[Site]]:
 
 def mutated(source: str, operator: str) -> list[str]:
     """Return every source that an operator's mutations produce."""
-    return [
-        each.applied_to(source) for site in find_sites("a.py", source) for each in site if each.operator == operator
-    ]
+    return [each.apply_to(source) for site in find_sites("a.py", source) for each in site if each.operator == operator]
 
 
 def body(*lines: str) -> str:
@@ -100,7 +98,7 @@ def test_line_count_is_kept() -> None:
     source = body("a = g(", "    b,", "    c,", ")", "return (", "    a", "    + b", ")")
     for site in find_sites("a.py", source):
         for each in site:
-            results_made = each.applied_to(source)
+            results_made = each.apply_to(source)
             compile(results_made, "a.py", "exec")
             assert results_made.count("\n") == source.count("\n")
     assert mutated(source, "statement")[0].split("\n")[1:6] == ["    pass", "", "", "", "    return ("]
@@ -142,7 +140,7 @@ def test_sampled_mutants_compile(sites: dict[str, list[Site]]) -> None:
     """Every sampled mutant compiles and differs from the source."""
     for each in mutation.sample(sites, 1, 40):
         source = (REPOSITORY / "src" / "lavt" / each.module).read_text()
-        compile(each.applied_to(source), each.module, "exec")
+        compile(each.apply_to(source), each.module, "exec")
         assert each.line != each.mutated
 
 
@@ -206,7 +204,7 @@ def test_accepted_survivors_match_the_sources(tmp_path: Path, sites: dict[str, l
 def test_invalid_arguments_are_rejected(arguments: list[str]) -> None:
     """Invalid arguments exit with code 2."""
     with pytest.raises(SystemExit) as exited:
-        mutation.arguments(arguments)
+        mutation.parse_arguments(arguments)
     assert exited.value.code == 2
 
 
