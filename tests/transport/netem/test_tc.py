@@ -62,14 +62,24 @@ from lavt.transport.netem.tc import (
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150))
 CONTROL = ImpairedFlow("control", "udp", 7448, "destination", Impairment(75))
 
-QDISCS = json.dumps([
-    {"kind": "prio", "handle": "4c56:", "root": True, "options": {"bands": 6}, "qlen": 0},
-    {
-        "kind": "netem", "handle": "4c01:", "parent": "4c56:4", "qlen": 7,
-        "options": {"limit": 10000, "delay": {"delay": 0.15, "jitter": 0, "correlation": 0},
-                    "rate": {"rate": 1250000000}, "ecn": False, "gap": 0},
-    },
-])  # fmt: skip
+QDISCS = json.dumps(
+    [
+        {"kind": "prio", "handle": "4c56:", "root": True, "options": {"bands": 6}, "qlen": 0},
+        {
+            "kind": "netem",
+            "handle": "4c01:",
+            "parent": "4c56:4",
+            "qlen": 7,
+            "options": {
+                "limit": 10000,
+                "delay": {"delay": 0.15, "jitter": 0, "correlation": 0},
+                "rate": {"rate": 1250000000},
+                "ecn": False,
+                "gap": 0,
+            },
+        },
+    ]
+)
 FREE = '[{"kind":"noqueue","handle":"0:","root":true,"refcnt":2,"options":{}}]'
 FILTERS = """filter protocol ip pref 1 u32 chain 0
 filter protocol ip pref 1 u32 chain 0 fh 800: ht divisor 1
