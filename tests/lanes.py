@@ -92,7 +92,7 @@ def main() -> int:
     known = [lane.name for lane in (*LANES, FULL)]
     if unknown := [name for name in names if name not in known]:
         parser.error(f"there is no lane {unknown[0]!r}: name some of {', '.join(known)}")
-    return run_lanes(select_lanes(names), tell=write)
+    return run_lanes(select_lanes(names), write=write)
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def shell(script: str) -> tuple[str, ...]:
 
 def run(*lanes: Lane) -> tuple[int, str]:
     output: list[str] = []
-    return run_lanes(lanes, tell=output.append), "".join(output)
+    return run_lanes(lanes, write=output.append), "".join(output)
 
 
 def test_runner_adds_up_the_lanes() -> None:
