@@ -36,7 +36,7 @@ TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class DegradedCase:
     """A picture and its ground truth."""
 
     kind: str
@@ -284,7 +284,7 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
     return np.asarray(np.interp(AHEAD_M, ahead, left), dtype=np.float64)
 
 
-def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[Case]:
+def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[DegradedCase]:
     """Yield `count` pictures of every kind from random places of random routes, reproducible by the seed."""
     kinds: list[tuple[str, str, Degrade | None]] = [(kind, kind, None) for kind in ROADS]
     kinds += [(kind, "as it is", paint) for kind, paint in PAINT.items()]
@@ -306,4 +306,4 @@ def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> It
                 picture = degrade(picture, generator)
             has_no_lane = kind in NO_LANE
             centre_m = None if has_no_lane else _truth(road, s_m, offset_m, turned_rad)
-            yield Case(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])
+            yield DegradedCase(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])

@@ -62,7 +62,7 @@ def sample(sites: Mapping[str, Sequence[Site]], seed: int, count: int) -> list[M
     return [all_sites[index][int(choices[index]) % len(all_sites[index])] for index in order[:count]]
 
 
-class Runner:
+class MutantRunner:
     """A runner of mutants in several trees in parallel."""
 
     def __init__(self, directory: Path, jobs: int, factor: float) -> None:
@@ -157,7 +157,7 @@ def measure(options: argparse.Namespace, log: Callable[[str], None]) -> str:
     if options.list:
         return "\n".join(map(describe, selected))
     with TemporaryDirectory(prefix="lavt_mutation_") as directory:
-        runner = Runner(Path(directory), min(options.jobs, max(1, len(todo))), options.timeout_factor)
+        runner = MutantRunner(Path(directory), min(options.jobs, max(1, len(todo))), options.timeout_factor)
         for number, result in enumerate(runner.run(todo), start=1):
             results[result.key] = result
             if options.out:

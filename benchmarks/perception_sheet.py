@@ -19,7 +19,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from benchmarks.degraded import AHEAD_M, MODEL, NO_LANE, Case, cases
+from benchmarks.degraded import AHEAD_M, MODEL, NO_LANE, DegradedCase, cases
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.domain import FloatArray, Lane, Picture
@@ -55,14 +55,14 @@ class LaneVerdict:
         return self.confidence >= LANE_CONFIDENCE
 
 
-def check_lane(case: Case, lane: Lane) -> LaneVerdict:
+def check_lane(case: DegradedCase, lane: Lane) -> LaneVerdict:
     """Compare a lane with the truth."""
     if case.centre_m is None:
         return LaneVerdict(case.kind, lane.confidence, np.full(len(AHEAD_M), np.inf))
     return LaneVerdict(case.kind, lane.confidence, np.abs(np.polyval(lane.centre[::-1], AHEAD_M) - case.centre_m))
 
 
-def check_case(case: Case) -> tuple[LaneVerdict, LaneVerdict]:
+def check_case(case: DegradedCase) -> tuple[LaneVerdict, LaneVerdict]:
     """Return the verdicts on a picture for a searching and a following detector."""
     searching, following = LaneDetector(MODEL), LaneDetector(MODEL)
     following.detect(case.before)
@@ -126,7 +126,7 @@ def cost_ms(pictures: Iterable[Picture]) -> tuple[float, float]:
     return 1e3 * float(np.median(spent[0])), 1e3 * float(np.median(spent[1]))
 
 
-def draw_sheet(sheet_cases: Iterable[Case]) -> Picture:
+def draw_sheet(sheet_cases: Iterable[DegradedCase]) -> Picture:
     """Draw all steps for a picture of each kind, one below the other with titles."""
     rows = []
     for case in sheet_cases:
@@ -147,7 +147,7 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     verdicts, undamaged = [], []
-    first: dict[str, Case] = {}
+    first: dict[str, DegradedCase] = {}
     for case in cases(arguments.count, routes=tuple(arguments.routes)):
         verdicts.append(check_case(case))
         first.setdefault(case.kind, case)

@@ -26,14 +26,14 @@ SLOWEST = ("--durations=12", "--durations-min=5")
 
 
 @dataclass(frozen=True)
-class Lane:
+class LaneSpec:
     """A lane: one or more commands that must pass."""
 
     name: str
     commands: tuple[tuple[str, ...], ...]
     limit_min: float
     """A lane that takes longer is killed and has failed."""
-    meanwhile: Lane | None = None
+    meanwhile: LaneSpec | None = None
     """A lane that runs at the same time, at the lowest priority."""
 
 
@@ -47,15 +47,15 @@ def program(name: str, *arguments: str) -> tuple[str, ...]:
     return (str(Path(sys.executable).with_name(name)), *arguments)
 
 
-FULL = Lane("full", (pytest("-m", "full"),), 40)
+FULL = LaneSpec("full", (pytest("-m", "full"),), 40)
 LINTERS = (program("ruff", "check"), program("ruff", "format", "--check"), program("mypy"), program("lint-imports"))
 LANES = (
-    Lane("linters", LINTERS, 10),
-    Lane("quick", (pytest(),), 15),
-    Lane("interop", (pytest("tests/interop"),), 5),
-    Lane("realtime", (pytest("-m", "realtime"),), 20),
-    Lane("field", (pytest("tests/field"),), 20),
-    Lane("kernel", ((sys.executable, "tests/kernel/run", *SLOWEST),), 25, meanwhile=FULL),
+    LaneSpec("linters", LINTERS, 10),
+    LaneSpec("quick", (pytest(),), 15),
+    LaneSpec("interop", (pytest("tests/interop"),), 5),
+    LaneSpec("realtime", (pytest("-m", "realtime"),), 20),
+    LaneSpec("field", (pytest("tests/field"),), 20),
+    LaneSpec("kernel", ((sys.executable, "tests/kernel/run", *SLOWEST),), 25, meanwhile=FULL),
 )
 
 
@@ -76,7 +76,7 @@ def write(text: str) -> None:
     sys.stdout.flush()
 
 
-def select_lanes(names: Sequence[str]) -> list[Lane]:
+def select_lanes(names: Sequence[str]) -> list[LaneSpec]:
     """Return the named lanes, to run sequentially in this order, or all lanes without names."""
     lanes = {lane.name: replace(lane, meanwhile=None) for lane in (*LANES, FULL)}
     return [lanes[name] for name in names] if names else list(LANES)

@@ -11,8 +11,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from tests.lanes import FOLDERS, FULL, LANES, QUICK, REPOSITORY, TESTS, Lane, runs_in_parallel, select_lanes
-from tests.support.lane_runner import Outcome, closing_line, counts_of, run_lanes, table
+from tests.lanes import FOLDERS, FULL, LANES, QUICK, REPOSITORY, TESTS, LaneSpec, runs_in_parallel, select_lanes
+from tests.support.lane_runner import LaneOutcome, closing_line, counts_of, run_lanes, table
 
 OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
@@ -122,7 +122,7 @@ def shell(script: str) -> tuple[str, ...]:
     return ("sh", "-c", script)
 
 
-def run(*lanes: Lane) -> tuple[int, str]:
+def run(*lanes: LaneSpec) -> tuple[int, str]:
     output: list[str] = []
     return run_lanes(lanes, write=output.append), "".join(output)
 
@@ -130,12 +130,12 @@ def run(*lanes: Lane) -> tuple[int, str]:
 def test_runner_adds_up_the_lanes() -> None:
     """If all lanes pass, the exit code is 0, their outputs appear in order, and the last line has the totals."""
     code, output = run(
-        Lane("quick", (shell("echo one; echo '== 2 passed, 1 skipped, 3 deselected in 1.20s =='"),), 1),
-        Lane(
+        LaneSpec("quick", (shell("echo one; echo '== 2 passed, 1 skipped, 3 deselected in 1.20s =='"),), 1),
+        LaneSpec(
             "kernel",
             (shell("sleep 0.3; echo '== 3 passed, 1 rerun in 62.10s (0:01:02) =='"),),
             1,
-            meanwhile=Lane("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),
+            meanwhile=LaneSpec("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),
         ),
     )
     assert code == 0
@@ -150,8 +150,8 @@ def test_runner_adds_up_the_lanes() -> None:
 @pytest.mark.parametrize("meanwhile", [False, True])
 def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
     """A lane's exit code decides whether it fails; the other lanes still run, and the table shows it."""
-    bad = Lane("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
-    good = Lane("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
+    bad = LaneSpec("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
+    good = LaneSpec("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
     code, output = run(*([good] if meanwhile else [bad, good]))
     assert code == 1
     assert "ended with 3" in output
@@ -161,8 +161,8 @@ def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
 def test_lane_is_killed_at_its_time_limit() -> None:
     """A lane that exceeds its time limit is killed with its children, and the message names the running test."""
     script = "import os, pathlib, time; pathlib.Path(os.environ['LAVT_PROGRESS']).write_text('test_a'); time.sleep(600)"
-    hangs = Lane("hangs", ((sys.executable, "-c", script), shell("echo never")), 1 / 60)
-    code, output = run(hangs, Lane("next", (shell("echo came"),), 1))
+    hangs = LaneSpec("hangs", ((sys.executable, "-c", script), shell("echo never")), 1 / 60)
+    code, output = run(hangs, LaneSpec("next", (shell("echo came"),), 1))
     assert code == 1
     assert "took longer than 0.0166667 min, and was at: test_a" in output
     assert "never" not in output
@@ -196,7 +196,10 @@ def test_counts_are_parsed_from_pytest_output() -> None:
 
 def test_table_lists_lanes_and_failures() -> None:
     """The table has a line with time and counts for each lane, followed by the reasons of failures."""
-    outcomes = [Outcome("quick", 61.2, Counter(passed=5, rerun=1)), Outcome("field", 5, Counter(failed=1), ["reason"])]
+    outcomes = [
+        LaneOutcome("quick", 61.2, Counter(passed=5, rerun=1)),
+        LaneOutcome("field", 5, Counter(failed=1), ["reason"]),
+    ]
     lines = table(outcomes).splitlines()
     assert lines[1].split() == ["quick", "1:01", "5", "0", "0", "0", "1", "0"]
     assert lines[2].split()[-1] == "FAILED"

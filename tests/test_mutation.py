@@ -267,7 +267,7 @@ def test_area_tests_run_after_module_tests_pass(fake_tree: type[FakeTree], tmp_p
     mutations = mutation.sites_of(["transport/rtp/adaptive_hold.py"])["transport/rtp/adaptive_hold.py"][0][:1]
     for passing_tests, expected in ((set(), [own]), ({*own}, [own, rest]), ({*own, *rest}, [own, rest])):
         fake_tree.passing_tests, fake_tree.mutated_runs = passing_tests, []
-        (result,) = mutation.Runner(tmp_path, jobs, 10.0).run(mutations)
+        (result,) = mutation.MutantRunner(tmp_path, jobs, 10.0).run(mutations)
         assert fake_tree.mutated_runs == expected
         assert result.caught == (passing_tests != {*own, *rest})
 

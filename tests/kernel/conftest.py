@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from tests.kernel.lane import clocks, netem
-from tests.kernel.lane.driving import Drive, LoopPrograms, collect, start_loop, wait_for_end
+from tests.kernel.lane.driving import DriveResult, LoopPrograms, collect, start_loop, wait_for_end
 from tests.kernel.lane.guests import SERIAL_LINE
 from tests.kernel.lane.host_stalls import HostProbe
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine
@@ -100,7 +100,9 @@ def offset_ns(server: Machine, client: Machine) -> int:
 
 
 @pytest.fixture
-def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path, stalls: Stalls) -> Callable[..., Drive]:
+def drive(
+    server_machine: Machine, client_machine: Machine, tmp_path: Path, stalls: Stalls
+) -> Callable[..., DriveResult]:
     """Return a function that drives over both machines, from starting the four programs to the result.
 
     The drive must be valid, except for a reason that begins with `expected_reason`.
@@ -113,7 +115,7 @@ def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path, stal
         client: tuple[str, ...] = (),
         expected_reason: str | None = None,
         meanwhile: Callable[[LoopPrograms], None] = lambda _: None,
-    ) -> Drive:
+    ) -> DriveResult:
         out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
         loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
         wait_for_end(loop, meanwhile)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.kernel.lane import clocks, ntp_server
 from tests.kernel.lane.chrony import SERVE_OWN_CLOCK, correction_s, follow_server, start_chronyd, wait_synchronised
-from tests.kernel.lane.driving import Drive
+from tests.kernel.lane.driving import DriveResult
 from tests.kernel.lane.machine import Machine, MachineError
 from tests.kernel.lane.netem import netem_on_all
 from tests.kernel.lane.verdicts import MEDIAN_SHARE, require_completed
@@ -152,7 +152,7 @@ def test_chrony_measures_the_offset_of_a_slewed_clock(
 
 
 def test_drive_over_both_machines_completes(
-    server_machine: Machine, client_machine: Machine, drive: Callable[..., Drive], stalls: Stalls
+    server_machine: Machine, client_machine: Machine, drive: Callable[..., DriveResult], stalls: Stalls
 ) -> None:
     """With the server's clock 250 ms ahead, a short road is completed, and the loop's parts add up within 1 ms."""
     server_machine.call(clocks.step, 250 * NS_PER_MS)

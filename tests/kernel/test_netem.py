@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, median, quantiles
@@ -26,6 +25,7 @@ from tests.kernel.namespaces import (
     inside,
     send_flows,
 )
+from tests.support.command_line import CommandResult
 from tests.support.stalls import Stalls
 
 from lavt.assembly.injection import Role, netem_flows
@@ -360,15 +360,6 @@ def test_scripts_and_command_have_the_same_effect(
 
     assert by_script == tc_output()
     assert cleared == free
-
-
-@dataclass(frozen=True)
-class CommandResult:
-    """Exit code and output of a command."""
-
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.kernel.lane import clocks
 from tests.kernel.lane.chrony import SERVE_OWN_CLOCK, correction_s, follow_server, start_chronyd, wait_synchronised
-from tests.kernel.lane.driving import REPOSITORY, Drive, LoopPrograms, reasons_against, start_loop
+from tests.kernel.lane.driving import REPOSITORY, DriveResult, LoopPrograms, reasons_against, start_loop
 from tests.kernel.lane.machine import Machine, wait_until
 from tests.kernel.lane.netem import netem_on_ntp
 from tests.kernel.lane.verdicts import MEDIAN_SHARE, changes_of_safety, require_completed, require_never_degraded
@@ -23,7 +23,7 @@ from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray
 
 pytestmark = pytest.mark.timeout(1800)
 
-DriveOnce = Callable[..., Drive]
+DriveOnce = Callable[..., DriveResult]
 TrueOffset = Callable[[], int]
 ReportFigure = Callable[[str], None]
 NTP_PORT = 11123
@@ -56,7 +56,7 @@ class OffsetTruth:
         self.offsets_ns.append(self.true_offset_ns())
         self.client_wall_ns.append(self.client.call(clocks.read_wall_clock)[1])
 
-    def check_drive(self, drive: Drive) -> None:
+    def check_drive(self, drive: DriveResult) -> None:
         """Require that Delta is within its bound and 1 ms of the truth at each sample, and the bound 2 ms or less."""
         drive_clocks = drive.measured.clocks
         assert drive_clocks.offset is not None
@@ -91,7 +91,7 @@ def chrony(server_machine: Machine, client_machine: Machine) -> None:
     wait_synchronised(client_machine, updates=10)
 
 
-def summary(drive: Drive) -> str:
+def summary(drive: DriveResult) -> str:
     """Return the measurements of a drive in one line."""
     result = drive.result
     tau_v, tau_c, loop, delta = (result[key] for key in ("tau_v_ms", "tau_c_ms", "loop_ms", "delta"))

@@ -21,7 +21,7 @@ JUDGES_TIMES = "judges_times"
 
 
 @dataclass
-class Session:
+class SessionState:
     """The state of this session's verdicts."""
 
     stalls: Stalls | None = None
@@ -29,7 +29,7 @@ class Session:
     messages: list[str] = field(default_factory=list)
 
 
-SESSION = pytest.StashKey[Session]()
+SESSION = pytest.StashKey[SessionState]()
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +42,7 @@ def stalls(request: pytest.FixtureRequest) -> Stalls:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Create the session's state."""
-    config.stash[SESSION] = Session()
+    config.stash[SESSION] = SessionState()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

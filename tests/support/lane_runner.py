@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.lanes import REPOSITORY, Lane
+from tests.lanes import REPOSITORY, LaneSpec
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -39,7 +39,7 @@ def counts_of(output: str) -> Counter[str]:
 
 
 @dataclass
-class Outcome:
+class LaneOutcome:
     """The result of a lane."""
 
     name: str
@@ -52,7 +52,7 @@ class Outcome:
 class RunningLane:
     """The commands of a lane, run sequentially, with their output in a file."""
 
-    def __init__(self, lane: Lane, folder: Path, *, niceness: int = 0) -> None:
+    def __init__(self, lane: LaneSpec, folder: Path, *, niceness: int = 0) -> None:
         self.lane = lane
         self._niceness = niceness
         self._left = list(lane.commands)
@@ -125,18 +125,18 @@ class RunningLane:
         self._written_bytes += len(chunk)
         return chunk.decode(errors="replace")
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> LaneOutcome:
         """Return the result."""
         counts = counts_of(self._output.read_text(errors="replace"))
-        return Outcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
+        return LaneOutcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
 
 
-def run_lanes(lanes: Sequence[Lane], *, write: Write) -> int:
+def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
     """Run lanes in their order; return 0 if all passed, else 1.
 
     The output of a lane that runs meanwhile is written after the other's.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[LaneOutcome] = []
     began_ns = MachineClock().now().mono_ns
     with TemporaryDirectory(prefix="lavt-lanes-") as folder:
         for lane in lanes:
@@ -168,7 +168,7 @@ def _run_together(running: Sequence[RunningLane], write: Write) -> None:
         write(each.new_output())
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
+def table(outcomes: Sequence[LaneOutcome]) -> str:
     """Return a table with one line per lane, followed by the reasons of failures."""
     lines = [f"{'lane':<10}{'time':>8}" + "".join(f"{word:>{len(word) + 3}}" for word in COUNTED)]
     for each in outcomes:
@@ -179,7 +179,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def closing_line(outcomes: Sequence[Outcome], took_s: float) -> str:
+def closing_line(outcomes: Sequence[LaneOutcome], took_s: float) -> str:
     """Return the totals in pytest's format; a lane that failed without a failed test counts as one failure."""
     total = sum((each.counts for each in outcomes), Counter[str]())
     failed = (

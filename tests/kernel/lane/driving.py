@@ -38,7 +38,7 @@ class LoopPrograms:
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveResult:
     """A finished drive: its run directory with both records, and the results."""
 
     out: Path
@@ -126,7 +126,7 @@ def wait_for_end(loop: LoopPrograms, meanwhile: Callable[[LoopPrograms], None]) 
     wait_until(f"the drive has ended: {loop.server.command}", ended, DRIVE_TIMEOUT_S, every_ns=500_000_000)
 
 
-def collect(loop: LoopPrograms, client: Machine, out: Path) -> Drive:
+def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     """Stop the programs in order, join the records, and compute the result."""
     for each in reversed(loop.all()):
         each.stop()
@@ -136,10 +136,10 @@ def collect(loop: LoopPrograms, client: Machine, out: Path) -> Drive:
     run = out / "run"
     result = join(out / "server", out / "client", run)
     server_record, client_record = read_record(run / "server.mcap"), read_record(run / "client.mcap")
-    return Drive(run, server_record, client_record, measure(server_record, client_record), result)
+    return DriveResult(run, server_record, client_record, measure(server_record, client_record), result)
 
 
-def reasons_against(finished_drive: Drive) -> list[str]:
+def reasons_against(finished_drive: DriveResult) -> list[str]:
     """Return the reasons against a drive, without those of a slow machine: a user-mode kernel has one processor."""
     slow = ("the physics was", "the camera missed")
     return [reason for reason in finished_drive.result["invalid_reasons"] if not reason.startswith(slow)]

@@ -12,7 +12,7 @@ import math
 import re
 
 from tests.field.by_wire import KIT_MS, STOP_BEFORE_MS, STOP_STALL_MS
-from tests.kernel.lane.driving import Drive, reasons_against
+from tests.kernel.lane.driving import DriveResult, reasons_against
 from tests.support.stalls import HostStalled, Stalls, described, stalled_share
 
 from lavt.domain import NS_PER_MS
@@ -38,7 +38,7 @@ drives as usual (`docs/by_wire.md`)."""
 REPORTS = re.compile(r"Report\w* for (\d+) ms")
 
 
-def require_valid(drive: Drive, stalls: Stalls, expected_reason: str | None = None) -> None:
+def require_valid(drive: DriveResult, stalls: Stalls, expected_reason: str | None = None) -> None:
     """Require that a drive is valid, except for the reason that the test expects."""
     reasons = [
         each for each in reasons_against(drive) if expected_reason is None or not each.startswith(expected_reason)
@@ -54,19 +54,19 @@ def least_stall_ms(reason: str) -> float:
     return next((least_ms for begin, least_ms in STALL_MS.items() if reason.startswith(begin)), math.inf)
 
 
-def require_completed(drive: Drive, stalls: Stalls) -> None:
+def require_completed(drive: DriveResult, stalls: Stalls) -> None:
     """Require that the route was driven to its end; a stall can only explain a safe stop before."""
     if drive.result["ending"] != "completed":
         raise explain_state(drive, stalls, "safe_stop", f"{drive.result['ending']}: {changes_of_safety(drive)}")
 
 
-def require_never_degraded(drive: Drive, stalls: Stalls) -> None:
+def require_never_degraded(drive: DriveResult, stalls: Stalls) -> None:
     """Require that commands arrived in time during the whole drive."""
     if any("-> degraded" in each for each in changes_of_safety(drive)):
         raise explain_state(drive, stalls, "degraded", str(changes_of_safety(drive)))
 
 
-def explain_state(drive: Drive, stalls: Stalls, state: str, message: str) -> Exception:
+def explain_state(drive: DriveResult, stalls: Stalls, state: str, message: str) -> Exception:
     """Return the exception for a safety state that was entered because of a timeout."""
     changes = [(at_ns, detail) for at_ns, detail in _safety(drive) if f"-> {state}" in detail]
     if not changes:
@@ -95,12 +95,12 @@ def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until
     return AssertionError(message) if share < SLOW_SHARE else HostStalled(message)
 
 
-def changes_of_safety(drive: Drive) -> list[str]:
+def changes_of_safety(drive: DriveResult) -> list[str]:
     """Return the changes of the safety state in order."""
     return [detail for _, detail in _safety(drive)]
 
 
-def _safety(drive: Drive) -> list[tuple[int, str]]:
+def _safety(drive: DriveResult) -> list[tuple[int, str]]:
     events = drive.server.table("event")
     rows = zip(events.texts("kind"), events.ints("mono_ns").tolist(), events.texts("detail"), strict=True)
     return [(at_ns, detail) for kind, at_ns, detail in rows if kind == "safety"]
