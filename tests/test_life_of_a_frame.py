@@ -10,7 +10,7 @@ from lavt.perception.lane_detector import LaneDetector
 from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.messages import decode, encode
 from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
@@ -91,7 +91,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one frame, from end to end
     assert max(map(len, packets)) <= MAX_PACKET_BYTES
 
     # 5. The packets cross the network: all packets of a frame have the same delay, and keep their order.
-    video = DelayLine(DelayLaw(VIDEO_DELAY_MS))
+    video = DelayLine(DelayModel(VIDEO_DELAY_MS))
     now_ns = START_NS + 75 * NS_PER_MS
     assert {video.push(packet, START_NS, index=0) for packet in packets} == {now_ns}
     assert video.pop_due(now_ns - 1) == []
@@ -145,7 +145,7 @@ def test_life_of_a_frame() -> None:  # noqa: PLR0915 (one frame, from end to end
     )
 
     # 11. The command crosses the network as bytes, which are checked when they are decoded.
-    control = DelayLine(DelayLaw(CONTROL_DELAY_MS))
+    control = DelayLine(DelayModel(CONTROL_DELAY_MS))
     assert control.push(encode(command), now_ns, index=0) == now_ns + 20 * NS_PER_MS
     now_ns += 20 * NS_PER_MS
     (datagram,) = control.pop_due(now_ns)

@@ -1,4 +1,4 @@
-"""The modules that are mutated, and the tests that are about them."""
+"""The modules to mutate, and their tests."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
     f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "assembly/test_assembly_by_wire.py"),
 }
-"""Path below `src/lavt` to paths below `tests`, the most special ones first."""
+"""Path below `src/lavt` to paths below `tests`, the most specific ones first."""
 
 AREAS: Final[dict[str, tuple[str, ...]]] = {
     "safety": ("safety", "nodes", "test_life_of_a_frame.py"),
@@ -113,24 +113,24 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
         "experiment/report",
         "experiment/runs/test_join.py",
         "experiment/runs/test_plan.py",
-    ),  # those that make up records; the others drive
+    ),  # the tests that analyse records; the others drive
     _DBW: (_DBW, "assembly/test_assembly_by_wire.py"),
 }
-"""Folder of a module, or one above it, to the wider tests: they are run for what its own tests let pass."""
+"""Folder of a module to the wider tests, which run if the module's own tests pass."""
 
 
 def own_tests(module: str) -> tuple[str, ...]:
-    """Return the paths of the tests about a module, from the repository's top."""
+    """Return the paths of a module's own tests, from the repository's top."""
     return tuple(f"tests/{path}" for path in MODULES[module])
 
 
 def area_of(module: str) -> tuple[str, ...]:
-    """Return the paths of the wider tests around a module, from the repository's top."""
+    """Return the paths of the tests of a module's area, from the repository's top."""
     folder = next(folder for folder in sorted(AREAS, key=len, reverse=True) if module.startswith(f"{folder}/"))
     return tuple(f"tests/{path}" for path in AREAS[folder])
 
 
 def rest_of_area(module: str) -> tuple[str, ...]:
-    """Return pytest's arguments for the wider tests without those about the module itself."""
+    """Return pytest's arguments for the tests of the area without the module's own."""
     own = own_tests(module)
     return *(path for path in area_of(module) if path not in own), *(f"--ignore={path}" for path in own)

@@ -66,7 +66,7 @@ class PacketImpairment:
         """Return the further delay of the next packet; None: it is lost."""
         number = self._number
         self._number += 1
-        lost = self._losses.takes(number)
+        lost = self._losses.is_lost(number)
         return None if lost else round(self._jitter.at(number) * self._jitter_ns)
 
 

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.kernel.lane.chrony import SERVING, following
+from tests.kernel.lane.chrony import SERVE_OWN_CLOCK, follow_server
 from tests.require import need
 from typer.testing import CliRunner
 
@@ -88,9 +88,9 @@ def test_the_client_is_started_by_a_person() -> None:
 
 def test_chrony_config_is_the_measured_one() -> None:
     """The lines for chrony are those of the tests on a real kernel, except for the addresses."""
-    serve, allow = SERVING
+    serve, allow = SERVE_OWN_CLOCK
     assert lines(DEPLOY / "chrony/vehicle.conf") == [serve, f"{allow} 192.0.2.0/24"]
-    assert lines(DEPLOY / "chrony/operator.conf") == [following("192.0.2.7").replace(" port 123", "")]
+    assert lines(DEPLOY / "chrony/operator.conf") == [follow_server("192.0.2.7").replace(" port 123", "")]
 
 
 def test_the_documentation_names_existing_commands_and_files() -> None:

@@ -20,7 +20,7 @@ class Kernel(NetemInterface):
     """
 
     def __init__(self, directory: Path, *, delayed: bool) -> None:
-        super().__init__("eth0", directory=directory, run=self.run_tc, stays=True)
+        super().__init__("eth0", directory=directory, run=self.run_tc, persistent=True)
         self.commands = ["tc qdisc add dev eth0 root"] if delayed else list[str]()
         self.is_delayed = delayed
         self.rejects: Callable[[str], bool] = lambda _line: False

@@ -65,7 +65,7 @@ def test_a_condition_is_granted_when_in_force() -> None:
 def test_a_state_delay_applies_to_the_router() -> None:
     """A state delay applies to the packets from the router's listening port."""
     [send] = request(server(), replace(L4, state_delay_ms=150.0))
-    assert send.payload.flows == (VIDEO, replace(STATE, law=Impairment(150.0)))
+    assert send.payload.flows == (VIDEO, replace(STATE, impairment=Impairment(150.0)))
 
 
 def test_a_repeated_request_renews_the_lease() -> None:
@@ -93,7 +93,7 @@ def test_an_expired_lease_clears_the_queues() -> None:
 def test_a_condition_is_changed_live() -> None:
     """A changed condition is applied without clearing the queues in between."""
     [send] = request(in_force(), replace(L4, condition="L5", delay_ms=225.0), NS_PER_S)
-    assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, law=Impairment(225.0)), STATE)))
+    assert send == Send("inject", InjectionOrder(2, "L5", (replace(VIDEO, impairment=Impairment(225.0)), STATE)))
 
 
 def test_a_condition_in_force_is_measured_periodically() -> None:
@@ -218,7 +218,7 @@ def test_garbage_is_counted() -> None:
 
 def new_client(control: ImpairedFlow = CONTROL) -> InjectionClient:
     return InjectionClient(
-        "alice", 7, condition="L4", control=control, video=VIDEO.law, state_delay_ms=0.0, start_ns=at(0).mono_ns
+        "alice", 7, condition="L4", control=control, video=VIDEO.impairment, state_delay_ms=0.0, start_ns=at(0).mono_ns
     )
 
 

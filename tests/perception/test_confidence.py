@@ -7,7 +7,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 from benchmarks.degraded import MODEL, NO_LANE, blocks, cases
-from benchmarks.perception_sheet import UNDECIDED, Judged, kinds_table, look, reliability_table
+from benchmarks.perception_sheet import UNDECIDED, LaneVerdict, check_case, kinds_table, reliability_table
 
 from lavt.control.lane_watch import LANE_CONFIDENCE
 from lavt.perception.lane_detector import TRACK_CONFIDENCE, LaneDetector
@@ -27,7 +27,7 @@ CLEAN = (
 )
 HALF = ("left line missing", "right line missing")
 CROSSED = ("old yellow line", "old white line", "diagonal", "arrow")
-Found = dict[str, list[tuple[Judged, Judged]]]
+Found = dict[str, list[tuple[LaneVerdict, LaneVerdict]]]
 
 
 @pytest.fixture(scope="module", params=[1, pytest.param(3, marks=pytest.mark.full)], ids="{} of each".format)
@@ -35,7 +35,7 @@ def found(request: pytest.FixtureRequest) -> Found:
     """Return results on pictures of each kind, other than those of the docs, searched and followed."""
     by_kind: Found = defaultdict(list)
     for case in cases(request.param, seed=7):
-        by_kind[case.kind].append(look(case))
+        by_kind[case.kind].append(check_case(case))
     return by_kind
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.node import WAKE, Message, Send, Stage
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine, Lognormal
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel, Lognormal
 
 MS = NS_PER_MS
 
@@ -52,7 +52,7 @@ class NullRecorder:
 
 
 def new_runtime(
-    law: DelayLaw, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
+    law: DelayModel, *, costs_ns: Mapping[tuple[str, str], int] | None = None, period_ns: int = 20 * MS
 ) -> tuple[VirtualRuntime, PeriodicSender]:
     """Return a runtime in which a driver sends `control` to an actuator."""
     clock = HostClock(0, 0)
@@ -86,10 +86,10 @@ def test_offset_drift_and_steps() -> None:
 
 def test_links_delay_exactly_and_keep_order() -> None:
     """A constant link delays exactly; a link with jitter keeps the order."""
-    runtime, actuator = new_runtime(DelayLaw(75.0))
+    runtime, actuator = new_runtime(DelayModel(75.0))
     runtime.run(NS_PER_S, lambda: False)
     assert [arrived for _, arrived, _ in actuator.received] == [(20 * i + 75) * MS for i in range(47)]
-    runtime, actuator = new_runtime(DelayLaw(0.0, Lognormal(40.0, 1.0), 1, "jitter"))
+    runtime, actuator = new_runtime(DelayModel(0.0, Lognormal(40.0, 1.0), 1, "jitter"))
     runtime.run(2 * NS_PER_S, lambda: False)
     numbers = [payload for payload, _, _ in actuator.received]
     arrivals = [arrived for _, arrived, _ in actuator.received]
@@ -101,7 +101,7 @@ def test_links_delay_exactly_and_keep_order() -> None:
 def test_a_busy_node_queues_messages() -> None:
     """A node that is slower than its messages queues them, each with its own arrival time."""
     runtime, actuator = new_runtime(
-        DelayLaw(0.0), costs_ns={("actuator", "receive"): 30 * MS, ("driver", "send"): 3 * MS}
+        DelayModel(0.0), costs_ns={("actuator", "receive"): 30 * MS, ("driver", "send"): 3 * MS}
     )
     runtime.run(200 * MS, lambda: False)
     assert [arrived // MS for _, arrived, _ in actuator.received[:4]] == [3, 23, 43, 63]
@@ -110,7 +110,7 @@ def test_a_busy_node_queues_messages() -> None:
 
 def test_a_closed_link_loses_messages() -> None:
     """A closed link loses new messages, and neither earlier nor later ones."""
-    runtime, actuator = new_runtime(DelayLaw(50.0))
+    runtime, actuator = new_runtime(DelayModel(50.0))
     link = runtime.links["control"]
     runtime.at(110 * MS, lambda: setattr(link, "open", False))
     runtime.at(210 * MS, lambda: setattr(link, "open", True))
@@ -123,7 +123,7 @@ def test_two_runs_are_equal() -> None:
     """Two runs with the same seed have equal times to the nanosecond; another seed has other times."""
 
     def received(seed: int) -> list[tuple[Any, int, int]]:
-        runtime, actuator = new_runtime(DelayLaw(5.0, Lognormal(12.0, 0.6), seed, "jitter"))
+        runtime, actuator = new_runtime(DelayModel(5.0, Lognormal(12.0, 0.6), seed, "jitter"))
         runtime.run(NS_PER_S, lambda: False)
         return actuator.received
 
@@ -133,7 +133,7 @@ def test_two_runs_are_equal() -> None:
 
 def test_a_run_ends_when_finished() -> None:
     """A run ends when finished or at its limit, and returns which."""
-    runtime, actuator = new_runtime(DelayLaw(0.0))
+    runtime, actuator = new_runtime(DelayModel(0.0))
     assert runtime.run(NS_PER_S, lambda: len(actuator.received) == 3)
     assert runtime.true_ns == 40 * MS
     assert not runtime.run(100 * MS, lambda: False)

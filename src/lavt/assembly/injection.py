@@ -86,7 +86,7 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
     [control] = netem_flows(
         requested, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )
-    if not (config.interface or control.law.is_nothing):
+    if not (config.interface or control.impairment.is_transparent):
         raise UserError(
             f"condition {config.condition} delays control, which this machine sends: set injection.interface to the "
             "interface towards the vehicle"

@@ -10,7 +10,7 @@ from lavt.assembly.injection import plain_law
 from lavt.config import Condition, ImpairmentConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
-from lavt.transport.emulation.link import LinkInjection, check_injected
+from lavt.transport.emulation.link import LinkInjection, check_injection
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 TRACES: Final = "netem/traces"
@@ -26,7 +26,7 @@ def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
     requested = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
-    check_injected(requested)
+    check_injection(requested)
     return requested
 
 

@@ -37,17 +37,17 @@ def show(interface: Interface, as_json: console.Json = False) -> None:
 
     Example: lavt netem show --interface eth0
     """
-    shown = NetemInterface(interface).shown()
+    shown = NetemInterface(interface).status()
     applied = shown["applied"] if shown["ours"] else None
-    impairments = {name: asdict(each) for name, each in shown["laws"].items()} if shown["ours"] else {}
+    impairments = {name: asdict(each) for name, each in shown["impairments"].items()} if shown["ours"] else {}
     if as_json:
         owner = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
-        console.print_json({**shown, "laws": impairments, "applied": owner})
+        console.print_json({**shown, "impairments": impairments, "applied": owner})
         return
     if not shown["ours"]:
         console.print_result(f"{interface} has no delay queues of LAVT: {', '.join(shown['queues']) or 'no queue'}")
         return
-    console.print_result(f"{interface} has {MADE_BY_HAND if applied is None else applied.words}")
+    console.print_result(f"{interface} has {MADE_BY_HAND if applied is None else applied.description}")
     for name, impairment in impairments.items():
         values = [f"{key} {value:g}" for key, value in impairment.items() if isinstance(value, int | float) and value]
         console.print_result(f"  {name}: {', '.join(values) or 'no impairment'}")
@@ -85,18 +85,18 @@ def apply(
     )
     exempt = [ExemptPort("udp", probe_port, "the clock probe")]
     check_flows(flows, exempt)
-    netem = NetemInterface(interface, stays=not hold)
+    netem = NetemInterface(interface, persistent=not hold)
     if dry_run:
         _print_commands(first_commands(interface, flows, tables=str(DIRECTORY)), as_json, interface, name)
         return
     _print_messages(netem.check())
     with console.stop_on_signals() as stop:
-        was_delayed = netem.shown()["ours"]
+        was_delayed = netem.status()["ours"]
         try:
-            commands = netem.apply(flows, never=exempt, condition=name)
+            commands = netem.apply(flows, exempt=exempt, condition=name)
             if not as_json:
                 _print_command_lines(commands)
-            verification = netem.verify(flows, never=exempt)
+            verification = netem.verify(flows, exempt=exempt)
             _print_verification(
                 verification, as_json, {"interface": interface, "condition": name, "commands": commands}
             )
@@ -125,7 +125,7 @@ def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_
     if applied is None:
         raise UserError(f"nothing was applied to {interface}: apply a condition first (`lavt netem apply`)")
     exempt = [ExemptPort("udp", probe_port, "the clock probe")]
-    verification = netem.verify(applied.flows, never=exempt)
+    verification = netem.verify(applied.flows, exempt=exempt)
     _print_verification(verification, as_json, {"interface": interface, "condition": applied.condition})
     _raise_if_failed(verification)
 
@@ -146,9 +146,9 @@ def clear(
     netem = NetemInterface(interface)
     _print_messages(netem.restore())
     applied = netem.applied()
-    commands = netem.clear(at_once=at_once, of_anybody=True)
+    commands = netem.clear(at_once=at_once, any_owner=True)
     if commands:
-        console.print_message(f"lavt: removed: {MADE_BY_HAND if applied is None else applied.words}")
+        console.print_message(f"lavt: removed: {MADE_BY_HAND if applied is None else applied.description}")
     _print_commands(commands, as_json, interface, "")
     if not as_json:
         console.print_result(f"{interface} is restored" if commands else f"{interface} has no delay queues of LAVT")

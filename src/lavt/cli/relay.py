@@ -15,7 +15,7 @@ from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.runtime import process_priority
-from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.impairment import Impairment
 from lavt.transport.emulation.link import LinkInjection
 from lavt.transport.emulation.relay import NONE, Relay, RelayedFlow, is_delayed_video, video_index
@@ -64,7 +64,7 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
         _resolve("video_server", config.video_server),
         upstream=NONE,
         downstream=_delay_law(config.video, seed, "video inherent"),
-        held_downstream=is_delayed_video,
+        delays_downstream=is_delayed_video,
         index_downstream=video_index,
         downstream_injected=_link_injection("video", config.video, seed),
     )
@@ -80,9 +80,9 @@ def flows(config: RelayConfig) -> list[RelayedFlow]:
     return [video, control]
 
 
-def _delay_law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
+def _delay_law(config: DelayConfig, seed: int, name: str) -> DelayModel:
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
-    return DelayLaw(config.constant_ms, jitter, seed, name)
+    return DelayModel(config.constant_ms, jitter, seed, name)
 
 
 def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:

@@ -62,9 +62,9 @@ class _Queues:
             self.repeat_ns = now.mono_ns + REQUEST_PERIOD_NS
         elif self.condition:
             self.repeat_ns = now.mono_ns + MEASURE_PERIOD_NS
-        requested_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
+        requested_ms: dict[str, float] = {flow.name: flow.impairment.delay_ms for flow in self.flows} or {"": 0.0}
         measured_ms = dict(result.measured_ms)
-        reason = result.reason or result.doubts
+        reason = result.reason or result.problems
         return [
             Send(
                 "injection",

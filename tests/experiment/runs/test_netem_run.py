@@ -17,7 +17,7 @@ from lavt.experiment.runs.plan import plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.netem.probe import ProbeResult, probes
-from lavt.transport.netem.state import AppliedState, StateFiles, boot, namespace, started
+from lavt.transport.netem.state import AppliedState, StateFiles, boot_id, network_namespace, start_ticks
 from lavt.transport.netem.tc import Command
 
 
@@ -40,15 +40,15 @@ class Kernel(NetemInterface):
         return ""
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
         """Measure nothing."""
         return {
-            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
-            for each in probes(flows, never)
+            each.name: ProbeResult(count, 0, 0, 0, *[each.impairment.delay_ms + self.more_ms] * 3)
+            for each in probes(flows, exempt)
         }
 
-    def doubts(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Doubt what is said to have stopped."""
         return self.stopped
 
@@ -96,9 +96,9 @@ def test_a_run_that_is_rejected_leaves_what_another_holds(tmp_path: Path) -> Non
     """Where another program holds the loopback a run is refused, and that program's queue stays."""
     kernel = Kernel(tmp_path)
     kernel.commands = ["tc qdisc add dev lo root"]
-    owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(AppliedState("lo", namespace(), boot(), owner, "L3", ()))
-    with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
+    owner = os.getppid(), start_ticks(os.getppid())
+    StateFiles(tmp_path).write(AppliedState("lo", network_namespace(), boot_id(), owner, "L3", ()))
+    with pytest.raises(UserError, match="L3 on lo"), kernel, run_by(kernel, "L1"):
         pass
     assert kernel.commands == ["tc qdisc add dev lo root"]
 
@@ -111,7 +111,7 @@ def test_what_was_not_done_as_requested_makes_a_run_invalid(tmp_path: Path) -> N
         kernel.more_ms = 3.0
         report = netem.report()
 
-    assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
+    assert "after the drive: video was delayed by 78.00 ms instead of 75 ms" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
     kernel.stopped = ["video: its correlated jitter has stopped"]
     assert netem_reasons(netem.report())[0].startswith("video: ")

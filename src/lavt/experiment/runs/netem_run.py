@@ -81,7 +81,11 @@ class NetemRun:
     def report(self) -> dict[str, Any]:
         """Measure again, and tell what was asked and what was measured: the content of `netem.json`."""
         after = self._measured()
-        return {**self._report, "after": after, "read_back": self._netem.read_back(self._flows) + self._netem.doubts()}
+        return {
+            **self._report,
+            "after": after,
+            "read_back": self._netem.read_back(self._flows) + self._netem.problems(),
+        }
 
     def _measured(self) -> dict[str, Any]:
         return {name: asdict(each) for name, each in self._netem.measure(self._flows).items()}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from lavt.assembly.links import injected
 from lavt.config import Condition, Costs
-from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.link import LinkInjection
 
 US_PER_MS = 1000.0
@@ -46,10 +46,10 @@ class NetworkDelays:
     A constant delay that is injected is part of these. Where more is, all that is injected is beside them.
     """
 
-    video: DelayLaw
-    control: DelayLaw
-    state: DelayLaw
-    unheld: DelayLaw
+    video: DelayModel
+    control: DelayModel
+    state: DelayModel
+    unheld: DelayModel
     video_injected: LinkInjection | None = None
     control_injected: LinkInjection | None = None
 
@@ -70,10 +70,10 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     video = injected("video", condition.video_ms, condition.video, seed)
     control = injected("control", condition.control_ms, condition.control, seed)
     return NetworkDelays(
-        DelayLaw(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
-        DelayLaw(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
-        DelayLaw(max(0.0, control_ms) + state_ms),
-        DelayLaw(0.0),
+        DelayModel(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
+        DelayModel(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
+        DelayModel(max(0.0, control_ms) + state_ms),
+        DelayModel(0.0),
         video,
         control,
     )
@@ -90,8 +90,8 @@ def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
     )
 
 
-def _later(law: DelayLaw, by_us: float) -> DelayLaw:
-    return DelayLaw(law.constant_ms + by_us / US_PER_MS, law.jitter, law.seed, law.name)
+def _later(law: DelayModel, by_us: float) -> DelayModel:
+    return DelayModel(law.constant_ms + by_us / US_PER_MS, law.jitter, law.seed, law.name)
 
 
 def _stages_ms(costs: Costs, stages: tuple[tuple[str, str], ...]) -> float:

@@ -30,7 +30,7 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import LAVT, Process, Processes
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.experiment.runs.virtual_run import read_costs
-from lavt.transport.emulation.delay_line import DelayLaw
+from lavt.transport.emulation.delay_line import DelayModel
 
 RELAY = "relay.json"
 """In a run directory: the delays asked of the relay, and for how long it held what it carried."""
@@ -214,7 +214,7 @@ def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> Re
     )
 
 
-def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: ImpairmentConfig = NOTHING) -> DelayConfig:
+def _delay(law: DelayModel, delay_ms: float = 0.0, impairment: ImpairmentConfig = NOTHING) -> DelayConfig:
     link = LinkConfig()
     if impairment != NOTHING:
         requested = impairment.model_dump()

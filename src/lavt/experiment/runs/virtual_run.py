@@ -26,7 +26,7 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.emulation.relay import video_index
 
@@ -169,7 +169,7 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
         return count
 
     def link(
-        law: DelayLaw, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = counted
+        law: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = counted
     ) -> VirtualLink:
         return VirtualLink(DelayLine(law, None if injected is None else EmulatedLink(injected)), index)
 
