@@ -20,10 +20,12 @@ from lavt.experiment.runs.plan import PlannedRun, plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
 
-def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:
+def digests(planned: list[PlannedRun], jobs: int, cluster_address: str | None) -> dict[str, str]:
     """Drive everything, and give the digest of each run."""
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+        driven, _ = run_all(
+            planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
+        )
     if driven.failed:
         raise SystemExit(f"failed: {driven.failed}")
     return {result["run"]: result["digest"] for result in driven.results}
@@ -45,9 +47,9 @@ def main() -> None:
         f"Dask, {options.jobs} workers": (options.jobs, "local"),
     }
     clock, first = MachineClock(), None
-    for name, (jobs, cluster_at) in ways.items():
+    for name, (jobs, cluster_address) in ways.items():
         begin_ns = clock.now().mono_ns
-        found = digests(planned, jobs, cluster_at)
+        found = digests(planned, jobs, cluster_address)
         first = first or found
         different = sum(first[run] != digest for run, digest in found.items())
         took_s = (clock.now().mono_ns - begin_ns) / NS_PER_S

@@ -70,7 +70,7 @@ def drive(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Count
     requested = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
     planned = plan_sweep(parse_config(SweepConfig, requested, "the grid"))
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None)
+        driven, _ = run_all(planned, Path(directory), jobs=jobs, on_progress=lambda _: None)
     if driven.failed:
         raise SystemExit(f"failed: {driven.failed}")
     completed: Counter[tuple[float, float, str]] = Counter()

@@ -71,7 +71,7 @@ def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -
     }
     planned = plan_sweep(parse_config(SweepConfig, requested, "sensitivity"))
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=options.jobs, tell=lambda _: None)
+        driven, _ = run_all(planned, Path(directory), jobs=options.jobs, on_progress=lambda _: None)
     if driven.failed:
         raise SystemExit(f"failed: {driven.failed}")
     return list(driven.results)

@@ -218,7 +218,7 @@ def run_side(
 
 def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as_json: bool, last: str = "") -> None:
     """Print what is new, and `last` at the very end; as JSON also how everything is."""
-    for heard, at in side.tap.take_heard():
+    for heard, at in side.tap.take_updates():
         if isinstance(heard, State):
             narrator.state(heard, at.mono_ns, holds=session is not None and session.holds)
         else:

@@ -38,7 +38,7 @@ class LiveTap:
             with self._lock:
                 look(payload, now)
 
-    def take_heard(self) -> list[Heard]:
+    def take_updates(self) -> list[Heard]:
         """Take the states and refusals since the last call, in order."""
         with self._lock:
             heard = list(self._heard)

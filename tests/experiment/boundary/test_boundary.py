@@ -347,7 +347,7 @@ def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatc
             limited_s=np.zeros(0),
         )
 
-    monkeypatch.setattr(boundary_module, "watch_drive", fake)
+    monkeypatch.setattr(boundary_module, "drive_monitored", fake)
     monkeypatch.setattr(boundary_module, "straight_growth", lambda _: (math.nan, -math.inf))
     (requested,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
     leaves_ms = 137
@@ -372,7 +372,7 @@ def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(boundary_module, "search", fake)
     monkeypatch.setattr(boundary_module, "processes", in_this_process)
     told: list[str] = []
-    found, failed, done = search_all(plan_boundary(small("repetitions=3")), jobs=1, tell=told.append)
+    found, failed, done = search_all(plan_boundary(small("repetitions=3")), jobs=1, on_progress=told.append)
     assert (len(found), done) == (2, True)
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
     assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
@@ -393,7 +393,7 @@ def test_a_process_that_dies_costs_no_search(monkeypatch: pytest.MonkeyPatch, tm
     """What a process that died was at is searched again, alone; only the one that dies there too has failed."""
     monkeypatch.setattr(boundary_module, "search", killed_by)
     searches = plan_boundary(small("repetitions=5", f"study.participant={tmp_path}"))
-    found, failed, done = search_all(searches, jobs=2, tell=lambda _: None)
+    found, failed, done = search_all(searches, jobs=2, on_progress=lambda _: None)
     assert [run["repetition"] for run in found] == [0, 2, 3, 4]
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
     assert done
@@ -412,7 +412,9 @@ def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tm
             raise KeyboardInterrupt
 
     requested = small("repetitions=5")
-    found, done = boundary_module.boundary(requested, plan_boundary(requested), tmp_path, jobs=1, tell=tell)
+    found, done = boundary_module.search_boundary(
+        requested, plan_boundary(requested), tmp_path, jobs=1, on_progress=tell
+    )
     assert (len(told), done) == (3, False)
     assert [run["repetition"] for run in found["runs"]] == [0, 1, 2]
     assert json.loads((tmp_path / "boundary.json").read_text()) == found

@@ -12,7 +12,7 @@ from lavt.config import ClientConfig, RunConfig, ServerConfig
 from lavt.config_file import load_config, parse_config
 from lavt.domain import Now
 from lavt.errors import UserError
-from lavt.experiment.runs.join import join
+from lavt.experiment.runs.join import join_sides
 from lavt.experiment.runs.run import compute_result
 from lavt.recording.record import RecordWriter, read_record
 
@@ -36,7 +36,7 @@ def sides(make_run: MakeRun, where: Path, **settings: Any) -> tuple[Path, Path]:
 def test_two_directories_become_one_run(make_run: MakeRun, tmp_path: Path) -> None:
     """The run has both records, a config that can be read again, and a result with what both sides were."""
     server, client = sides(make_run, tmp_path)
-    result = join(server, client, tmp_path / "run")
+    result = join_sides(server, client, tmp_path / "run")
     assert (result["route"], result["preset"], result["ending"]) == ("b_key", "paper_calibrated", "completed")
     assert (result["time"], result["injection"], result["inherent"], result["condition"]) == (
         "real", "none", "network", "none",
@@ -53,14 +53,14 @@ def test_records_of_two_drives_are_rejected(make_run: MakeRun, tmp_path: Path) -
     server, _ = sides(make_run, tmp_path / "one")
     _, client = sides(make_run, tmp_path / "two", began_s=100.0)
     with pytest.raises(UserError, match="same drive"):
-        join(server, client, tmp_path / "run")
+        join_sides(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
 def test_the_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
     """For how long packets waited for earlier ones is what the client's config says, not what the server's does."""
     server, client = sides(make_run, tmp_path)
-    join(server, client, tmp_path / "run")
+    join_sides(server, client, tmp_path / "run")
     assert load_config(RunConfig, tmp_path / "run" / "config.yaml").video.reorder_hold_ms == 25.0
 
 
@@ -75,7 +75,7 @@ def test_a_client_of_a_later_drive_is_rejected(make_run: MakeRun, tmp_path: Path
         writer.write("frame", {"number": 0, "stamp_ns": stamp_ns, "stamped_mono_ns": mono_ns}, Now(mono_ns, mono_ns))
     writer.close()
     with pytest.raises(UserError, match="only the first drive"):
-        join(server, client, tmp_path / "run")
+        join_sides(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -83,4 +83,4 @@ def test_what_is_not_the_directory_of_a_side_is_rejected(make_run: MakeRun, tmp_
     """A directory without the record or the config of its side is refused with what to name instead."""
     server, client = sides(make_run, tmp_path)
     with pytest.raises(UserError, match="--out of `lavt server`"):
-        join(client, server, tmp_path / "run")
+        join_sides(client, server, tmp_path / "run")

@@ -23,7 +23,7 @@ def at_l0(out: Path, *changes: str) -> list[Mapping[str, Any]]:
     """Drive the paper's sweep without any delay."""
     sweep = ["conditions=[L0]", "network.inherent=loopback", "record.video=false", *changes]
     planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), sweep))
-    driven, _ = run_all(planned, out, jobs=None, tell=lambda _: None)
+    driven, _ = run_all(planned, out, jobs=None, on_progress=lambda _: None)
     assert not driven.failed
     return list(driven.results)
 

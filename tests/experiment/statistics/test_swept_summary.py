@@ -11,7 +11,7 @@ import pytest
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.experiment.sweep.sweep import open_sweep, sweep
+from lavt.experiment.sweep.sweep import drive_sweep, open_sweep
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L1]", "routes=[a_key, b_key]", "repetitions=1")
 
@@ -36,7 +36,7 @@ def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
     config = load_config(SweepConfig, shipped("configs/paper.yaml"), CHANGES)
     out: Path = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(config, plan_sweep(config), out, jobs=2, tell=lambda _: None)
+    drive_sweep(config, plan_sweep(config), out, jobs=2, on_progress=lambda _: None)
     return json.loads((out / "summary.json").read_text())
 
 

@@ -26,7 +26,7 @@ from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
 from lavt.experiment.runs.run import RESULT, run_once
-from lavt.experiment.sweep.sweep import base_of, open_sweep, recorded_base, run_all, sweep
+from lavt.experiment.sweep.sweep import base_of, drive_sweep, open_sweep, recorded_base, run_all
 from lavt.experiment.sweep.workers import Workers, processes
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
@@ -45,7 +45,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two runs, driven by two processes."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(requested(), two_runs(), out, jobs=2, tell=lambda _: None)
+    drive_sweep(requested(), two_runs(), out, jobs=2, on_progress=lambda _: None)
     return out
 
 
@@ -70,7 +70,7 @@ def resumed(swept: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
     first, second = (swept / "runs" / run.name / RESULT for run in two_runs())
     kept = second.stat().st_mtime_ns
     first.unlink()  # as if it had been killed while driving
-    sweep(requested(), two_runs(), swept, jobs=1, tell=lambda _: None)
+    drive_sweep(requested(), two_runs(), swept, jobs=1, on_progress=lambda _: None)
     return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == kept
 
 
@@ -88,7 +88,7 @@ def test_the_speed_is_that_of_what_was_driven(
     """Runs that were driven before do not make a resumed sweep faster; where nothing is driven the speed is kept."""
     speed = resumed[1]["speed"]
     assert speed["simulated_s"] == read_json(swept / "runs" / two_runs()[0].name / RESULT)["duration_s"]
-    sweep(requested(), two_runs(), swept, jobs=2, tell=lambda _: None)
+    drive_sweep(requested(), two_runs(), swept, jobs=2, on_progress=lambda _: None)
     assert read_json(swept / "summary.json")["speed"] == speed
 
 
@@ -96,7 +96,7 @@ def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
     """A run that ends with an error that nobody foresaw is told by its kind and text, and the others are driven."""
     good, bad = two_runs()
     told: list[str] = []
-    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, tell=told.append)
+    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, on_progress=told.append)
     ((name, why),) = driven.failed
     assert name == bad.name
     assert why.startswith("ValidationError: ")
@@ -116,7 +116,7 @@ def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
     """A sweep that was driven with another config is not resumed: its runs would not belong together."""
     changed, before = requested("seed=2"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
-        sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
+        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
 
 
@@ -127,7 +127,7 @@ def test_resuming_a_sweep_of_other_runs_is_rejected(swept: Path, key: str, value
     """Nor one that asks for other runs, or more: the report would hold those that are there already, too."""
     changed, before = requested(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
-        sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
+        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
 
 
@@ -209,7 +209,7 @@ def test_a_sweep_that_is_stopped_while_files_come_in_keeps_no_half_of_a_run(
     (tmp_path / "runs").mkdir()
     planned = plan_sweep(requested("fidelity=geometry"))[:1]
     with pytest.raises(KeyboardInterrupt):
-        run_all(planned, tmp_path / "runs", jobs=1, tell=lambda _: None, cluster_at="local")
+        run_all(planned, tmp_path / "runs", jobs=1, on_progress=lambda _: None, cluster_address="local")
     assert not list(tmp_path.glob("runs/*"))
 
 
@@ -266,8 +266,10 @@ def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     _, planned = geometry()
     ways = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
     digests = {}
-    for name, (jobs, cluster_at) in ways.items():
-        driven, _ = run_all(planned, tmp_path / name, jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+    for name, (jobs, cluster_address) in ways.items():
+        driven, _ = run_all(
+            planned, tmp_path / name, jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
+        )
         assert driven.failed == []
         digests[name] = {result["run"]: result["digest"] for result in driven.results}
     assert len(set(digests["one"].values())) == len(planned)
@@ -297,7 +299,7 @@ def test_files_from_far_are_let_go_once_they_are_written(tmp_path: Path, monkeyp
     monkeypatch.setattr(lavt.experiment.sweep.sweep, "cluster", lambda _address, _jobs: nullcontext(workers))
     _, planned = geometry()
     held: list[int] = []
-    run_all(planned[:3], tmp_path, jobs=None, tell=lambda _: held.append(len(away.held)), cluster_at="far")
+    run_all(planned[:3], tmp_path, jobs=None, on_progress=lambda _: held.append(len(away.held)), cluster_address="far")
     assert held == [3, 2, 1]
 
 
@@ -307,9 +309,9 @@ def test_without_a_scheduler_there_is_a_sentence(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     _, planned = geometry()
     with pytest.raises(UserError, match="no Dask scheduler answers at"):
-        run_all(planned, tmp_path, jobs=None, tell=lambda _: None, cluster_at="tcp://127.0.0.1:1")
+        run_all(planned, tmp_path, jobs=None, on_progress=lambda _: None, cluster_address="tcp://127.0.0.1:1")
     with pytest.raises(UserError, match="--jobs is for this machine"):
-        run_all(planned, tmp_path, jobs=2, tell=lambda _: None, cluster_at="tcp://127.0.0.1:1")
+        run_all(planned, tmp_path, jobs=2, on_progress=lambda _: None, cluster_address="tcp://127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -338,7 +340,7 @@ def test_a_process_that_dies_costs_no_run(tmp_path: Path) -> None:
     """When a process is killed from outside, what it was at is driven again, and all runs are there in the end."""
     _, planned = geometry()
     left = [1]
-    driven, _ = run_all(planned, tmp_path, jobs=2, tell=lambda _: kill_a_worker(left))
+    driven, _ = run_all(planned, tmp_path, jobs=2, on_progress=lambda _: kill_a_worker(left))
     assert left == [0]
     assert driven.failed == []
     assert sorted(result["run"] for result in driven.results) == sorted(each.name for each in planned)
@@ -360,7 +362,7 @@ def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: 
     workers = Workers(DiesAfterwards(), 1, far=False)
     monkeypatch.setattr(lavt.experiment.sweep.sweep, "processes", lambda _jobs: nullcontext(workers))
     _, planned = geometry()
-    driven, _ = run_all(planned[:1], tmp_path, jobs=1, tell=lambda _: None)
+    driven, _ = run_all(planned[:1], tmp_path, jobs=1, on_progress=lambda _: None)
     assert driven.failed == []
     assert (
         [drive.result for drive in driven.drives] == driven.results == [read_json(tmp_path / planned[0].name / RESULT)]

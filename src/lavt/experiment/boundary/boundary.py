@@ -25,7 +25,7 @@ from lavt.experiment.boundary.delay_margin import configured_loop, critical_dela
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.boundary_figure import boundary_figure
 from lavt.experiment.report.files import save_figure
-from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.experiment.statistics.boundary_summary import CRITERIA, groups_of
 from lavt.experiment.sweep.workers import Workers, processes
@@ -35,7 +35,7 @@ FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CR
 SEARCHED = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
 """Keys of a boundary config that are not a run's."""
 
-Tell = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 Totals = Callable[[float], float]
 
 
@@ -113,7 +113,7 @@ def search(requested: BoundarySearch) -> dict[str, Any]:
 
     @functools.cache
     def drive(delay_ms: float) -> MonitoredRun:
-        return watch_drive(plan_run(with_video_delay(config, delay_ms), name=requested.name))
+        return drive_monitored(plan_run(with_video_delay(config, delay_ms), name=requested.name))
 
     added_ms: list[float] = []
 
@@ -176,14 +176,14 @@ def theoretical_ms(config: RunConfig) -> float | None:
 
 
 def search_all(
-    searches: Sequence[BoundarySearch], *, jobs: int | None, tell: Tell
+    searches: Sequence[BoundarySearch], *, jobs: int | None, on_progress: ProgressCallback
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
     """Search them all, `jobs` at a time (None: one a core).
 
     Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
     Ctrl-C, which lets the searches under way end, and takes what they found.
     """
-    work, done = _SearchProgress(tell), True
+    work, done = _SearchProgress(on_progress), True
     try:
         _search_in_processes(work, searches, jobs or os.cpu_count() or 1)
     except KeyboardInterrupt:
@@ -194,10 +194,10 @@ def search_all(
 class _SearchProgress:
     """What has become of the searches so far."""
 
-    def __init__(self, tell: Tell) -> None:
+    def __init__(self, on_progress: ProgressCallback) -> None:
         self.found: dict[str, dict[str, Any]] = {}
         self.failed: list[dict[str, Any]] = []
-        self._tell = tell
+        self._on_progress = on_progress
 
     def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
         """Have searches done; give those that were not, because a worker's process died, in the order of `todo`."""
@@ -213,7 +213,7 @@ class _SearchProgress:
             except Exception as error:  # whatever it is, the other searches have nothing to do with it
                 self.fail(requested, in_words(error))
             else:
-                self._tell(f"{requested.name}: {_sentence(self.found[requested.name])}")
+                self._on_progress(f"{requested.name}: {_sentence(self.found[requested.name])}")
 
         try:
             for future in as_completed(list(futures)):
@@ -228,7 +228,7 @@ class _SearchProgress:
     def fail(self, requested: BoundarySearch, why: str) -> None:
         """Note that a search failed."""
         self.failed.append({"name": requested.name, "why": why})
-        self._tell(f"{requested.name}: failed: {why}")
+        self._on_progress(f"{requested.name}: failed: {why}")
 
 
 def _search_in_processes(work: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
@@ -248,14 +248,19 @@ def _sentence(run: Mapping[str, Any]) -> str:
     return ", ".join(parts) + " ms"
 
 
-def boundary(
-    config: BoundaryConfig, searches: Sequence[BoundarySearch], out: Path, *, jobs: int | None, tell: Tell
+def search_boundary(
+    config: BoundaryConfig,
+    searches: Sequence[BoundarySearch],
+    out: Path,
+    *,
+    jobs: int | None,
+    on_progress: ProgressCallback,
 ) -> tuple[dict[str, Any], bool]:
     """Search, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also of what was found before Ctrl-C.
 
     `searches` are those of `config`. Returns what is in `boundary.json`, and whether all was done.
     """
-    runs, failed, done = search_all(searches, jobs=jobs, tell=tell)
+    runs, failed, done = search_all(searches, jobs=jobs, on_progress=on_progress)
     entry = {
         "schema": 1,
         "config": config.model_dump(mode="json"),

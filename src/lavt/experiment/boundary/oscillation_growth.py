@@ -11,7 +11,7 @@ import numpy as np
 from lavt.assembly.entropy import run_seed
 from lavt.config import RunConfig
 from lavt.domain import FloatArray
-from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.vehicle.sim.simulator import start_of
 
@@ -87,5 +87,5 @@ def calm_seed(seed: int) -> int:
 
 def straight_growth(config: RunConfig) -> tuple[float, float]:
     """Drive `config` straight on, and give the total delay in ms and the growth of the swing in 1/s."""
-    drive = watch_drive(straight_run(config), limit_s=LONGEST_S)
+    drive = drive_monitored(straight_run(config), limit_s=LONGEST_S)
     return drive.total_delay_ms, growth_per_s(drive)

@@ -23,7 +23,7 @@ from lavt.recording.table import MISSING
 SIDES = ("server", "client")
 
 
-def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
+def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
     """Make the run directory `out` of what two sides wrote, compute its result, and give that.
 
     Raises `UserError` where a directory is not that of its side, or the two were not written in the same drive.

@@ -51,7 +51,7 @@ class MonitoredRun:
     """When commands were changed by a limit of the vehicle's safety."""
 
 
-def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
+def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
     """Drive, keeping in memory what is watched.
 
     It is the drive that `run_once` makes, but for its records: they are begun in a temporary directory that is removed.

@@ -32,7 +32,7 @@ from lavt.recording.output_directory import prepare_directory
 SWEEP = "sweep.yaml"
 """The whole config of a sweep, in its directory."""
 
-Tell = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +45,16 @@ class SweepResult:
 
 
 def run_all(
-    planned: Sequence[PlannedRun], runs_dir: Path, *, jobs: int | None, tell: Tell, cluster_at: str | None = None
+    planned: Sequence[PlannedRun],
+    runs_dir: Path,
+    *,
+    jobs: int | None,
+    on_progress: ProgressCallback,
+    cluster_address: str | None = None,
 ) -> tuple[SweepResult, dict[str, Any] | None]:
     """Drive the runs that have no result yet, `jobs` at a time (None: one a core), those in real time one by one.
 
-    With `cluster_at` they are driven by Dask's workers there. Returns the results, those of runs that were driven
+    With `cluster_address` they are driven by Dask's workers there. Returns the results, those of runs that were driven
     before among them, and the entry `speed` of the summary: of the virtual runs that were driven now, None where there
     were none.
     """
@@ -57,12 +62,12 @@ def run_all(
     start_ns = clock.now().mono_ns
     before = [read_json(runs_dir / each.name / RESULT) for each in planned if is_finished(runs_dir / each.name)]
     todo = [each for each in planned if not is_finished(runs_dir / each.name)]
-    work = _SweepProgress(runs_dir, tell)
-    if cluster_at is None:
+    work = _SweepProgress(runs_dir, on_progress)
+    if cluster_address is None:
         jobs = 1 if any(each.config.time == "real" for each in todo) else jobs or os.cpu_count() or 1
         _drive_in_processes(work, todo, jobs)
     elif todo:
-        with cluster(cluster_at, jobs) as workers:
+        with cluster(cluster_address, jobs) as workers:
             jobs = workers.jobs
             work.drive(workers, todo)
     results = [drive.result for drive in work.drives]
@@ -86,11 +91,11 @@ def is_finished(directory: Path) -> bool:
 class _SweepProgress:
     """What has become of the runs so far."""
 
-    def __init__(self, runs_dir: Path, tell: Tell) -> None:
+    def __init__(self, runs_dir: Path, on_progress: ProgressCallback) -> None:
         self.drives: list[DriveData] = []
         self.failed: list[tuple[str, str]] = []
         self.runs_dir = runs_dir
-        self._tell = tell
+        self._on_progress = on_progress
 
     def drive(self, workers: Workers, todo: Sequence[PlannedRun]) -> list[PlannedRun]:
         """Have runs driven; give those that were not, because a worker's process died."""
@@ -119,12 +124,12 @@ class _SweepProgress:
     def take(self, planned: PlannedRun, drive: DriveData) -> None:
         """Note a drive."""
         self.drives.append(drive)
-        self._tell(f"{planned.name}: {drive.result['ending']}")
+        self._on_progress(f"{planned.name}: {drive.result['ending']}")
 
     def fail(self, planned: PlannedRun, why: str) -> None:
         """Note that a run failed."""
         self.failed.append((planned.name, why))
-        self._tell(f"{planned.name} failed: {why}")
+        self._on_progress(f"{planned.name} failed: {why}")
 
 
 def _drive_in_processes(work: _SweepProgress, todo: Sequence[PlannedRun], jobs: int) -> None:
@@ -157,18 +162,18 @@ def open_sweep(out: Path, *, resume: bool) -> None:
         prepare_directory(out)
 
 
-def sweep(
+def drive_sweep(
     config: SweepConfig,
     planned: Sequence[PlannedRun],
     out: Path,
     *,
     jobs: int | None,
-    tell: Tell,
-    cluster_at: str | None = None,
+    on_progress: ProgressCallback,
+    cluster_address: str | None = None,
 ) -> tuple[Path, SweepResult]:
     """Drive what is missing of a sweep into `out`, and write its config, summary and report.
 
-    `planned` are the runs of `config`; `cluster_at` is that of `run_all`. Returns the report's page, and what was
+    `planned` are the runs of `config`; `cluster_address` is that of `run_all`. Returns the report's page, and what was
     driven. Runs that failed are in `out`/failed.json, and in summary and report.
     """
     _check_sweep(config, out)
@@ -179,7 +184,7 @@ def sweep(
             _check_config(each, runs_dir / each.name)
     (out / SWEEP).write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
     _remove_unfinished(planned, runs_dir)
-    driven, speed = run_all(planned, runs_dir, jobs=jobs, tell=tell, cluster_at=cluster_at)
+    driven, speed = run_all(planned, runs_dir, jobs=jobs, on_progress=on_progress, cluster_address=cluster_address)
     failed = [{"run": name, "reason": why} for name, why in driven.failed]
     write_json(out / FAILED, failed)
     if not driven.results:
