@@ -1,9 +1,9 @@
-"""Drive the paper's campaign several times, each time by other workers, and compare the digests of every run.
+"""Drive the paper's campaign several times, each time with other workers, and compare the digests of every run.
 
     python benchmarks/digests.py [--fidelity geometry] [--repetitions 5] [--jobs 2]
 
-180 runs at fidelity geometry are the default; `--fidelity video --repetitions 1` are 36 with pixels and H.264. Each is
-driven by as many processes as `--jobs` says, once more by as many, by one, and by Dask's workers on this machine.
+The default is 180 runs at fidelity geometry; `--fidelity video --repetitions 1` is 36 with pixels and H.264. Each is
+driven by `--jobs` processes, by as many again, by one, and by Dask workers on this machine.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lavt.experiment.sweep.sweep import run_all
 
 
 def digests(planned: list[PlannedRun], jobs: int, cluster_address: str | None) -> dict[str, str]:
-    """Drive everything, and give the digest of each run."""
+    """Drive all runs, and return the digest of each."""
     with TemporaryDirectory() as directory:
         driven, _ = run_all(
             planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
