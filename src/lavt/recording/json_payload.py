@@ -39,7 +39,7 @@ def _to_simpler_type(value: Any) -> Json:
         return value.item()
     if isinstance(value, Enum):
         return value.value
-    raise TypeError(f"a record cannot hold a {type(value).__name__}")
+    raise TypeError(f"a record cannot contain a {type(value).__name__}")
 
 
 @functools.cache

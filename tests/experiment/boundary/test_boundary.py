@@ -76,7 +76,7 @@ def test_without_a_crossing_the_bracket_has_no_upper_end() -> None:
 
 
 def test_a_crossing_below_the_range_has_no_lower_end() -> None:
-    """A criterion that holds at the first delay has a bracket without a lower end."""
+    """A criterion that is met at the first delay has a bracket without a lower end."""
     assert first_bracket(lambda _: True, GRID_MS, 2.0) == Bracket(None, 0.0)
     assert first_bracket(lambda delay_ms: delay_ms != 100, GRID_MS, 2.0) == Bracket(None, 0.0, monotone=False)
 

@@ -22,12 +22,12 @@ from lavt.transport.netem.tc import Command
 
 
 class Kernel(NetemInterface):
-    """A netem interface that records the commands of tc, and measures the requested delay plus `more_ms`."""
+    """A netem interface that records the commands of tc, and measures the requested delay plus `added_ms`."""
 
     def __init__(self, directory: Path) -> None:
         super().__init__("lo", directory=directory, run=self.record)
         self.commands: list[str] = []
-        self.more_ms = 0.0
+        self.added_ms = 0.0
         self.stopped: list[str] = []
 
     def record(self, command: Command) -> str:
@@ -42,9 +42,9 @@ class Kernel(NetemInterface):
     def measure(
         self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
-        """Return results as requested, plus `more_ms`."""
+        """Return results as requested, plus `added_ms`."""
         return {
-            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
+            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.added_ms] * 3)
             for each in probes(flows, never)
         }
 
@@ -108,7 +108,7 @@ def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> No
     kernel = Kernel(tmp_path)
     with run_by(kernel, "L1") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
-        kernel.more_ms = 3.0
+        kernel.added_ms = 3.0
         report = netem.report()
 
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))

@@ -32,12 +32,12 @@ from lavt.experiment.sweep.workers import Workers, process_workers
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
 
-def requested(*changes: str) -> SweepConfig:
+def sweep_config(*changes: str) -> SweepConfig:
     return load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, *changes])
 
 
 def two_runs() -> list[PlannedRun]:
-    return plan_sweep(requested())
+    return plan_sweep(sweep_config())
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Drive a sweep of two runs in two processes, and return its directory."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    drive_sweep(requested(), two_runs(), out, jobs=2, on_progress=lambda _: None)
+    drive_sweep(sweep_config(), two_runs(), out, jobs=2, on_progress=lambda _: None)
     return out
 
 
@@ -54,7 +54,7 @@ def test_a_sweep_writes_all_files(swept: Path) -> None:
     for run in two_runs():
         names = {path.name for path in (swept / "runs" / run.name).iterdir()}
         assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
-    assert load_config(SweepConfig, swept / "sweep.yaml") == requested()
+    assert load_config(SweepConfig, swept / "sweep.yaml") == sweep_config()
     assert (swept / "report" / "index.html").is_file()
     summary = json.loads((swept / "summary.json").read_text())
     assert list(summary["conditions"]) == ["L0", "L3"]
@@ -70,7 +70,7 @@ def resumed(swept: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
     first, second = (swept / "runs" / run.name / RESULT for run in two_runs())
     before_ns = second.stat().st_mtime_ns
     first.unlink()  # as if it had been killed while driving
-    drive_sweep(requested(), two_runs(), swept, jobs=1, on_progress=lambda _: None)
+    drive_sweep(sweep_config(), two_runs(), swept, jobs=1, on_progress=lambda _: None)
     return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == before_ns
 
 
@@ -88,7 +88,7 @@ def test_the_speed_is_that_of_the_last_drives(
     """Runs from before do not count in a resumed sweep's speed; if no run is driven, the speed is kept."""
     speed = resumed[1]["speed"]
     assert speed["simulated_s"] == read_json(swept / "runs" / two_runs()[0].name / RESULT)["duration_s"]
-    drive_sweep(requested(), two_runs(), swept, jobs=2, on_progress=lambda _: None)
+    drive_sweep(sweep_config(), two_runs(), swept, jobs=2, on_progress=lambda _: None)
     assert read_json(swept / "summary.json")["speed"] == speed
 
 
@@ -114,7 +114,7 @@ def test_the_config_of_a_run_reproduces_it(swept: Path, tmp_path: Path) -> None:
 
 def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
     """A sweep that was driven with another config is not resumed."""
-    changed, before = requested("seed=2"), (swept / "sweep.yaml").read_bytes()
+    changed, before = sweep_config("seed=2"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
         drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
@@ -125,7 +125,7 @@ def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
 )
 def test_resuming_a_sweep_of_other_runs_is_rejected(swept: Path, key: str, value: str) -> None:
     """A sweep with other or fewer runs is not resumed."""
-    changed, before = requested(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
+    changed, before = sweep_config(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
         drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
@@ -149,7 +149,7 @@ BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
 @pytest.mark.parametrize(("changes", "base"), BASES, ids=str)
 def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[str, Any], tmp_path: Path) -> None:
     """The base of a sweep is the value of its config at each axis, at any position in the axis."""
-    config = requested(*changes)
+    config = sweep_config(*changes)
     assert base_of(config, plan_sweep(config)) == base
     assert recorded_base(tmp_path) is None
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
@@ -185,10 +185,10 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
             break
         pause(20 * NS_PER_MS)
     os.killpg(started.pid, number)  # as a terminal does: to all processes
-    _, said = started.communicate(timeout=60)
+    _, stderr = started.communicate(timeout=60)
     assert started.returncode == 1
-    assert "what was finished is kept" in said
-    assert "Traceback" not in said
+    assert "what was finished is kept" in stderr
+    assert "Traceback" not in stderr
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < 60
 
 
@@ -208,7 +208,7 @@ def test_ctrl_c_leaves_no_partial_remote_run(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("lavt.experiment.sweep.sweep.cluster_workers", remote_workers)
     monkeypatch.setattr("lavt.experiment.sweep.workers.write_files", write_one_and_stop)
     (tmp_path / "runs").mkdir()
-    planned = plan_sweep(requested("fidelity=geometry"))[:1]
+    planned = plan_sweep(sweep_config("fidelity=geometry"))[:1]
     with pytest.raises(KeyboardInterrupt):
         run_all(planned, tmp_path / "runs", jobs=1, on_progress=lambda _: None, cluster_address="local")
     assert not list(tmp_path.glob("runs/*"))
@@ -251,8 +251,8 @@ def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
             break
         pause(20 * NS_PER_MS)
     os.killpg(started.pid, signal.SIGINT)
-    _, said = started.communicate(timeout=60)
-    assert "what was finished is kept" in said
+    _, stderr = started.communicate(timeout=60)
+    assert "what was finished is kept" in stderr
     assert started.returncode == 1
 
 

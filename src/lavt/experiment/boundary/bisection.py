@@ -15,15 +15,15 @@ LARGEST_RATE_PER_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """The two delays between which a criterion begins to hold; None at an end that is outside the searched range.
+    """The two delays between which a criterion is first met; None at an end that is outside the searched range.
 
-    `low_ms` is None where the criterion holds from the shortest delay on, `high_ms` where it holds at no delay.
+    `low_ms` is None where the criterion is met at the shortest delay, `high_ms` where it is met at no delay.
     """
 
     low_ms: float | None
     high_ms: float | None
     monotone: bool = True
-    """True if the criterion holds at every delay of the grid from the first at which it holds."""
+    """True if the criterion is met at every delay of the grid from the first at which it is met."""
 
 
 def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], within_ms: float) -> Bracket:
@@ -32,11 +32,11 @@ def first_bracket(criterion: Callable[[float], bool], grid_ms: Sequence[float], 
     `grid_ms` is ascending. A change that is reversed within one step of the grid is not found. The criterion was
     evaluated at both ends of the bracket.
     """
-    holds = [criterion(delay_ms) for delay_ms in grid_ms]
-    if not any(holds):
+    is_met = [criterion(delay_ms) for delay_ms in grid_ms]
+    if not any(is_met):
         return Bracket(grid_ms[-1], None)
-    first = holds.index(True)
-    monotone = all(holds[first:])
+    first = is_met.index(True)
+    monotone = all(is_met[first:])
     if first == 0:
         return Bracket(None, grid_ms[0], monotone)
     low_ms, high_ms = grid_ms[first - 1], grid_ms[first]

@@ -14,7 +14,7 @@ from lavt.experiment.sweep.workers import Workers, ignore_terminal_signals, term
 from lavt.recording.provenance import provenance
 
 LOCAL = "local"
-"""The address that stands for Dask workers on this machine."""
+"""The address of Dask workers on this machine."""
 CONNECT_S = 10
 
 
