@@ -23,7 +23,9 @@ from lavt.experiment.sweep.sweep import run_all
 def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:
     """Run everything, and return the digest of each run."""
     with TemporaryDirectory() as directory:
-        completed, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+        completed, _ = run_all(
+            planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_at
+        )
     if completed.failed:
         raise SystemExit(f"failed: {completed.failed}")
     return {result["run"]: result["digest"] for result in completed.results}

@@ -70,7 +70,7 @@ def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Co
     config = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
     planned = plan_sweep(parse_config(SweepConfig, config, "the grid"))
     with TemporaryDirectory() as directory:
-        runs, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None)
+        runs, _ = run_all(planned, Path(directory), jobs=jobs, on_progress=lambda _: None)
     if runs.failed:
         raise SystemExit(f"failed: {runs.failed}")
     completed: Counter[tuple[float, float, str]] = Counter()

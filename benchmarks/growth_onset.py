@@ -30,7 +30,7 @@ def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> Run
         f"controller.lookahead_s={lookahead_s}",
         f"controller.speed_mps={speed_mps}",
         f"camera.rate_hz={rate_hz}",
-        "safety.sight_m=200",  # the speed must not depend on the delay
+        "safety.stopping_distance_limit_m=200",  # the speed must not depend on the delay
     ]
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 

@@ -70,7 +70,7 @@ def run_drives(preset: str, key: str, values: Values, options: argparse.Namespac
     }
     planned = plan_sweep(parse_config(SweepConfig, config, "sensitivity"))
     with TemporaryDirectory() as directory:
-        completed, _ = run_all(planned, Path(directory), jobs=options.jobs, tell=lambda _: None)
+        completed, _ = run_all(planned, Path(directory), jobs=options.jobs, on_progress=lambda _: None)
     if completed.failed:
         raise SystemExit(f"failed: {completed.failed}")
     return list(completed.results)

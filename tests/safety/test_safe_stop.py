@@ -16,7 +16,7 @@ from tests.safety.stops import ALLOWED_M, ROUTES, SPEED_MPS, Curve, Stop, curves
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import PATH_POINTS, PATH_STEP_M
-from lavt.experiment.runs.monitored_run import watch_drive
+from lavt.experiment.runs.monitored_run import drive_monitored
 from lavt.experiment.runs.plan import plan_run
 from lavt.safety.limiter import stopping_speed_limit_mps
 from lavt.safety.limits import LIMITS
@@ -94,7 +94,7 @@ def test_with_old_pictures_the_car_drives_slower() -> None:
         "safety": {"picture_age_limit_ms": 2000.0},
         "fidelity": "geometry",
     }
-    seen = watch_drive(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
+    seen = drive_monitored(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
     speeds_mps = seen.speed_mps[seen.time_s > 10]
     allowed_mps = stopping_speed_limit_mps(seen.total_delay_ms / 1000, LIMITS)
     assert allowed_mps < SPEED_MPS - 0.2

@@ -34,15 +34,14 @@ def boundary(
 
     Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
     """
-    from lavt.experiment.boundary.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.boundary.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.boundary.boundary import plan_boundary, search_boundary  # noqa: PLC0415 (slow: scipy)
 
     requested = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(requested)
     out = out or Path("out") / "boundary"
     prepare_directory(out)
     with console.interruptible(), progress(f"boundary into {out}", len(searches)) as report_done:
-        found, is_complete = search_boundary(requested, searches, out, jobs=jobs, tell=report_done)
+        found, is_complete = search_boundary(requested, searches, out, jobs=jobs, on_progress=report_done)
     for failure in found["failed"]:
         console.print_message(f"failed: {failure['name']}: {failure['why']}")
     if not is_complete:

@@ -71,7 +71,7 @@ def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None
     from lavt.experiment.sweep.sweep import run_all  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     with progress("virtual time, L0 to L5", len(planned)) as report_done:
-        driven, speed = run_all(planned, out / "runs", jobs=None, tell=report_done)
+        driven, speed = run_all(planned, out / "runs", jobs=None, on_progress=report_done)
     return bool(driven.failed), speed
 
 

@@ -9,7 +9,7 @@ import typer
 
 from lavt.cli import console
 from lavt.cli.run import print_run
-from lavt.experiment.runs.join import join as join_sides
+from lavt.experiment.runs.join import join_sides
 
 
 def register(app: typer.Typer) -> None:

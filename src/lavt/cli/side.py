@@ -221,7 +221,7 @@ def _print_status(
     side: Side, log: SessionLog, session: ClientSession | None, *, as_json: bool, last_line: str = ""
 ) -> None:
     """Print the new lines of the log and then `last_line`; as JSON, print the status too."""
-    for heard, at in side.tap.take_heard():
+    for heard, at in side.tap.take_updates():
         if isinstance(heard, State):
             log.add_state(heard, at.mono_ns, has_control=session is not None and session.has_control)
         else:

@@ -40,8 +40,7 @@ def sweep(
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.sweep.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.sweep.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.sweep import drive_sweep, is_finished, open_sweep  # noqa: PLC0415 (slow: scipy)
 
     requested = load_config(SweepConfig, config, changes or [])
     planned = plan_sweep(requested)
@@ -53,7 +52,7 @@ def sweep(
     open_sweep(out, resume=resume)
     missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
     with console.interruptible(), progress(f"sweep into {out}", missing) as report_done:
-        page, driven = drive_sweep(requested, planned, out, jobs=jobs, tell=report_done, cluster_at=cluster)
+        page, driven = drive_sweep(requested, planned, out, jobs=jobs, on_progress=report_done, cluster_address=cluster)
     for name, why in driven.failed:
         console.print_message(f"failed: {name}: {why}")
     if as_json:

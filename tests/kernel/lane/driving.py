@@ -11,7 +11,7 @@ from typing import Any
 from tests.kernel.lane.machine import Machine, MachineError, StartedProgram, wait_until
 
 from lavt.experiment.analysis.metrics import RunMeasurement, measure
-from lavt.experiment.runs.join import join
+from lavt.experiment.runs.join import join_sides
 from lavt.recording.record import Record, read_record
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -134,7 +134,7 @@ def collect(loop: LoopPrograms, client: Machine, out: Path) -> DriveResult:
     for name in ("client.mcap", "config.yaml"):
         (out / "client" / name).write_bytes(client.read(out / "client" / name))
     run = out / "run"
-    result = join(out / "server", out / "client", run)
+    result = join_sides(out / "server", out / "client", run)
     server_record, client_record = read_record(run / "server.mcap"), read_record(run / "client.mcap")
     return DriveResult(run, server_record, client_record, measure(server_record, client_record), result)
 
