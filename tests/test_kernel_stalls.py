@@ -14,8 +14,8 @@ import pytest
 from tests.field.by_wire import STOP_STALL_MS
 from tests.kernel.lane import clocks, host_stalls
 from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
-from tests.kernel.lane.verdicts import MEDIAN_SHARE, excuse_slow_machine, least_stall_ms, least_stop_ms
-from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, stalled_share
+from tests.kernel.lane.verdicts import MEDIAN_SHARE, least_stall_ms, least_stop_ms
+from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, excuse_slow_machine, stalled_share
 from tests.test_stalls import QUIET, FakeProbe, stalls_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S

@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 from tests.support.ports import free_port
-from tests.support.stalls import STALL_MS, Stalls
+from tests.support.stalls import STALL_MS, Stalls, excuse_slow_machine
 
 from lavt.clock import MachineClock, pause
 from lavt.config import RunConfig
@@ -40,6 +40,8 @@ BEFORE_MS = 200
 """A stall of the host this long before the kit disengaged may be its cause."""
 STOP_BEFORE_MS, STOP_STALL_MS = 1500, 100
 """The same for a safe stop, which begins after 500 ms and is reported within 200 ms; shorter stalls do not cause it."""
+SLOW_MS = 3000
+"""Many short stalls in this time before a stop may be its cause."""
 GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
@@ -233,10 +235,13 @@ class RunningDrive:
     def unexpected_stop(self) -> Exception:
         """Return the exception for a stop without a fault; call it soon after the stop."""
         message, braked_ns = f"it stopped: {self.loop.server.latest}, {self.car.events}", self.car.braked_ns()
-        if braked_ns is not None:
-            return self.car.unexpected_release(braked_ns, message)
         now_ns = CLOCK.now().mono_ns
-        return self.stalls.verdict(message, now_ns - STOP_BEFORE_MS * NS_PER_MS, now_ns, stall_ms=STOP_STALL_MS)
+        if braked_ns is not None:
+            failure = self.car.unexpected_release(braked_ns, message)
+        else:
+            since_ns = now_ns - STOP_BEFORE_MS * NS_PER_MS
+            failure = self.stalls.verdict(message, since_ns, now_ns, stall_ms=STOP_STALL_MS)
+        return excuse_slow_machine(failure, self.stalls, now_ns - SLOW_MS * NS_PER_MS, now_ns)
 
     def require_within(self, took_ms: float, limit_ms: float, since_ns: int, what: str) -> None:
         """Require that something took less than a limit; only stalls until the limit excuse a delay."""

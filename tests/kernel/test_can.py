@@ -32,12 +32,11 @@ from tests.kernel.lane.machine import Machine, MachineError, wait_until
 from tests.kernel.lane.verdicts import (
     KIT_STALL_MS,
     changes_of_safety,
-    excuse_slow_machine,
     least_stop_ms,
     require_completed,
     require_valid,
 )
-from tests.support.stalls import Stalls
+from tests.support.stalls import Stalls, excuse_slow_machine
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S

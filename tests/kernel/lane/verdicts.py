@@ -13,7 +13,7 @@ import re
 
 from tests.field.by_wire import KIT_MS, STOP_BEFORE_MS, STOP_STALL_MS
 from tests.kernel.lane.driving import DriveResult, reasons_against
-from tests.support.stalls import HostStalled, Stalls, described, stalled_share
+from tests.support.stalls import Stalls
 
 from lavt.domain import NS_PER_MS
 from lavt.experiment.analysis.metrics import driving_interval
@@ -32,9 +32,6 @@ time sources and the sum of the loop's parts are judged by shortest round trips 
 MEDIAN_SHARE = 0.07
 """Share of a time that must be stalled to explain too large medians: more than a machine loses by using its
 processor fully."""
-SLOW_SHARE = 0.15
-"""Share of a by-wire drive that must be stalled to explain a too slow machine. Without 15 ms of each 100 ms it still
-drives as usual (`docs/by_wire.md`)."""
 REPORTS = re.compile(r"Report\w* for (\d+) ms")
 
 
@@ -83,16 +80,6 @@ def least_stop_ms(reason: str) -> float:
     """
     limits_ms = [int(limit_ms) for limit_ms in REPORTS.findall(reason)]
     return min(limits_ms) - MARGIN_MS if limits_ms else STOP_STALL_MS
-
-
-def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until_ns: int) -> Exception:
-    """Return `HostStalled` if many short stalls made the machine too slow, and the failure otherwise."""
-    if isinstance(failure, HostStalled):
-        return failure
-    recorded = stalls.during(since_ns, until_ns)
-    share = stalled_share(recorded, since_ns, until_ns)
-    message = f"stalled for {share:.1%} of the time, {described(recorded, since_ns)}; {failure}"
-    return AssertionError(message) if share < SLOW_SHARE else HostStalled(message)
 
 
 def changes_of_safety(drive: DriveResult) -> list[str]:
