@@ -185,15 +185,15 @@ def make_entry(of: Mutation) -> str:
 
 def test_accepted_survivors_match_the_sources(tmp_path: Path, sites: dict[str, list[Site]]) -> None:
     """An accepted survivor matches a mutation of the sources; one that matches none is an error."""
-    sites = {"a.py": find_sites("a.py", body("g(a < b)"))}
-    first = sites["a.py"][1][0]
+    example = {"a.py": find_sites("a.py", body("g(a < b)"))}
+    first = example["a.py"][1][0]
     file = tmp_path / "accepted.toml"
     file.write_text(make_entry(first))
-    assert results.load_accepted(file, sites) == {first.key[:4]: "x"}
+    assert results.load_accepted(file, example) == {first.key[:4]: "x"}
     for wrong in (make_entry(first).replace("<", "=="), make_entry(first).replace("reason", "why"), "accepted = 1 2"):
         file.write_text(wrong)
         with pytest.raises(UserError):
-            results.load_accepted(file, sites)
+            results.load_accepted(file, example)
     results.load_accepted(results.ACCEPTED_FILE, sites)
 
 

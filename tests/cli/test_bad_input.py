@@ -137,7 +137,7 @@ def test_settings_that_the_encoder_rejects(run: Run, tmp_path: Path) -> None:
     ended = run("run", DEMO, "--set", "video.buffer_ms=0.5", "--set", "vehicle.scenery=none", "--out", "mine")
     assert (ended.code, ended.out) == (2, "")
     assert ended.err.splitlines()[-1].startswith("lavt: ")
-    assert "buffer of 0.0005 s" in ended.err.splitlines()[-1]
+    assert "buffer cannot be 0.0005 s" in ended.err.splitlines()[-1]
     assert files(tmp_path) == {}
 
 

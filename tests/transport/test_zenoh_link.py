@@ -509,7 +509,7 @@ def test_encrypted_configs_restrict_access(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))
 def test_plain_configs_say_so(name: str) -> None:
     """The first line of an unencrypted router's config restricts it to a lab or a VPN."""
-    assert "plain" in (first := (CONFIGS / name).read_text().partition("\n")[0])
+    assert "not encrypted" in (first := (CONFIGS / name).read_text().partition("\n")[0])
     assert "a lab or a VPN" in first
 
 

@@ -301,7 +301,7 @@ def test_first_seeds_of_all_come_before_second_ones() -> None:
         ("routes=[a, a]", "each once"),
         ("presets=[]", "at least one"),
         ("presets=[swift]", "no preset 'swift'"),
-        ("network.condition=L9", "no condition 'L9'"),
+        ("network.condition=L9", "unknown condition 'L9'"),
     ],
 )
 def test_invalid_boundary_configs_are_rejected(change: str, expected: str) -> None:

@@ -116,7 +116,7 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
     ({"conditions": []}, "has no run"),
     ({"conditions": ["L0", "L0"]}, "a_key_L0_00 twice"),
     ({"axes": {"study.participant": ["a b", "a/b"]}}, "twice"),
-    ({"conditions": ["L0", "L9"]}, "'L9': the known ones are L0"),
+    ({"conditions": ["L0", "L9"]}, "'L9': choose one of L0"),
     ({"routes": ["a_key", "nowhere"]}, "'nowhere': name one"),
     ({"controller": {"preset": "magic"}}, "'magic'; choose one of"),
     ({"axes": {"controller.preset": ["designed", "magic"]}}, "'magic'; choose one of"),

@@ -152,7 +152,7 @@ REJECTED: list[tuple[str, dict[str, Any], str]] = [
     ("dataspeed_gen1", {"reports__gear__values": {}}, "reports.gear.values has no gear: name its signal"),
     ("dataspeed_gen2", {"reports__speed__values": {}}, "no report has a speed: name its signal"),
     ("dataspeed_gen2", {"reports__system__trip": {"STATE=x": "no"}}, "'STATE=x' of SystemReport"),
-    ("dataspeed_gen2", {"commands": None}, "is for remote or user: say in commands which"),
+    ("dataspeed_gen2", {"commands": None}, "is for remote or user"),
     ("dataspeed_gen2", {"sent__system__value": ""}, "SystemCmd of its DBC has no signal ''"),
     ("dataspeed_gen2", {"sent__stearing": {}}, "unknown key 'sent.stearing': did you mean 'steering'?"),
     ("dataspeed_gen2", {"limits__brake": 2.0}, "'limits.brake': Input should be less than or equal to 1"),
