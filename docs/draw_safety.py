@@ -1,4 +1,4 @@
-"""Draws the marked blocks of docs/safety.md anew, from the code: python docs/draw_safety.py."""
+"""Regenerate the marked blocks of docs/safety.md from the code: python docs/draw_safety.py."""
 
 from __future__ import annotations
 
