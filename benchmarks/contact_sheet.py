@@ -1,4 +1,4 @@
-"""Draws one sheet of the simulator's frames: every route in every light, as a driver would see them.
+"""Draw one sheet of the simulator's frames: every route in every light, from the driver's view.
 
 python benchmarks/contact_sheet.py [--out docs/pictures/frames.jpg]
 """
@@ -18,22 +18,22 @@ from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 PLACES = (("a", 30.0), ("a", 205.0), ("b", 175.0), ("b", 470.0), ("c", 60.0), ("c", 230.0))
-"""Roads, and stations (m) on them; the key parts lie on the same roads."""
+"""Roads and stations (m) on them; the key parts are on the same roads."""
 
 CELL_PX = (480, 360)
 LABEL_PX = 22
 QUALITY = 80
 
 
-def frame(road: Road, s_m: float, light: LightName) -> Picture:
-    """Draw what a car in the middle of its lane sees."""
+def render_frame(road: Road, s_m: float, light: LightName) -> Picture:
+    """Render the view of a car in the middle of its lane."""
     x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
     renderer = Renderer(road, MODEL, seed=1, scenery="full", light=light)
     return renderer.render(Pose(0, x_m, y_m, heading_rad), round(s_m))
 
 
-def labelled(picture: Picture, text: str) -> Picture:
-    """Make a cell of the sheet, with what it shows in its corner."""
+def label_cell(picture: Picture, text: str) -> Picture:
+    """Return a cell of the sheet, labelled in its corner."""
     cell = np.asarray(cv2.resize(picture, CELL_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     cell[:LABEL_PX] = cell[:LABEL_PX] // 3
     cv2.putText(cell, text, (6, LABEL_PX - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
@@ -41,14 +41,14 @@ def labelled(picture: Picture, text: str) -> Picture:
 
 
 def main() -> None:
-    """Write the sheet and say how large it is."""
+    """Write the sheet and print its size."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("docs/pictures/frames.jpg"))
     out: Path = parser.parse_args().out
     rows = []
     for name, s_m in PLACES:
         road = load_road(name)
-        cells = [labelled(frame(road, s_m, light), f"{road.title}, {s_m:.0f} m, {light}") for light in LIGHTS]
+        cells = [label_cell(render_frame(road, s_m, light), f"{road.title}, {s_m:.0f} m, {light}") for light in LIGHTS]
         rows.append(np.hstack(cells))
     out.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(out), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])

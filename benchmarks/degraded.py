@@ -1,7 +1,7 @@
-"""Pictures that perception was not made for, each with the truth: where the lane's centre really is.
+"""Degraded pictures with ground truth, for which perception was not designed.
 
-A picture is rendered from a place on a road whose marks may have been changed, then painted on (`PAINT`), then spoilt
-(`SPOILT`). The truth is taken from the road, in the vehicle's frame.
+A picture is rendered from a place on a road whose markings may have been changed, then painted on (`PAINT`), then
+degraded (`DEGRADED`). The truth about the lane's centre comes from the road, in the vehicle's frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lavt.vehicle.sim.road.road import Road, load_road
 
 MODEL = CameraModel()
 AHEAD_M = np.array([5.0, 10.0, 15.0])
-Spoil = Callable[[Picture, np.random.Generator], Picture]
+Degrade = Callable[[Picture, np.random.Generator], Picture]
 
 TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
     (38, 38, 40),
@@ -36,19 +36,19 @@ TAR, WORN_WHITE, WHITE, YELLOW, CONCRETE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """A picture and the truth about it."""
+class DegradedCase:
+    """A picture and its ground truth."""
 
     kind: str
     before: Picture
-    """What was seen before: the road as it is, from the same place."""
+    """An earlier picture from the same place: the unchanged road."""
     picture: Picture
     centre_m: FloatArray | None
-    """y of the lane's centre at `AHEAD_M`; None where there is no lane to be seen."""
+    """y of the lane's centre at `AHEAD_M`; None if no lane is visible."""
     lane_width_m: float
 
 
-# Marks changed on the road itself.
+# Changed markings on the road itself.
 
 
 def _marks(keep: Callable[[RoadMark], RoadMark | None]) -> Callable[[Road], Road]:
@@ -64,10 +64,17 @@ ROADS: dict[str, Callable[[Road], Road]] = {
     "solid lines": _marks(lambda mark: replace(mark, kind="solid")),
 }
 NO_LANE = {
-    "all marks missing", "kerb only", "diagonal only", "crosswalk only", "upside-down", "noise only", "coarse blocks",
-    "grey", "blackout",
-}  # fmt: skip
-"""Kinds in which nobody could tell where the lane is."""
+    "all marks missing",
+    "kerb only",
+    "diagonal only",
+    "crosswalk only",
+    "upside-down",
+    "noise only",
+    "coarse blocks",
+    "grey",
+    "blackout",
+}
+"""Kinds of pictures in which the lane cannot be recognised."""
 
 
 # Paint on the ground.
@@ -87,7 +94,7 @@ def _strip(picture: Picture, line: list[tuple[float, float]], width_m: float, co
 
 
 def tar_seams(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Dark repaired cracks along and across the lane."""
+    """Paint dark repaired cracks along and across the lane."""
     for _ in range(6):
         x, y = generator.uniform(3, 15), generator.uniform(-3, 3)
         _strip(picture, [(x, y), (x + 3, y + generator.normal(0, 0.5)), (x + 7, y + generator.normal(0, 1))], 0.09, TAR)
@@ -95,14 +102,14 @@ def tar_seams(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def old_yellow_line(picture: Picture, generator: np.random.Generator) -> Picture:
-    """One yellow line of road works that leads aside over the lane."""
+    """Paint one yellow roadworks line that crosses the lane at an angle."""
     y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
     _strip(picture, [(3, y), (25, y + 22 * slope)], 0.12, YELLOW)
     return picture
 
 
 def yellow_diversion(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Two yellow lines 3 m apart that lead aside over the lane, as a lane of their own: which counts, who knows."""
+    """Paint two yellow roadworks lines 3 m apart, like an ambiguous second lane that crosses the lane."""
     y, slope = generator.uniform(-2, 2), generator.uniform(0.1, 0.25) * generator.choice([-1, 1])
     for offset in (0.0, 3.0):
         _strip(picture, [(3, y + offset), (25, y + offset + 22 * slope)], 0.12, YELLOW)
@@ -110,21 +117,21 @@ def yellow_diversion(picture: Picture, generator: np.random.Generator) -> Pictur
 
 
 def old_white_line(picture: Picture, generator: np.random.Generator) -> Picture:
-    """One worn white line that crosses the lane."""
+    """Paint one worn white line that crosses the lane."""
     y, slope = generator.uniform(-2, 2), generator.choice([-0.12, 0.12])
     _strip(picture, [(3, y), (25, y + 22 * slope)], 0.12, WORN_WHITE)
     return picture
 
 
 def diagonal(picture: Picture, generator: np.random.Generator) -> Picture:
-    """A bright line at 30 degrees across everything."""
+    """Paint a bright line at 30 degrees across everything."""
     x, side = generator.uniform(4, 8), generator.choice([-1, 1])
     _strip(picture, [(x, -4.0 * side), (x + 14, 4.0 * side)], 0.15, WHITE)
     return picture
 
 
 def crosswalk(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Bars along the road, half a metre wide and as far apart, 3 m long."""
+    """Paint bars along the road, 3 m long, half a metre wide and half a metre apart."""
     x = generator.uniform(5, 11)
     for y in np.arange(-5.0, 5.0, 1.0):
         _strip(picture, [(x, y), (x + 3, y)], 0.5, WHITE)
@@ -132,7 +139,7 @@ def crosswalk(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def arrow(picture: Picture, generator: np.random.Generator) -> Picture:
-    """An arrow in the lane's middle: a shaft of 5 m and a head."""
+    """Paint an arrow in the middle of the lane: a shaft of 5 m and a head."""
     x = generator.uniform(4, 9)
     _strip(picture, [(x, 0), (x + 4, 0)], 0.15, WHITE)
     _strip(picture, [(x + 4, -0.5), (x + 5, 0)], 0.2, WHITE)
@@ -141,7 +148,7 @@ def arrow(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def kerb(picture: Picture, generator: np.random.Generator) -> Picture:
-    """A kerb of concrete on the right: top, and a dark gutter."""
+    """Paint a concrete kerb on the right, with its top and a dark gutter."""
     y = generator.uniform(-3.5, -2.0)
     _strip(picture, [(3, y - 0.15), (30, y - 0.15)], 0.3, CONCRETE)
     _strip(picture, [(3, y + 0.06), (30, y + 0.06)], 0.12, (50, 50, 50))
@@ -149,7 +156,7 @@ def kerb(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def tree_shadows(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Shadows of trunks and leaves over the road, with sun between."""
+    """Paint shadows of trunks and leaves over the road."""
     shade = np.full(picture.shape, 255, dtype=np.uint8)
     for _ in range(4):
         x, slope = generator.uniform(3, 20), generator.uniform(-0.5, 0.5)
@@ -160,7 +167,7 @@ def tree_shadows(picture: Picture, generator: np.random.Generator) -> Picture:
     return np.asarray(picture * (cv2.GaussianBlur(shade, (5, 5), 0) / 255.0), dtype=np.uint8)
 
 
-PAINT: dict[str, Spoil] = {
+PAINT: dict[str, Degrade] = {
     each.__name__.replace("_", " "): each
     for each in (tar_seams, old_yellow_line, yellow_diversion, old_white_line, diagonal, crosswalk, arrow, tree_shadows)
 }
@@ -170,7 +177,7 @@ PAINT: dict[str, Spoil] = {
 
 
 def _worn(picture: Picture, share: float) -> Picture:
-    """Pull what is brighter than its surroundings back towards them."""
+    """Reduce the contrast of what is brighter than its surroundings."""
     around = cv2.medianBlur(picture, 31)
     below = picture[240:].astype(np.float32), around[240:].astype(np.float32)
     worn = np.where(below[0] > below[1] + 8, below[1] + (below[0] - below[1]) * (1 - share), below[0])
@@ -194,7 +201,7 @@ def _salt_and_pepper(picture: Picture, generator: np.random.Generator, share: fl
 
 
 def _glare(picture: Picture, generator: np.random.Generator) -> Picture:
-    """A sun ahead: a bloom over the picture, and a bright streak on the road."""
+    """Add a low sun ahead: a bloom over the picture, and a bright streak on the road."""
     rows, columns = np.indices(picture.shape[:2])
     u, v = generator.uniform(200, 440), generator.uniform(120, 200)
     bloom = 190 * np.exp(-(((columns - u) / 150) ** 2 + ((rows - v) / 130) ** 2))
@@ -203,7 +210,7 @@ def _glare(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def _rain(picture: Picture, generator: np.random.Generator) -> Picture:
-    """Streaks, lower contrast and a blur, as through a wet windscreen."""
+    """Add streaks, lower contrast and a blur, as through a wet windscreen."""
     streaks = np.zeros(picture.shape[:2], dtype=np.uint8)
     for _ in range(350):
         u, v = generator.integers(0, 640), generator.integers(0, 480)
@@ -217,10 +224,10 @@ def _rain(picture: Picture, generator: np.random.Generator) -> Picture:
 
 
 def _low_rate(picture: Picture, _generator: np.random.Generator) -> Picture:
-    """The tenth picture of H.264 at 200 kbit/s: blocks."""
+    """Return the tenth frame of H.264 at 200 kbit/s, which has block artefacts."""
     encoder = Encoder(640, 480, rate_hz=30.0, bit_rate_bps=200_000, gop_frames=300)
     decoder, shown = Decoder(), picture
-    for shift in range(10):  # a still scene would become sharp: it moves as a road does
+    for shift in range(10):  # the scene moves like a road, because a still one would become sharp
         moved = np.roll(picture, (9 - shift) * 3, axis=0)
         decoded = decoder.decode(encoder.encode(moved))
         shown = decoded.picture if decoded is not None else shown
@@ -228,12 +235,12 @@ def _low_rate(picture: Picture, _generator: np.random.Generator) -> Picture:
 
 
 def blocks(generator: np.random.Generator, side_px: int) -> Picture:
-    """Black and white squares at random, and no road."""
+    """Return random black and white squares, without a road."""
     squares = generator.integers(0, 2, (480 // side_px, 640 // side_px, 1)).astype(np.uint8) * 255
     return squares.repeat(side_px, 0).repeat(side_px, 1).repeat(3, 2)
 
 
-SPOILT: dict[str, Spoil] = {
+DEGRADED: dict[str, Degrade] = {
     "worn by half": lambda picture, _: _worn(picture, 0.5),
     "worn by 80 %": lambda picture, _: _worn(picture, 0.8),
     "dark": lambda picture, generator: _noisy((picture * 0.2).astype(np.uint8), generator, 4),
@@ -266,7 +273,7 @@ def _renderer(route: str, marks: str) -> tuple[Road, Renderer]:
 
 
 def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatArray:
-    """Give y of the lane's centre at `AHEAD_M` in the frame of a car at a station, beside the centre and turned."""
+    """Return y of the lane's centre at `AHEAD_M` for a car at a station, beside the centre and turned."""
     x_m, y_m, heading_rad, _ = (float(value) for value in road.point(s_m))
     heading = heading_rad + turned_rad
     place = np.array([x_m - offset_m * np.sin(heading_rad), y_m + offset_m * np.cos(heading_rad)])
@@ -277,13 +284,13 @@ def _truth(road: Road, s_m: float, offset_m: float, turned_rad: float) -> FloatA
     return np.asarray(np.interp(AHEAD_M, ahead, left), dtype=np.float64)
 
 
-def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[Case]:
-    """Give `count` pictures of every kind, from random places of random routes: all repeats with the seed."""
-    kinds: list[tuple[str, str, Spoil | None]] = [(kind, kind, None) for kind in ROADS]
+def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> Iterator[DegradedCase]:
+    """Yield `count` pictures of every kind from random places of random routes, reproducible by the seed."""
+    kinds: list[tuple[str, str, Degrade | None]] = [(kind, kind, None) for kind in ROADS]
     kinds += [(kind, "as it is", paint) for kind, paint in PAINT.items()]
     kinds += [(f"{paint.__name__} only", "all marks missing", paint) for paint in (kerb, diagonal, crosswalk)]
-    kinds += [(kind, "as it is", spoil) for kind, spoil in SPOILT.items()]
-    for kind, marks, spoil in kinds:
+    kinds += [(kind, "as it is", degrade) for kind, degrade in DEGRADED.items()]
+    for kind, marks, degrade in kinds:
         for number in range(count):
             generator = stream(seed, f"degraded {kind}", number)
             route = str(generator.choice(routes))
@@ -295,8 +302,8 @@ def cases(count: int, seed: int = 1, routes: tuple[str, ...] = ("a_key",)) -> It
             pose = Pose(0, float(x_m), float(y_m), heading_rad)
             before = _renderer(route, "as it is")[1].render(pose, number)
             picture = before.copy() if marks == "as it is" else renderer.render(pose, number)
-            if spoil is not None:
-                picture = spoil(picture, generator)
-            nothing = kind in NO_LANE
-            centre_m = None if nothing else _truth(road, s_m, offset_m, turned_rad)
-            yield Case(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])
+            if degrade is not None:
+                picture = degrade(picture, generator)
+            has_no_lane = kind in NO_LANE
+            centre_m = None if has_no_lane else _truth(road, s_m, offset_m, turned_rad)
+            yield DegradedCase(kind, before, picture, centre_m, road.lanes.widths_m[road.lanes.driven])

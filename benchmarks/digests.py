@@ -1,9 +1,9 @@
-"""Drive the paper's campaign several times, each time by other workers, and compare the digests of every run.
+"""Run the paper's campaign several times with different workers, and compare the digests of all runs.
 
     python benchmarks/digests.py [--fidelity geometry] [--repetitions 5] [--jobs 2]
 
-180 runs at fidelity geometry are the default; `--fidelity video --repetitions 1` are 36 with pixels and H.264. Each is
-driven by as many processes as `--jobs` says, once more by as many, by one, and by Dask's workers on this machine.
+The default is 180 runs at fidelity geometry; `--fidelity video --repetitions 1` is 36 runs with pixels and H.264. The
+campaign runs twice in `--jobs` processes, once in one process, and once with Dask's workers on this machine.
 """
 
 from __future__ import annotations
@@ -21,16 +21,18 @@ from lavt.experiment.sweep.sweep import run_all
 
 
 def digests(planned: list[PlannedRun], jobs: int, cluster_at: str | None) -> dict[str, str]:
-    """Drive everything, and give the digest of each run."""
+    """Run everything, and return the digest of each run."""
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
-    if driven.failed:
-        raise SystemExit(f"failed: {driven.failed}")
-    return {result["run"]: result["digest"] for result in driven.results}
+        completed, _ = run_all(
+            planned, Path(directory), jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_at
+        )
+    if completed.failed:
+        raise SystemExit(f"failed: {completed.failed}")
+    return {result["run"]: result["digest"] for result in completed.results}
 
 
 def main() -> None:
-    """Print for each way of driving how many digests differ from those of the first, and how long it took."""
+    """Print for each executor how many digests differ from the first executor's, and the time it took."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--fidelity", default="geometry", choices=["video", "pixels", "geometry"])
     parser.add_argument("--repetitions", type=int, default=5)
@@ -38,20 +40,20 @@ def main() -> None:
     options = parser.parse_args()
     changes = [f"fidelity={options.fidelity}", f"repetitions={options.repetitions}"]
     planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), changes))
-    ways = {
+    executors = {
         f"{options.jobs} jobs": (options.jobs, None),
         f"{options.jobs} jobs, again": (options.jobs, None),
         "1 job": (1, None),
         f"Dask, {options.jobs} workers": (options.jobs, "local"),
     }
     clock, first = MachineClock(), None
-    for name, (jobs, cluster_at) in ways.items():
+    for name, (jobs, cluster_at) in executors.items():
         begin_ns = clock.now().mono_ns
-        found = digests(planned, jobs, cluster_at)
-        first = first or found
-        different = sum(first[run] != digest for run, digest in found.items())
+        run_digests = digests(planned, jobs, cluster_at)
+        first = first or run_digests
+        different = sum(first[run] != digest for run, digest in run_digests.items())
         took_s = (clock.now().mono_ns - begin_ns) / NS_PER_S
-        print(f"{name}: {len(found)} runs, {different} digests differ, {took_s:.0f} s", flush=True)
+        print(f"{name}: {len(run_digests)} runs, {different} digests differ, {took_s:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Look where the completion of drives falls, over lookahead and steering limit, beside where the paper's falls.
+"""Find how the completion of drives depends on lookahead and steering limit, and compare it with the paper's.
 
     python benchmarks/find_calibrated_preset.py [--repetitions 2] [--jobs N]
 
-The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of settings
-all six routes are driven in geometry fidelity, and a logistic curve is fitted to completion over injected delay.
-Printed are the delay at which half of the drives are completed, the shares completed, and the deviance of the paper's
-counts from those shares. The preset is not moved to wherever the deviance happens to be smallest: it is meant to put
-the fall where the paper's is, and nothing else.
+The paper gives no gains, only how many of 30 drives were completed under each condition. For each pair of settings all
+six routes are driven in geometry fidelity, and a logistic curve is fitted to completion over injected delay. The output
+has the delay at which half of the drives are completed, the shares of completed drives, and the deviance of the
+paper's counts from these shares. The preset is not simply the pair with the smallest deviance: it only has to place the
+fall where the paper's is.
 """
 
 from __future__ import annotations
@@ -29,59 +29,59 @@ from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
 PAPER = {"L0": 30, "L1": 28, "L2": 15, "L3": 11, "L4": 9, "L5": 3}
-"""Completed of 30."""
+"""Completed drives of 30."""
 LOOKAHEADS_S = (0.70, 0.74, 0.78, 0.82)
-LIMITS_RAD = (0.18, 0.21, 0.24)
-NARROWEST_MS = 5.0
+STEERING_LIMITS_RAD = (0.18, 0.21, 0.24)
+MIN_WIDTH_MS = 5.0
 
 Counts = Mapping[str, tuple[int, int]]
-"""Condition to (completed, driven)."""
+"""Maps a condition to (completed, total)."""
 
 
 def threshold_ms(counts: Counts) -> float:
-    """Injected delay at which half of the drives are completed, by a logistic curve of maximum likelihood."""
+    """Return the injected delay at which half of the drives are completed, from a maximum-likelihood logistic curve."""
     injected = conditions()
     delay_ms = np.array([injected[name].video_ms + injected[name].control_ms for name in counts])
-    completed, driven = np.array(list(counts.values()), dtype=np.float64).T
+    completed, runs = np.array(list(counts.values()), dtype=np.float64).T
 
     def cost(parameters: np.ndarray) -> float:
-        share = expit((parameters[0] - delay_ms) / (NARROWEST_MS + math.exp(parameters[1])))
+        share = expit((parameters[0] - delay_ms) / (MIN_WIDTH_MS + math.exp(parameters[1])))
         share = np.clip(share, 1e-9, 1 - 1e-9)
-        return float(-np.sum(completed * np.log(share) + (driven - completed) * np.log(1 - share)))
+        return float(-np.sum(completed * np.log(share) + (runs - completed) * np.log(1 - share)))
 
     return float(minimize(cost, x0=np.array([170.0, 3.0]), method="Nelder-Mead").x[0])
 
 
 def deviance(counts: Counts) -> float:
-    """Twice the log-likelihood that the paper's counts lose with our shares (half a drive added to both sides)."""
+    """Return twice the log-likelihood lost by using our shares for the paper's counts, with half a drive added."""
     total = 0.0
     for name, paper in PAPER.items():
-        completed, driven = counts[name]
-        ours, theirs = (completed + 0.5) / (driven + 1), paper / 30
-        for share, number, other in ((ours, paper, theirs), (1 - ours, 30 - paper, 1 - theirs)):
+        completed, runs = counts[name]
+        our_share, paper_share = (completed + 0.5) / (runs + 1), paper / 30
+        for share, number, other in ((our_share, paper, paper_share), (1 - our_share, 30 - paper, 1 - paper_share)):
             total += 2 * number * (math.log(other) - math.log(share)) if number else 0.0
     return total
 
 
-def drive(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Counts]:
-    """Drive the whole grid, and count."""
+def run_grid(repetitions: int, jobs: int | None) -> dict[tuple[float, float], Counts]:
+    """Drive the whole grid, and return the counts."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
-    axes = {"controller.lookahead_s": list(LOOKAHEADS_S), "controller.steering_limit_rad": list(LIMITS_RAD)}
-    requested = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
-    planned = plan_sweep(parse_config(SweepConfig, requested, "the grid"))
+    axes = {"controller.lookahead_s": list(LOOKAHEADS_S), "controller.steering_limit_rad": list(STEERING_LIMITS_RAD)}
+    config = {**base, "fidelity": "geometry", "repetitions": repetitions, "axes": axes}
+    planned = plan_sweep(parse_config(SweepConfig, config, "the grid"))
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=jobs, tell=lambda _: None)
-    if driven.failed:
-        raise SystemExit(f"failed: {driven.failed}")
+        runs, _ = run_all(planned, Path(directory), jobs=jobs, on_progress=lambda _: None)
+    if runs.failed:
+        raise SystemExit(f"failed: {runs.failed}")
     completed: Counter[tuple[float, float, str]] = Counter()
     total: Counter[tuple[float, float, str]] = Counter()
-    for result in driven.results:
+    for result in runs.results:
         key = (*(result["axes"][name] for name in axes), result["condition"])
         total[key] += 1
         completed[key] += result["ending"] == "completed"
     return {
         pair: {name: (completed[(*pair, name)], total[(*pair, name)]) for name in PAPER}
-        for pair in itertools.product(LOOKAHEADS_S, LIMITS_RAD)
+        for pair in itertools.product(LOOKAHEADS_S, STEERING_LIMITS_RAD)
     }
 
 
@@ -96,10 +96,10 @@ def main() -> None:
     print("|---" * (4 + len(PAPER)) + "|")
     rows = [
         ("paper", "", paper),
-        *((f"{k} s", f"{limit} rad", each) for (k, limit), each in drive(options.repetitions, options.jobs).items()),
+        *((f"{k} s", f"{limit} rad", each) for (k, limit), each in run_grid(options.repetitions, options.jobs).items()),
     ]
     for lookahead, limit, counts in rows:
-        shares = [f"{100 * completed / driven:.0f} %" for completed, driven in counts.values()]
+        shares = [f"{100 * completed / runs:.0f} %" for completed, runs in counts.values()]
         print(
             f"| {lookahead} | {limit} | {threshold_ms(counts):.0f} ms | "
             + " | ".join(shares)

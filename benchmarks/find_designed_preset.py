@@ -2,7 +2,7 @@
 
     python benchmarks/find_designed_preset.py
 
-Only the model of `lavt.experiment.boundary.delay_margin` is used, no drive and no result under injected delay.
+It uses only the model of `lavt.experiment.boundary.delay_margin`, and no drives.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from lavt.experiment.boundary.delay_margin import LateralLoop, critical_delay_s,
 MARGIN_RAD = math.radians(30)
 VIDEO_S = 0.062  # paper_wifi5, median, stamp written to stamp read
 CONTROL_S = 0.009  # paper_wifi5
-PROCESSING_S = 0.010  # perception, decision and what is left until the wheel is told; the hold is in the model
+PROCESSING_S = 0.010  # perception, control and the path to the wheel; the zero-order hold is in the model
 
 
 def main() -> None:
-    """Print the lookahead and what it and the calibrated preset leave."""
+    """Print the lookahead, and the margins of it and of the calibrated preset."""
     delay_s = VIDEO_S + CONTROL_S + PROCESSING_S
     smallest_s = smallest_lookahead_s(MARGIN_RAD, delay_s)
     rounded_s = math.ceil(smallest_s * 100) / 100

@@ -1,9 +1,9 @@
-"""Measure the total delay at which a swing begins to grow on a straight road, and print it beside the theory's.
+"""Measure the total delay at which an oscillation begins to grow on a straight road, and compare it with theory.
 
     python benchmarks/growth_onset.py [--lookaheads 0.74,1.01,1.3] [--rates 15,30] [--speeds 6,10] [--seeds 1]
 
-Drives are in geometry fidelity, with the latency of the loopback and a constant delay of the video; nothing in them
-reaches a limit while the swing is measured. `docs/boundary.md` holds what this printed.
+The drives use geometry fidelity, with the loopback's latency and a constant delay of the video. No limit is reached
+while the oscillation is measured. `docs/boundary.md` has the output.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ WITHIN_MS = 0.5
 
 
 def case(lookahead_s: float, rate_hz: float, speed_mps: float, seed: int) -> RunConfig:
-    """Give the config of one case."""
+    """Return the config of one case."""
     changes = [
         "fidelity=geometry",
         f"seed={seed}",
         f"controller.lookahead_s={lookahead_s}",
         f"controller.speed_mps={speed_mps}",
         f"camera.rate_hz={rate_hz}",
-        "safety.sight_m=200",  # the speed must not depend on the delay
+        "safety.stopping_distance_limit_m=200",  # the speed must not depend on the delay
     ]
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 
 
 def onset_ms(config: RunConfig, theory_ms: float) -> float:
-    """Search the total delay at which the swing neither grows nor dies away."""
+    """Return the total delay at which the oscillation neither grows nor decays."""
     added_ms = []
 
     def growth(delay_ms: float) -> float:

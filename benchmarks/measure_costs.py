@@ -1,8 +1,9 @@
-"""Measures what the loop costs, and writes it to `configs/costs.yaml`, which virtual time runs on.
+"""Measure the durations of the loop's stages and links, and write them to `configs/costs.yaml` for virtual time.
 
-A real drive over the loopback without injection, with all its processes; then medians over its frames, from its
-records: each hop from the timelines, waking a node as what passes between a message's arrival and its first hop, and
-each link as what passes between the end of the sender's chain and the arrival at the receiver (one machine: one clock).
+The program makes real drives over the loopback without injection, with all processes, and takes medians over their
+frames from the records: each stage from the timelines, waking a node as the time from a message's arrival to its first
+stage, and each link as the time from the end of the sender's pipeline to the arrival at the receiver (one machine has
+one clock).
 
     python benchmarks/measure_costs.py [--drives 3] [--out configs/costs.yaml]
 """
@@ -33,15 +34,20 @@ Samples = dict[tuple[str, str], list[float]]
 
 
 def timelines(record: Record) -> list[tuple[str, str, int, int, list[tuple[str, int]]]]:
-    """Give node, channel, stamp, arrival and hops of every timeline of a record."""
+    """Return node, channel, stamp, arrival and stages of every timeline of a record."""
     table = record.table("timeline")
-    columns = (table.texts("node"), table.texts("channel"), table.ints("stamp_ns").tolist(),
-               table.ints("arrived_mono_ns").tolist(), table.objects("stages"))  # fmt: skip
+    columns = (
+        table.texts("node"),
+        table.texts("channel"),
+        table.ints("stamp_ns").tolist(),
+        table.ints("arrived_mono_ns").tolist(),
+        table.objects("stages"),
+    )
     return list(zip(*columns, strict=True))
 
 
 def add_stages(record: Record, stages: Samples) -> None:
-    """Collect the duration of every hop, and of waking for every message."""
+    """Collect the duration of every stage, and of waking a node for every message."""
     for node, channel, _stamp_ns, arrived_ns, ends in timelines(record):
         if channel != "wake":
             stages[node, f"wait_{channel}"].append((ends[0][1] - arrived_ns) / US)
@@ -50,7 +56,7 @@ def add_stages(record: Record, stages: Samples) -> None:
 
 
 def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> None:
-    """Collect what the links cost: video and control by stamp and sequence, state by its send time."""
+    """Collect the delays of the links: video by stamp, control and state by send time."""
     sent = {stamp_ns: ends[-1][1] for node, _, stamp_ns, _, ends in timelines(server) if node == "camera"}
     for node, channel, stamp_ns, arrived_ns, _ in timelines(client):
         if node == "driver" and channel == "access_unit" and stamp_ns in sent:
@@ -61,18 +67,18 @@ def add_links(server: Record, client: Record, links: dict[str, list[float]]) -> 
     links["state"] += ((state.wall_ns - state.ints("sent_wall_ns")) / US).tolist()
 
 
-def costs_of(drives: int) -> dict[str, Any]:
-    """Drive and measure."""
+def measure_costs(drives: int) -> dict[str, Any]:
+    """Drive, and return the costs."""
     stages: Samples = defaultdict(list)
     links: dict[str, list[float]] = defaultdict(list)
     loads = []
-    for number in range(drives):
+    for index in range(drives):
         with TemporaryDirectory() as folder:
-            changes = ["time=real", "network.injection=none", f"seed={number + 1}"]
+            changes = ["time=real", "network.injection=none", f"seed={index + 1}"]
             out = Path(folder) / "run"
             result = run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
-            print(f"drive {number + 1}: {result['ending']}, tau_v {result['tau_v_ms']['p50']:.2f} ms, "
-                  f"tau_c {result['tau_c_ms']['p50']:.2f} ms, loop {result['loop_ms']['p50']:.2f} ms")  # fmt: skip
+            latencies = (f"{name[:-3]} {result[name]['p50']:.2f} ms" for name in ("tau_v_ms", "tau_c_ms", "loop_ms"))
+            print(f"drive {index + 1}: {result['ending']}, {', '.join(latencies)}")
             server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
             add_stages(server, stages)
             add_stages(client, stages)
@@ -92,12 +98,12 @@ def costs_of(drives: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure the costs and write the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--drives", type=int, default=3)
     parser.add_argument("--out", type=Path, default=shipped("configs/costs.yaml"))
     arguments = parser.parse_args()
-    costs = costs_of(arguments.drives)
+    costs = measure_costs(arguments.drives)
     head = "# Medians in microseconds, written by benchmarks/measure_costs.py; virtual time runs on them.\n"
     arguments.out.write_text(head + yaml.safe_dump(costs, sort_keys=False))
     print(arguments.out.read_text())

@@ -1,6 +1,6 @@
-"""Measures what rendering costs: CPU time of frames over whole drives, in the lane and swerving, and memory.
+"""Measure the cost of rendering: CPU time of frames over whole drives, in the lane and swerving, and memory.
 
-A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad. A hitch is the longest frame of a drive.
+A swerving car leaves its lane by 6 m to both sides and turns by 0.6 rad.
 
     python benchmarks/render_times.py [--route b] [--drives 3]
 """
@@ -35,8 +35,8 @@ CASES: tuple[tuple[CameraModel, SceneryKind, LightName, bool], ...] = (
 )
 
 
-def drive(road: Road, drawing: Renderer, *, swerving: bool) -> FloatArray:
-    """CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
+def measure_drive(road: Road, scene_renderer: Renderer, *, swerving: bool) -> FloatArray:
+    """Return the CPU time of every frame of a drive at 30 km/h and 30 Hz, in milliseconds."""
     times = []
     for number, s_m in enumerate(np.arange(0.0, road.length_m, FRAME_M)):
         phase = 2 * np.pi * s_m / SWERVE_EVERY_M if swerving else 0.0
@@ -44,34 +44,36 @@ def drive(road: Road, drawing: Renderer, *, swerving: bool) -> FloatArray:
         turned_rad = SWERVE_RAD * float(np.cos(phase)) if swerving else 0.0
         pose = Pose(0, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
         begin_s = time.process_time()
-        drawing.render(pose, number)
+        scene_renderer.render(pose, number)
         times.append((time.process_time() - begin_s) * 1000)
     return np.array(times)
 
 
 def main() -> None:
-    """Print a table; of several drives the medians, so that one disturbance by other programs does not count."""
+    """Print a table of medians over the drives, so that a single disturbance has no effect."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--route", default="b")
     parser.add_argument("--drives", type=int, default=3)
-    requested = parser.parse_args()
-    road = load_road(requested.route)
+    options = parser.parse_args()
+    road = load_road(options.route)
     print("picture    scenery  light     drive     prepare s  median ms  p99 ms  longest ms  memory MB")
     for model, scenery, light, swerving in CASES:
-        found = []
-        for _ in range(requested.drives):
+        measurements = []
+        for _ in range(options.drives):
             renderer.world.cache_clear()
             begin_s = time.process_time()
-            drawing = Renderer(road, model, seed=1, scenery=scenery, light=light)
-            drawing.prepare()
+            scene_renderer = Renderer(road, model, seed=1, scenery=scenery, light=light)
+            scene_renderer.prepare()
             prepare_s = time.process_time() - begin_s
-            times = drive(road, drawing, swerving=swerving)
-            found.append((prepare_s, float(np.median(times)), float(np.percentile(times, 99)), float(times.max())))
-        prepare_s, middle_ms, p99_ms, longest_ms = (median(column) for column in zip(*found, strict=True))
+            times = measure_drive(road, scene_renderer, swerving=swerving)
+            measurements.append(
+                (prepare_s, float(np.median(times)), float(np.percentile(times, 99)), float(times.max()))
+            )
+        prepare_s, middle_ms, p99_ms, longest_ms = (median(column) for column in zip(*measurements, strict=True))
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
-        size, way = f"{model.width_px}x{model.height_px}", "swerving" if swerving else "in lane"
+        size, driving = f"{model.width_px}x{model.height_px}", "swerving" if swerving else "in lane"
         print(
-            f"{size:9}  {scenery:7}  {light:8}  {way:8}  {prepare_s:9.2f}  {middle_ms:9.2f}  {p99_ms:6.1f}"
+            f"{size:9}  {scenery:7}  {light:8}  {driving:8}  {prepare_s:9.2f}  {middle_ms:9.2f}  {p99_ms:6.1f}"
             f"  {longest_ms:10.1f}  {memory_mb:9.0f}"
         )
 

@@ -1,11 +1,11 @@
-"""Measures how much later a video's packets arrive that go through `lavt rendezvous`, on the loopback of one machine.
+"""Measure the latency that `lavt rendezvous` adds to video packets, on the loopback of one machine.
 
     python benchmarks/rendezvous.py [--seconds 20]
 
 Pictures of 14 packets of 1216 bytes, 30 a second (4 Mbit/s), go from a socket that has registered as the vehicle to a
-client's: straight, and through the process, in turns. A packet's time is from its sending to its arrival by the
-kernel's stamp. So what is told is the work of the machine in between; the way to it and on is the network's.
-Prints a row for each; last, one line of JSON.
+client's socket: directly and through the rendezvous, in turns. A packet's latency is from its sending to the kernel's
+timestamp of its arrival. So the difference is the rendezvous's own processing, without any network. Prints a row for
+each way and finally a line of JSON.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US
 from lavt.experiment.runs.processes import Processes
 from lavt.runtime import process_priority
-from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
-from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, wrap, write_registration
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, enable_arrival_times
+from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, encode_registration, wrap
 from lavt.transport.video.path_validation import PathClient
 
 HERE = "127.0.0.1"
@@ -35,37 +35,38 @@ CHANGES = (f"bind={HERE}", "video_port=0", "probe_port=0")
 PERCENTILES = (50, 95, 99)
 
 
-class Ends:
-    """The sockets of the vehicle and of a client, with a rendezvous between them."""
+class LatencyProbe:
+    """The sockets of a vehicle and a client, which measure latencies directly and through a rendezvous."""
 
-    def __init__(self, vehicle: socket.socket, client: socket.socket, between: Address) -> None:
+    def __init__(self, vehicle: socket.socket, client: socket.socket, rendezvous: Address) -> None:
         self._clock = MachineClock()
-        self._vehicle, self._client, self._between = vehicle, client, between
-        want_arrival_times(client)
+        self._vehicle, self._client, self._rendezvous = vehicle, client, rendezvous
+        enable_arrival_times(client)
         for each in (vehicle, client):
             each.bind((HERE, 0))
             each.settimeout(WAIT_S)
         self._registered_ns = 0
 
-    def meet(self) -> None:
-        """Register, and let the client ask: it is answered from now on."""
+    def refresh(self) -> None:
+        """Register the vehicle and send a hello of the client, once a second."""
         now = self._clock.now()
         if now.mono_ns - self._registered_ns < REGISTER_EVERY_NS:
             return
         self._registered_ns = now.mono_ns
-        self._vehicle.sendto(write_registration("vehicle-1", "video", now.wall_ns, None), self._between)
-        self._client.sendto(PathClient(bytes(16)).hello(0), self._between)
+        self._vehicle.sendto(encode_registration("vehicle-1", "video", now.wall_ns, None), self._rendezvous)
+        self._client.sendto(PathClient(bytes(16)).hello(0), self._rendezvous)
         self._vehicle.recv(2000)
 
-    def picture(self, *, through: bool) -> list[int]:
-        """Send a picture, and tell how long each of its packets took, in nanoseconds."""
+    def send_picture(self, *, through: bool) -> list[int]:
+        """Send a picture and return the latencies of its packets in nanoseconds."""
         client = self._client.getsockname()
         for number in range(PACKETS):
             packet = struct.pack(">Bq", number, self._clock.now().wall_ns).ljust(PACKET_BYTES, b"\0")
-            self._vehicle.sendto(wrap(client, packet) if through else packet, self._between if through else client)
-        return [self._took_ns() for _ in range(PACKETS)]
+            self._vehicle.sendto(wrap(client, packet) if through else packet, self._rendezvous if through else client)
+        return [self._receive_ns() for _ in range(PACKETS)]
 
-    def _took_ns(self) -> int:
+    def _receive_ns(self) -> int:
+        """Receive a packet and return its latency."""
         packet, ancillary, _flags, _sender = self._client.recvmsg(2000, ANCILLARY_BYTES)
         return arrival(ancillary, self._clock.now()).wall_ns - int(struct.unpack_from(">xq", packet)[0])
 
@@ -75,8 +76,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0)
     pictures = max(2, round(parser.parse_args().seconds * RATE_HZ))
-    process_priority.take()
-    took_ns: dict[str, list[int]] = {"straight": [], "through": []}
+    process_priority.raise_priority()
+    latencies_ns: dict[str, list[int]] = {"straight": [], "through": []}
     config = Path(__file__).parents[1] / "configs" / "rendezvous.yaml"
     sets = [word for change in CHANGES for word in ("--set", change)]
     with (
@@ -86,19 +87,19 @@ def main() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
     ):
         port = processes.start("rendezvous", "rendezvous", str(config), *sets).ready()["ready"]["video_port"]
-        ends = Ends(vehicle, client, (HERE, port))
+        probe = LatencyProbe(vehicle, client, (HERE, port))
         for number in range(pictures):
-            ends.meet()
+            probe.refresh()
             way = ("straight", "through")[number % 2]
-            took_ns[way] += ends.picture(through=way == "through")
+            latencies_ns[way] += probe.send_picture(through=way == "through")
             pause(NS_PER_S // RATE_HZ - NS_PER_MS)
-    told = {
+    latencies_us = {
         way: {f"p{each}": round(float(np.percentile(times_ns, each)) / NS_PER_US, 1) for each in PERCENTILES}
-        for way, times_ns in took_ns.items()
+        for way, times_ns in latencies_ns.items()
     }
-    for way, percentiles in told.items():
+    for way, percentiles in latencies_us.items():
         print(f"{way:>8}  " + "  ".join(f"{name} {us:7.1f} us" for name, us in percentiles.items()))
-    print(json.dumps({"us": told, "pictures": pictures, "python": sys.version.split()[0]}))
+    print(json.dumps({"us": latencies_us, "pictures": pictures, "python": sys.version.split()[0]}))
 
 
 if __name__ == "__main__":

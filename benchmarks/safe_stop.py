@@ -2,7 +2,7 @@
 
     python -m benchmarks.safe_stop [PICTURE]        # at the top of the repository
 
-About two minutes on one core. The stops are those of tests/safety/test_safe_stop.py.
+It takes about two minutes on one core. The stops are those of tests/safety/test_safe_stop.py.
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ from tests.safety.stops import ALLOWED_M, ROUTES, Curve, Stop, stops
 
 from lavt.experiment.report.figure_style import COLOURS, new_figure
 
-Done = list[tuple[Curve, Stop, Stop]]
-FOLLOWED, HELD = "along the path", "wheel held"
+CurveStops = list[tuple[Curve, Stop, Stop]]
+FOLLOWING, HOLDING = "along the path", "wheel held"
 
 
-def out(done: Sequence[Stop]) -> int:
-    """Count the stops that left the lane by more than is allowed."""
-    return sum(stop.beyond_m > ALLOWED_M for stop in done)
+def count_beyond(curve_stops: Sequence[Stop]) -> int:
+    """Return how many stops left the lane by more than the allowed distance."""
+    return sum(stop.beyond_m > ALLOWED_M for stop in curve_stops)
 
 
-def worst(done: Sequence[Stop]) -> str:
-    """Say how far out a corner of the body got, and where the last command was."""
-    stop = max(done, key=lambda each: each.beyond_m)
+def format_worst(curve_stops: Sequence[Stop]) -> str:
+    """Format how far a corner of the body got beyond the lane, and where the last command was."""
+    stop = max(curve_stops, key=lambda each: each.beyond_m)
     return f"{stop.beyond_m:+.2f} m, at {stop.at_m:.0f} m"
 
 
-def row(curve: Curve, done: Done) -> str:
-    """Make a row of the table: a curve, and the worst of its stops."""
+def format_row(curve: Curve, curve_stops: CurveStops) -> str:
+    """Format a table row: a curve and the worst of its stops."""
     side = "left" if curve.radius_m > 0 else "right"
-    followed, held = [stop for _, stop, _ in done], [stop for _, _, stop in done]
+    following, holding = [stop for _, stop, _ in curve_stops], [stop for _, _, stop in curve_stops]
     return (
         f"| {curve.route} | {curve.from_m:.0f} to {curve.to_m:.0f} m | {side}, {abs(curve.radius_m):.0f} m "
-        f"| {len(done)} | {worst(followed)} | {worst(held)} | {out(held)} |"
+        f"| {len(curve_stops)} | {format_worst(following)} | {format_worst(holding)} | {count_beyond(holding)} |"
     )
 
 
-def draw(done: Done) -> Figure:
-    """Draw how far out each stop got, over where its last command was; a panel for each route."""
+def draw(curve_stops: CurveStops) -> Figure:
+    """Plot how far each stop got beyond the lane over the position of its last command, with a panel per route."""
     figure = new_figure(5.0)
     axes = figure.subplots(3, 2, sharey=True).ravel()
     for axis, route in zip(axes, ROUTES, strict=True):
-        for curve, each in groupby((each for each in done if each[0].route == route), key=itemgetter(0)):
-            _, followed, held = zip(*each, strict=True)
+        for curve, each in groupby((each for each in curve_stops if each[0].route == route), key=itemgetter(0)):
+            _, following, holding = zip(*each, strict=True)
             axis.axvspan(curve.from_m, curve.to_m, color="0.92")
-            for these, name, colour in ((followed, FOLLOWED, COLOURS[0]), (held, HELD, COLOURS[4])):
-                places = [stop.at_m for stop in these], [stop.beyond_m for stop in these]
+            for group, name, colour in ((following, FOLLOWING, COLOURS[0]), (holding, HOLDING, COLOURS[4])):
+                places = [stop.at_m for stop in group], [stop.beyond_m for stop in group]
                 axis.plot(*places, color=colour, label=name)
         axis.axhline(0.0, color="0.5", linewidth=0.8)
         axis.axhline(ALLOWED_M, color="black", linewidth=0.8, linestyle="--")
@@ -65,23 +65,24 @@ def draw(done: Done) -> Figure:
 
 
 def main() -> None:
-    """Stop everywhere, print, and draw where a file is named."""
-    done = [each for route in ROUTES for each in stops(route)]
+    """Compute all stops, print the tables, and draw the picture if a file is named."""
+    curve_stops = [each for route in ROUTES for each in stops(route)]
     print("| route | curve | bend, radius | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
-    for curve, each in groupby(done, key=itemgetter(0)):
-        print(row(curve, list(each)))
-    followed = [stop for _, stop, _ in done]
-    speeds_kmh = [stop.speed_mps * 3.6 for stop in followed]
+    for curve, each in groupby(curve_stops, key=itemgetter(0)):
+        print(format_row(curve, list(each)))
+    following = [stop for _, stop, _ in curve_stops]
+    speeds_kmh = [stop.speed_mps * 3.6 for stop in following]
     print(f"\nlast command at {min(speeds_kmh):.1f} to {max(speeds_kmh):.1f} km/h")
-    print(f"way from the last command to standstill: at most {max(stop.covered_m for stop in followed):.1f} m")
+    print(f"way from the last command to standstill: at most {max(stop.covered_m for stop in following):.1f} m")
     print("\n| condition | stops | worst along the path | worst with the wheel held | of these out |")
     print("| --- | --- | --- | --- | --- |")
     for condition in ("L1", "L3", "L5"):
-        _, delayed, held = zip(*stops("a", condition), strict=True)
-        print(f"| {condition} | {len(held)} | {worst(delayed)} | {worst(held)} | {out(held)} |")
+        _, delayed, holding = zip(*stops("a", condition), strict=True)
+        worst = f"{format_worst(delayed)} | {format_worst(holding)}"
+        print(f"| {condition} | {len(holding)} | {worst} | {count_beyond(holding)} |")
     for picture in sys.argv[1:]:
-        draw(done).savefig(picture, dpi=110)
+        draw(curve_stops).savefig(picture, dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""Vary a preset's settings one at a time, and print what theory says and what drives show, as Markdown tables.
+"""Vary a preset's settings one at a time, and print theory and measurements as Markdown tables.
 
     python benchmarks/sensitivity.py [--routes a_key,b_key,c_key] [--repetitions 3] [--jobs N]
 
-Drives are in geometry fidelity: the lane's true centre takes the detector's place, everything else is the whole loop.
-The latency is that of `paper_wifi5`, the seeds are the same in every column. `docs/controllers.md` holds what this
-printed.
+The drives use geometry fidelity: the lane's true centre replaces the detector, and everything else is the whole loop.
+The latency is that of `paper_wifi5`, and the seeds are the same in every column. `docs/controllers.md` has the output.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from lavt.experiment.runs.plan import plan_sweep
 from lavt.experiment.sweep.sweep import run_all
 
 DELAY_S = 0.081
-"""At L0 with `paper_wifi5`: 62 + 9 ms, and 10 ms from the picture to the wheel's command: see find_designed_preset."""
+"""Delay at L0 with `paper_wifi5`: 62 + 9 ms, and 10 ms from frame to steering command; see find_designed_preset."""
 CONDITIONS = ("L0", "L1", "L2", "L3", "L5")
-"""L4 is the same total delay as L3."""
+"""L4 has the same total delay as L3."""
 
 Values = Sequence[float]
 
 
 def variations(preset: Preset) -> dict[str, Values]:
-    """Give the values that each setting takes, the preset's own among them."""
+    """Return the values for each setting, including the preset's own."""
     limits: dict[str, Values] = (
         {"controller.lateral_limit_mps2": (2.0, 3.0, 4.5)}
         if math.isfinite(preset.lateral_limit_mps2)
@@ -48,7 +47,7 @@ def variations(preset: Preset) -> dict[str, Values]:
 
 
 def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
-    """Give the theory's loop with one setting changed; it knows nothing of limits."""
+    """Return the theoretical loop with one setting changed; the theory has no limits."""
     settings = {"controller.lookahead_s": preset.lookahead_s, "controller.speed_mps": preset.speed_mps, key: value}
     return LateralLoop(
         lookahead_s=settings["controller.lookahead_s"],
@@ -57,11 +56,11 @@ def loop_with(preset: Preset, key: str, value: float) -> LateralLoop:
     )
 
 
-def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[Mapping[str, Any]]:
-    """Drive every value under every condition, and give the results."""
+def run_drives(preset: str, key: str, values: Values, options: argparse.Namespace) -> list[Mapping[str, Any]]:
+    """Run every value under every condition, and return the results."""
     base = load_config(SweepConfig, shipped("configs/paper.yaml")).model_dump(mode="json")
     base["controller"]["preset"] = preset
-    requested = {
+    config = {
         **base,
         "fidelity": "geometry",
         "routes": options.routes.split(","),
@@ -69,37 +68,39 @@ def drives(preset: str, key: str, values: Values, options: argparse.Namespace) -
         "repetitions": options.repetitions,
         "axes": {key: list(values)},
     }
-    planned = plan_sweep(parse_config(SweepConfig, requested, "sensitivity"))
+    planned = plan_sweep(parse_config(SweepConfig, config, "sensitivity"))
     with TemporaryDirectory() as directory:
-        driven, _ = run_all(planned, Path(directory), jobs=options.jobs, tell=lambda _: None)
-    if driven.failed:
-        raise SystemExit(f"failed: {driven.failed}")
-    return list(driven.results)
+        completed, _ = run_all(planned, Path(directory), jobs=options.jobs, on_progress=lambda _: None)
+    if completed.failed:
+        raise SystemExit(f"failed: {completed.failed}")
+    return list(completed.results)
 
 
-def cell(results: Sequence[Mapping[str, Any]]) -> str:
-    """Say how many of the drives were completed, and the median of their P95."""
+def format_cell(results: Sequence[Mapping[str, Any]]) -> str:
+    """Format the share of completed drives and the median of their P95."""
     p95_m = [result["p95_m"] for result in results if result["ending"] == "completed"]
     share = f"{len(p95_m)}/{len(results)}"
     return f"{share}, {median(p95_m):.2f} m" if p95_m else share
 
 
-def table(preset: Preset, key: str, values: Values, options: argparse.Namespace) -> None:
-    """Print one table."""
-    results = drives(preset.name, key, values, options)
+def print_table(preset: Preset, key: str, values: Values, options: argparse.Namespace) -> None:
+    """Print the table of one setting."""
+    results = run_drives(preset.name, key, values, options)
     print(f"\n`{preset.name}`, `{key}`:\n")
     print("| value | phase margin at L0 | critical delay | " + " | ".join(CONDITIONS) + " |")
     print("|---" * (3 + len(CONDITIONS)) + "|")
     for value in values:
         loop = loop_with(preset, key, value)
         margin_deg, critical_ms = math.degrees(phase_margin_rad(loop, DELAY_S)), 1e3 * critical_delay_s(loop)
-        of_value = [result for result in results if result["axes"][key] == value]
-        cells = [cell([result for result in of_value if result["condition"] == name]) for name in CONDITIONS]
+        results_of_value = [result for result in results if result["axes"][key] == value]
+        cells = [
+            format_cell([result for result in results_of_value if result["condition"] == name]) for name in CONDITIONS
+        ]
         print(f"| {value:.3g} | {margin_deg:.0f} deg | {critical_ms:.0f} ms | " + " | ".join(cells) + " |", flush=True)
 
 
 def main() -> None:
-    """Print all tables of both presets."""
+    """Print the tables of both presets."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--routes", default="a_key,b_key,c_key")
     parser.add_argument("--repetitions", type=int, default=3)
@@ -108,7 +109,7 @@ def main() -> None:
     for name in ("designed", "paper_calibrated"):
         preset = find_preset(name)
         for key, values in variations(preset).items():
-            table(preset, key, values, options)
+            print_table(preset, key, values, options)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from lavt.domain import NS_PER_MS, NS_PER_S, CameraModel, Pose
 from lavt.errors import BadPacket
 from lavt.streams import stream
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.fec import RepairReceiver, RepairSender
 from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import VIDEO_PAYLOAD_TYPE, AccessUnit, Depacketizer, Packetizer, parse_packet
@@ -185,7 +185,7 @@ class Receiver:
             for recovered in self.repair.push(packet, now_ns):
                 ordered += self.reorder.push_recovered(recovered, now_ns)
                 media += 1
-        ordered += self.reorder.expire(now_ns + LEAST_HOLD_NS)
+        ordered += self.reorder.expire(now_ns + MIN_HOLD_NS)
         return media, [unit for each in ordered for unit in self.depacketizer.push(*each)]
 
 

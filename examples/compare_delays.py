@@ -1,4 +1,4 @@
-"""Drive one route in virtual time under two conditions, and compare how well the lane was kept.
+"""Drive one route in virtual time under two conditions, and compare the lane keeping.
 
 python examples/compare_delays.py [DIRECTORY]
 """
@@ -22,8 +22,8 @@ def main() -> None:
         changes = [f"network.condition={condition}", "vehicle.scenery=none"]
         run = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes))
         result = run_once(run, directory / condition)
-        print(f"{condition}: {result['ending']}, cross-track P95 {result['p95_m']:.2f} m, "
-              f"loop latency {result['loop_ms']['p50']:.0f} ms")  # fmt: skip
+        latency_ms, p95_m = result["loop_ms"]["p50"], result["p95_m"]
+        print(f"{condition}: {result['ending']}, cross-track P95 {p95_m:.2f} m, loop latency {latency_ms:.0f} ms")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""A controller of your own: Stanley's law (Hoffmann et al., American Control Conference 2007) beside the lane keeper.
+"""A custom controller: Stanley's law (Hoffmann et al., American Control Conference 2007), compared with the default.
 
 python examples/my_controller.py [DIRECTORY]
 
-A package of yours makes it known to every `lavt` command, as `controller.kind: stanley`, by an entry point:
+A package can register a controller for every `lavt` command, here as `controller.kind: stanley`, with an entry point:
 
     [project.entry-points."lavt.controllers"]
     stanley = "my_package:Stanley"
@@ -24,7 +24,7 @@ from lavt.experiment.runs.run import run_once
 
 
 class Stanley:
-    """Steers the front axle onto the lane's centre, and keeps the preset's speed."""
+    """A controller that steers the front axle onto the lane's centre, and keeps the preset's speed."""
 
     gain_per_s = 1.2
 
@@ -35,7 +35,7 @@ class Stanley:
         self._preset, self._wheelbase_m = preset, wheelbase_m
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
-        """Give wheel angle and pedals for the newest lane (vehicle's frame, left positive) and speed."""
+        """Return wheel angle and pedals for the newest lane (vehicle frame, left positive) and speed."""
         del now_ns
         c0, c1, c2 = lane.centre
         error_m = c0 + (c1 + c2 * self._wheelbase_m) * self._wheelbase_m
@@ -43,7 +43,7 @@ class Stanley:
         steering_rad = heading_rad + math.atan2(self.gain_per_s * error_m, max(speed_mps, 1.0))
         limit_rad = self._preset.steering_limit_rad
         throttle = 0.0 if lane.confidence < 0.2 else min(max(self._preset.speed_mps - speed_mps, 0.0), 1.0)
-        path_per_m = (2 * c2,) * PATH_POINTS  # the vehicle follows it when commands stop coming
+        path_per_m = (2 * c2,) * PATH_POINTS  # the vehicle follows this path after a command timeout
         return Decision(min(max(steering_rad, -limit_rad), limit_rad), throttle, 0.0, path_per_m)
 
 

@@ -4,19 +4,19 @@
 #     sudo sh netem/server.sh IF VIDEO_MS [VIDEO_PORT]        sudo sh netem/server.sh eth0 150
 #
 # IF        the interface that faces the client
-# VIDEO_MS  for how long RTP and sender reports are held
-# It begins with a free interface: clear it first with netem/clear.sh. What each word means: docs/netem.md.
+# VIDEO_MS  delay of RTP and sender reports
+# The interface must have its default queue: clear it first with netem/clear.sh. See docs/netem.md.
 set -eu
 interface=$1 video_ms=$2 video_port=${3:-5600}
 trap '[ $? = 0 ] || tc qdisc del dev "$interface" root handle 4c56: 2>/dev/null' EXIT
 
-# Six bands: everything goes through the first three as before, filters alone lead to the others.
+# Six bands: by default all traffic uses the first three; only filters send packets to the others.
 tc qdisc add dev "$interface" root handle 4c56: prio bands 6
 
-# The fourth band holds what comes. A rate makes netem keep order; this one costs a packet a microsecond.
+# The fourth band delays its packets. netem keeps order only with a rate; this one costs a microsecond per packet.
 tc qdisc add dev "$interface" parent 4c56:4 handle 4c01: netem limit 10000 delay "${video_ms}ms" rate 10gbit
 
-# From the video's port, whole packets, whose payload begins as RTP does (version 2): not the challenges of its path.
+# Whole packets from the video's port whose payload begins like RTP (version 2), not the challenges of its path.
 tc filter add dev "$interface" parent 4c56: protocol ip prio 1 u32 match u8 0x45 0xff at 0 \
     match u16 0x0000 0x1fff at 6 match ip protocol 17 0xff match ip sport "$video_port" 0xffff \
     match u8 0x80 0xc0 at 28 classid 4c56:4

@@ -1,4 +1,4 @@
-"""What a test needs of the machine, and what LAVT_REQUIRE makes of its absence."""
+"""Skip tests whose requirements are missing, or fail them if LAVT_REQUIRE names the requirement."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 
 def need(part: str, reason: str) -> NoReturn:
-    """Skip the test that asks; fail it where LAVT_REQUIRE, a list with commas, names the part."""
+    """Skip the calling test; fail it if LAVT_REQUIRE, a comma-separated list, names the part."""
     required = os.environ.get("LAVT_REQUIRE", "").replace(" ", "").split(",")
     if part in required:
         pytest.fail(f"LAVT_REQUIRE names {part}: {reason}", pytrace=False)

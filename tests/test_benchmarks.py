@@ -14,8 +14,8 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 BENCHMARK = BENCHMARKS / "virtual_loop.py"
 
 
-def test_stages_make_up_the_whole() -> None:
-    """What the stages leave of the whole is the rest; a stage without any time, or more than the whole, is an error."""
+def test_rest_completes_the_stages() -> None:
+    """The rest is the whole less the stages; a stage without time, or stages above the whole, are an error."""
     assert with_rest({"render": 2.0, "encode": 3.0}, 6.0) == {"render": 2.0, "encode": 3.0, "rest": 1.0}
     with pytest.raises(WorkError, match="encode"):
         with_rest({"render": 2.0, "encode": 0.0}, 6.0)
@@ -24,27 +24,33 @@ def test_stages_make_up_the_whole() -> None:
 
 
 @pytest.mark.full
-def test_the_benchmark_of_the_virtual_loop_runs() -> None:
-    """`benchmarks/virtual_loop.py` tells how many times real time is reached and where it goes, last as JSON."""
-    done = subprocess.run(
+def test_virtual_loop_benchmark_runs() -> None:
+    """`benchmarks/virtual_loop.py` prints the speed relative to real time and the stages, and JSON in the last line."""
+    completed = subprocess.run(
         [sys.executable, BENCHMARK, "--settings", "geometry", "--repetitions", "1", "--limit-s", "2"],
-        capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    last = json.loads(done.stdout.splitlines()[-1])
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    last = json.loads(completed.stdout.splitlines()[-1])
     assert list(last) == ["full_x", "bare_x", "geometry_x", "perception_ms", "render_ms"]
     assert last["geometry_x"] > 0
     for stage in ("render", "perception", "control", "rest"):
-        assert f"{stage} " in done.stdout
+        assert f"{stage} " in completed.stdout
 
 
 @pytest.mark.full
-def test_the_benchmark_of_the_onset_runs() -> None:
-    """`benchmarks/growth_onset.py` prints theory and measurement of each case as a row of a table."""
-    done = subprocess.run(
+def test_growth_onset_benchmark_runs() -> None:
+    """`benchmarks/growth_onset.py` prints theory and measurement of each case as a table row."""
+    completed = subprocess.run(
         [sys.executable, BENCHMARKS / "growth_onset.py", "--lookaheads", "0.74", "--rates", "15", "--speeds", "6"],
-        capture_output=True, text=True, check=True, timeout=300,
-    )  # fmt: skip
-    header, _, row = done.stdout.splitlines()
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
+    header, _, row = completed.stdout.splitlines()
     assert header.count("|") == row.count("|")
     assert row.startswith("| 0.74 s | 15 Hz | 6 m/s | ")
     theory_ms, measured_ms, difference_ms = (float(cell.split()[0]) for cell in row.split("|")[-4:-1])
@@ -54,31 +60,36 @@ def test_the_benchmark_of_the_onset_runs() -> None:
 
 
 @pytest.mark.full
-def test_the_study_of_the_stamp_runs() -> None:
-    """`benchmarks/stamp_reading.py` prints a table for each size and one of the checks, and last, if asked, JSON."""
+def test_stamp_reading_study_runs() -> None:
+    """`benchmarks/stamp_reading.py` prints a table for each size and for the checks, and JSON with --json."""
     requested = ["--sizes", "320x240", "--rates-kbps", "460", "--frames", "40", "--processes", "1", "--json"]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, BENCHMARKS / "stamp_reading.py", *requested],
-        capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    lines = done.stdout.splitlines()
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    lines = completed.stdout.splitlines()
     assert lines[4].startswith("| 460 | ")
     last = json.loads(lines[-1])
-    assert [(cell["loss"], cell["repair"]) for cell in last["cells"]] == [
-        (0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2),
-    ]  # fmt: skip
+    cells = [(cell["loss"], cell["repair"]) for cell in last["cells"]]
+    assert cells == [(0.0, 0), (0.01, 0), (0.01, 1), (0.05, 0), (0.05, 1), (0.05, 2)]
     whole = last["cells"][0]
     assert whole["accepted"] == whole["frames"] == whole["intact"] == whole["intact_good"] == 40
     assert (whole["unread_share"], whole["good_of_intact"]) == (0.0, 1.0)
 
 
 @pytest.mark.full
-def test_the_benchmark_of_the_rendezvous_runs() -> None:
-    """`benchmarks/rendezvous.py` tells how long packets take straight and through the process, last as JSON."""
-    done = subprocess.run(
+def test_rendezvous_benchmark_runs() -> None:
+    """`benchmarks/rendezvous.py` prints the delays of packets with and without the forwarder, last as JSON."""
+    completed = subprocess.run(
         [sys.executable, BENCHMARKS / "rendezvous.py", "--seconds", "0.5"],
-        capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    took_us = json.loads(done.stdout.splitlines()[-1])["us"]
-    assert took_us["straight"]["p50"] > 0
-    assert took_us["through"]["p50"] > 0
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    delays_us = json.loads(completed.stdout.splitlines()[-1])["us"]
+    assert delays_us["straight"]["p50"] > 0
+    assert delays_us["through"]["p50"] > 0

@@ -15,12 +15,12 @@ from lavt.config import ClientCameraConfig, ClientConfig, ServerCameraConfig, Se
 from lavt.domain import Now
 from lavt.node import WAKE, Node
 
-OUTSIDE_OF_THE_NODES = {"clock_source", "injector", "operator", "runtime"}
+EXTERNAL_SENDERS = {"clock_source", "injector", "operator", "runtime"}
 
 
 @pytest.fixture(scope="module")
 def nodes() -> Sequence[Node]:
-    """All nodes of both sides, as they are built for a run."""
+    """Return all nodes of both sides, built as for a run."""
     camera = ServerCameraConfig(width_px=640, height_px=480)
     server = build_server(
         ServerConfig(vehicle=VehicleConfig(scenery="none"), camera=camera),
@@ -38,67 +38,72 @@ def nodes() -> Sequence[Node]:
 
 
 PART_OF = {"picture_reader": "driver"}
-"""Modules of which a node is made."""
+"""Modules that belong to a node of another name."""
 
 
 def sent_channels() -> set[tuple[str, str]]:
-    """Read from the nodes' source what they send: (module, channel)."""
+    """Return (module, channel) of each `Send` in the source of the nodes."""
     found = set()
     for path in Path(str(lavt.nodes.__file__)).parent.glob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Send":
                 channel = call.args[0]
-                assert isinstance(channel, ast.Constant), f"{path.name}:{call.lineno} sends on a channel without a name"
+                assert isinstance(channel, ast.Constant), (
+                    f"{path.name}:{call.lineno} sends on a channel that is not a constant"
+                )
                 found.add((PART_OF.get(path.stem, path.stem), str(channel.value)))
     return found
 
 
-def test_what_nodes_listen_to(nodes: Sequence[Node]) -> None:
-    """Nodes listen to the channels that name them as receivers in the table, and to no others."""
-    listened = {(channel, node.name) for node in nodes for channel in node.chains if channel != WAKE}
-    assert listened == {(channel, name) for channel, row in CHANNELS.items() for name in row.receivers}
+def test_nodes_receive_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
+    """Nodes receive exactly the channels that list them as receivers."""
+    received = {(channel, node.name) for node in nodes for channel in node.pipelines if channel != WAKE}
+    assert received == {(channel, name) for channel, row in CHANNELS.items() for name in row.receivers}
 
 
-def test_every_chain_has_named_stages(nodes: Sequence[Node]) -> None:
-    """A chain has at least one hop, and its hops have different names: the timeline tells them apart by these."""
+def test_stages_have_different_names(nodes: Sequence[Node]) -> None:
+    """Each pipeline has at least one stage, and its stages have different names."""
     for node in nodes:
-        for stages in node.chains.values():
+        for stages in node.pipelines.values():
             names = [name for name, _ in stages]
             assert names
             assert len(set(names)) == len(names)
 
 
-def test_what_nodes_send(nodes: Sequence[Node]) -> None:
-    """What a node sends goes over a channel of the table; where somebody listens, the table names it as the sender."""
+def test_nodes_send_on_the_channels_of_the_table(nodes: Sequence[Node]) -> None:
+    """Nodes send on channels of the table only, and the table names them as senders."""
     sent = sent_channels()
     assert {channel for _, channel in sent} <= CHANNELS.keys()
-    heard = {(module, channel) for module, channel in sent if CHANNELS[channel].carrier != "record"}
+    received = {(module, channel) for module, channel in sent if CHANNELS[channel].carrier != "record"}
     names = {node.name for node in nodes}
-    assert heard == {
+    assert received == {
         (row.sender, name) for name, row in CHANNELS.items() if row.sender in names and row.carrier != "record"
     }
 
 
-def test_table_names_nodes(nodes: Sequence[Node]) -> None:
-    """Senders and receivers in the table are names of nodes, of the runtime, of the source of time or of a person."""
+def test_senders_and_receivers_exist(nodes: Sequence[Node]) -> None:
+    """Senders and receivers in the table are nodes, the runtime, a clock source, an injector or the operator."""
     names = {node.name for node in nodes}
-    assert {row.sender for row in CHANNELS.values()} <= names | OUTSIDE_OF_THE_NODES
+    assert {row.sender for row in CHANNELS.values()} <= names | EXTERNAL_SENDERS
     assert set(chain.from_iterable(row.receivers for row in CHANNELS.values())) == names
 
 
-def test_everything_but_records_is_heard() -> None:
-    """A channel has a receiver unless it is written down only, or is for the host's clock or queues."""
-    deaf = {name for name, row in CHANNELS.items() if not row.receivers}
-    assert deaf == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {"clock_query", "inject"}
+def test_every_channel_but_records_has_a_receiver() -> None:
+    """Every channel has a receiver, except for records, clock queries and injection orders."""
+    without_receivers = {name for name, row in CHANNELS.items() if not row.receivers}
+    assert without_receivers == {name for name, row in CHANNELS.items() if row.carrier == "record"} | {
+        "clock_query",
+        "inject",
+    }
 
 
 def test_ground_truth_stays_on_the_server() -> None:
-    """What only a simulator knows crosses no network and reaches no node."""
+    """Ground truth is recorded only; it crosses no network and reaches no node."""
     assert CHANNELS["truth"].carrier == "record"
     assert CHANNELS["truth"].receivers == ()
 
 
-def test_commands_wait_in_order() -> None:
-    """Every command is admitted or refused by itself: commands queue, and the queue is bounded."""
+def test_commands_queue() -> None:
+    """Commands queue, because each one is judged, and the queue is bounded."""
     assert CHANNELS["control"].waiting == "queue"
     assert 0 < QUEUE_LENGTH < 100_000

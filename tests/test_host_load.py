@@ -11,8 +11,8 @@ from tests.support.stalls import Stalls
 MODULE = [sys.executable, "-m", "tests.support.host_load"]
 
 
-def test_stops_follow_from_the_seed() -> None:
-    """The same seed stops the processors at the same times, another one at others; on average as often as asked."""
+def test_stop_times_follow_from_the_seed() -> None:
+    """The same seed gives the same stop times and another seed others, with the requested mean rate."""
     stops = stop_times(1, 20, 300, 20_000)
     assert stops == stop_times(1, 20, 300, 20_000) != stop_times(2, 20, 300, 20_000)
     assert 850 < len(stops) < 1150
@@ -22,21 +22,21 @@ def test_stops_follow_from_the_seed() -> None:
 
 
 @pytest.mark.parametrize("arguments", [["--share", "0.3"], ["--share", "0.7", "--stop-ms", "300", "--", "true"]])
-def test_what_it_cannot_do_is_an_error(arguments: list[str]) -> None:
-    """Without a command, or with more load than the kernel allows real-time programs, it says so and ends with 2."""
+def test_invalid_arguments_are_rejected(arguments: list[str]) -> None:
+    """Without a command, or with more load than the kernel allows real-time programs, the exit code is 2."""
     assert subprocess.run([*MODULE, *arguments], capture_output=True, check=False).returncode == 2
 
 
 @pytest.mark.realtime
-def test_processors_are_taken_away() -> None:
-    """The command runs with stops of all processors together and a share taken; the exit code is the command's."""
+def test_load_stops_all_processors_together() -> None:
+    """The command runs while all processors stop together and the load takes a share; its exit code is returned."""
     measured = Stalls.measured()
     try:
         if not all(probe.above for probe in measured.probes):
             pytest.skip("needs the right to real-time priority")
         options = ["--share", "0.3", "--stop-ms", "120", "--stops-every-s", "0.5", "--seed", "1"]
         command = [sys.executable, "-c", "import time; time.sleep(3); raise SystemExit(3)"]
-        done = subprocess.run([*MODULE, *options, "--", *command], capture_output=True, text=True, check=False)
+        completed = subprocess.run([*MODULE, *options, "--", *command], capture_output=True, text=True, check=False)
         measured.collect()
     finally:
         measured.end()
@@ -44,10 +44,10 @@ def test_processors_are_taken_away() -> None:
         [each for each in measured.recorded if each.processor == probe.processor and each.length_ms > 90]  # type: ignore[attr-defined]
         for probe in measured.probes
     ]
-    assert done.returncode == 3
+    assert completed.returncode == 3
     assert len({len(each) for each in stops}) == 1
     assert stops[0]
-    for together in zip(*stops, strict=True):
-        assert max(each.end_ns for each in together) - min(each.end_ns for each in together) < 20_000_000
-    shares = [float(line.partition(" had ")[2].partition("%")[0]) for line in done.stderr.splitlines()]
-    assert all(share > 90 for share in shares), done.stderr
+    for ends in zip(*stops, strict=True):
+        assert max(each.end_ns for each in ends) - min(each.end_ns for each in ends) < 20_000_000
+    shares = [float(line.partition(" had ")[2].partition("%")[0]) for line in completed.stderr.splitlines()]
+    assert all(share > 90 for share in shares), completed.stderr

@@ -1,4 +1,4 @@
-"""`tests/kernel/run` on a machine where it cannot run, and the arguments that it hands to pytest."""
+"""`tests/kernel/run` on a machine where it cannot run, and the arguments that it passes to pytest."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.kernel.lane.command import pytest_arguments, writable
+from tests.kernel.lane.command import pytest_arguments, writable_directories
 
 RUN = Path(__file__).parent / "kernel" / "run"
 
 
 def rejection(*arguments: str, **environment: str) -> str:
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, str(RUN), *arguments],
         env={**os.environ, **environment},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert "Traceback" not in done.stderr
-    return done.stderr.splitlines()[-1]
+    assert completed.returncode == 2
+    assert completed.stdout == ""
+    assert "Traceback" not in completed.stderr
+    return completed.stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
-    ("given", "passed"),
+    ("extra", "expected"),
     [
         ([], ["tests/kernel"]),
         (["-x", "-k", "lane"], ["-x", "-k", "lane", "tests/kernel"]),
@@ -38,44 +38,44 @@ def rejection(*arguments: str, **environment: str) -> str:
         (["tests/assembly/test_assembly.py"], ["tests/assembly/test_assembly.py", "tests/kernel"]),
     ],
 )
-def test_tests_are_named_by_their_file_alone(given: list[str], passed: list[str]) -> None:
-    """A test file of the lane may be named by its name, and without one all of tests/kernel is run."""
-    assert pytest_arguments(given) == passed
+def test_files_can_be_given_by_name(extra: list[str], expected: list[str]) -> None:
+    """A test file of the lane can be given by its name, and without one all of tests/kernel runs."""
+    assert pytest_arguments(extra) == expected
 
 
-def test_without_debian_it_says_what_to_do(tmp_path: Path) -> None:
-    """Where there is no apt-get, one sentence names a system that has it."""
+def test_missing_apt_get_is_reported(tmp_path: Path) -> None:
+    """Without apt-get the message names a system that has it."""
     assert "use Debian or Ubuntu" in rejection(PATH=str(tmp_path), LAVT_KERNEL=str(tmp_path / "kernel"))
 
 
-def test_without_the_archive_it_says_what_to_do(tmp_path: Path) -> None:
-    """Where Debian's archive is out of reach, one sentence says so."""
+def test_unreachable_archive_is_reported(tmp_path: Path) -> None:
+    """If Debian's archive cannot be reached, the message says so."""
     for name in ("apt-get", "dpkg"):
-        stand_in = tmp_path / name
-        stand_in.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('E: Could not resolve the archive')\n")
-        stand_in.chmod(0o755)
+        fake_tool = tmp_path / name
+        fake_tool.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('E: Could not resolve the archive')\n")
+        fake_tool.chmod(0o755)
 
-    said = rejection(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
+    message = rejection(PATH=f"{tmp_path}{os.pathsep}{os.environ['PATH']}", LAVT_KERNEL=str(tmp_path / "kernel"))
 
-    assert "Could not resolve the archive" in said
-    assert "connect this machine" in said
+    assert "Could not resolve the archive" in message
+    assert "connect this machine" in message
 
 
-def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    """Where the cache directory cannot be made, one sentence names LAVT_KERNEL."""
+def test_unwritable_cache_is_reported(tmp_path: Path) -> None:
+    """If the cache directory cannot be created, the message names LAVT_KERNEL."""
     (tmp_path / "file").touch()
 
     assert "LAVT_KERNEL" in rejection(LAVT_KERNEL=str(tmp_path / "file" / "kernel"))
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_the_machines_may_write_where_they_are_told_to(
-    told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("has_progress", [False, True])
+def test_writable_directories_of_the_machines(
+    has_progress: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They write below --out and beside the file of LAVT_PROGRESS, and nowhere else."""
+    """The machines may write to `--out` and to the directory of LAVT_PROGRESS, and nowhere else."""
     progress = tmp_path / "lane" / "progress"
     monkeypatch.delenv("LAVT_PROGRESS", raising=False)
-    if told:
+    if has_progress:
         monkeypatch.setenv("LAVT_PROGRESS", str(progress))
-    assert writable(None) == [progress.parent] * told
-    assert writable(tmp_path / "out") == [*[progress.parent] * told, tmp_path / "out"]
+    assert writable_directories(None) == [progress.parent] * has_progress
+    assert writable_directories(tmp_path / "out") == [*[progress.parent] * has_progress, tmp_path / "out"]

@@ -1,4 +1,4 @@
-"""The host's record of stalls inside a machine of the kernel lane, and what it explains, without such a machine."""
+"""The host's record of stalls inside a machine of the kernel lane, and what it excuses, tested without a machine."""
 
 from __future__ import annotations
 
@@ -13,39 +13,43 @@ from typing import Any
 import pytest
 from tests.field.by_wire import STOP_STALL_MS
 from tests.kernel.lane import clocks, host_stalls
-from tests.kernel.lane.host_stalls import AT_ONCE, HostProbe
-from tests.kernel.lane.verdicts import MEDIAN_SHARE, least_stall_ms, least_stop_ms, or_too_slow
-from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, stalled_share
+from tests.kernel.lane.host_stalls import STALLS_PER_ANSWER, HostProbe
+from tests.kernel.lane.verdicts import MEDIAN_SHARE, least_stall_ms, least_stop_ms
+from tests.support.stalls import HostStalled, ProbeEnded, Stall, Stalls, excuse_slow_machine, stalled_share
 from tests.test_stalls import QUIET, FakeProbe, stalls_of
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 
 COUNTER_HZ = 2e9
-HERE = 9_000_000_000, 50 * NS_PER_S
-"""Reading of the counter and of this machine's clock."""
+READING = 9_000_000_000, 50 * NS_PER_S
+"""A reading of the counter and of this machine's clock."""
 FAIR_SERVER_MS = 60
-"""What ordinary programs get of each second where a machine uses up its processor."""
+"""What ordinary programs get of each second if a machine uses its processor fully."""
 
 
 @pytest.fixture(autouse=True)
 def counter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The counter is another at each reading, and no machine is needed that has one."""
+    """Replace the counter by fixed readings, so that no particular processor is needed."""
     monkeypatch.setattr(clocks, "counter_hz", lambda: COUNTER_HZ)
-    monkeypatch.setattr(clocks, "monotonic_reading", lambda: HERE)
-    monkeypatch.setattr(host_stalls, "ASK_S", 1000)
+    monkeypatch.setattr(clocks, "read_monotonic_clock", lambda: READING)
+    monkeypatch.setattr(host_stalls, "POLL_S", 1000)
 
 
-def told(*stalls: tuple[int, int, int], more: bool = False) -> dict[str, Any]:
-    """An answer of the host, whose clock is at 7 s 1.5 s before the reading here."""
+def answer_with(*stalls: tuple[int, int, int], more: bool = False) -> dict[str, Any]:
+    """Return an answer of the host, whose clock reads 7 s, 1.5 s before the reading here."""
     return {
-        "counter": HERE[0] - 3_000_000_000, "mono_ns": 7 * NS_PER_S, "stalls": stalls, "more": more, "above": True,
+        "counter": READING[0] - 3_000_000_000,
+        "mono_ns": 7 * NS_PER_S,
+        "stalls": stalls,
+        "more": more,
+        "above": True,
         "processor_times": QUIET,
-    }  # fmt: skip
+    }
 
 
 @contextmanager
-def line(*answers: dict[str, Any]) -> Iterator[str]:
-    """Give the device of a serial line, at whose other end each question gets the next answer."""
+def serial_line(*answers: dict[str, Any]) -> Iterator[str]:
+    """Return the device of a serial line whose other end gives these answers in order."""
     host, machine = os.openpty()
 
     def answer() -> None:
@@ -61,36 +65,36 @@ def line(*answers: dict[str, Any]) -> Iterator[str]:
     os.close(host)
 
 
-def test_times_of_the_host_become_this_machines() -> None:
+def test_host_times_are_converted() -> None:
     """A stall that ended 0.5 s before the host's answer, read here 1.5 s later, ended 2 s before the reading."""
-    with line(told(), told((1, 6_400_000_000, 6_500_000_000))) as device:
+    with serial_line(answer_with(), answer_with((1, 6_400_000_000, 6_500_000_000))) as device:
         probe = HostProbe(device)
         assert probe.report() == (48_500_000_000, [Stall(1, 47_900_000_000, 48_000_000_000)])
         probe.end()
 
 
-def test_a_record_in_pieces_is_complete() -> None:
-    """Where the host has more to tell than fits into an answer, a report asks until it has all of it."""
-    pieces = [told((0, number, number + 1), more=number < 2) for number in range(3)]
-    with line(told(), *pieces, told()) as device:
+def test_long_record_takes_several_answers() -> None:
+    """If the host has more stalls than fit into an answer, a report queries until it has all of them."""
+    pieces = [answer_with((0, number, number + 1), more=number < 2) for number in range(3)]
+    with serial_line(answer_with(), *pieces, answer_with()) as device:
         probe = HostProbe(device)
         assert len(probe.report()[1]) == 3
         assert probe.report()[1] == []
         probe.end()
 
 
-def test_a_probe_that_ended_on_the_host_is_noticed_here() -> None:
-    """A report raises `ProbeEnded` where one of the host's probes has ended."""
-    with line(told(), {"ended": "processor 1"}) as device:
+def test_ended_host_probe_is_reported() -> None:
+    """A report raises `ProbeEnded` if one of the host's probes has ended."""
+    with serial_line(answer_with(), {"ended": "processor 1"}) as device:
         probe = HostProbe(device)
         with pytest.raises(ProbeEnded, match="processor 1"):
             probe.report()
         probe.end()
 
 
-def test_the_hosts_share_of_idle_time_counts() -> None:
-    """The processor times are the host's, and the last ones are still there when the record has ended."""
-    with line(told(), {"ended": "processor 1"}) as device:
+def test_processor_times_are_those_of_the_host() -> None:
+    """The processor times are the host's, and the last ones remain available after the record has ended."""
+    with serial_line(answer_with(), {"ended": "processor 1"}) as device:
         probe = HostProbe(device)
         with pytest.raises(ProbeEnded):
             probe.report()
@@ -98,14 +102,14 @@ def test_the_hosts_share_of_idle_time_counts() -> None:
         probe.end()
 
 
-def test_an_answer_is_short() -> None:
-    """An answer has at most 40 stalls and says that there are more; the next one goes on, and none is told twice."""
-    recorded = [Stall(0, number, number + 1) for number in range(AT_ONCE + 1)]
+def test_answers_have_a_limited_length() -> None:
+    """An answer has at most 40 stalls and announces more; the next answer has the others, and none twice."""
+    recorded = [Stall(0, number, number + 1) for number in range(STALLS_PER_ANSWER + 1)]
     stalls = Stalls([FakeProbe([(0, []), (0, recorded)])], lambda: QUIET)
-    first, second = (host_stalls._answer(stalls) for _ in range(2))
-    assert (len(first["stalls"]), first["more"]) == (AT_ONCE, True)
+    first, second = (host_stalls._query(stalls) for _ in range(2))
+    assert (len(first["stalls"]), first["more"]) == (STALLS_PER_ANSWER, True)
     assert (len(second["stalls"]), second["more"]) == (1, False)
-    longest = told(*((1, 10**18, 10**18) for _ in range(AT_ONCE)))
+    longest = answer_with(*((1, 10**18, 10**18) for _ in range(STALLS_PER_ANSWER)))
     assert len(json.dumps(longest)) < 3900
 
 
@@ -120,8 +124,8 @@ def test_an_answer_is_short() -> None:
         ("chrony and the probe disagree about the offset between the clocks: 1.00 and 9.00 ms", math.inf),
     ],
 )
-def test_each_reason_against_a_drive_has_the_least_stall_that_explains_it(reason: str, least_ms: float) -> None:
-    """Samples of clocks that are missing take a stall of 1.5 s; no stall explains what is no matter of time."""
+def test_least_stall_for_each_reason_against_a_drive(reason: str, least_ms: float) -> None:
+    """Missing clock samples need a stall of 1.5 s; no stall explains reasons that do not depend on timing."""
     assert least_stall_ms(reason) == least_ms
 
 
@@ -129,24 +133,26 @@ def test_each_reason_against_a_drive_has_the_least_stall_that_explains_it(reason
     ("reason", "least_ms"),
     [
         ("driving -> safe_stop: no command for 500 ms", 100),
-        ("the vehicle does not obey: no SteerReport1 for 100 ms; no BrakeReport1 for 100 ms", 40),
-        ("the vehicle does not obey: no SteerReport1 for 200 ms", 140),
+        ("the vehicle does not accept commands: no SteerReport1 for 100 ms; no BrakeReport1 for 100 ms", 40),
+        ("the vehicle does not accept commands: no SteerReport1 for 200 ms", 140),
     ],
 )
-def test_each_safe_stop_has_the_least_stall_that_explains_it(reason: str, least_ms: float) -> None:
-    """A stop by missing commands takes 100 ms; one by missing reports 60 ms less than their time-out."""
+def test_least_stall_for_each_safe_stop(reason: str, least_ms: float) -> None:
+    """A stop by missing commands needs 100 ms; one by missing reports 60 ms less than their timeout."""
     assert least_stop_ms(reason) == least_ms
 
 
-def test_a_machine_that_uses_up_its_processor_is_not_too_slow_by_that() -> None:
-    """What the kernel gives ordinary programs then stops no command for 300 ms, and is too small a share."""
+def test_full_processor_use_excuses_nothing() -> None:
+    """The share of ordinary programs on a fully used processor is too short and too small to excuse a failure."""
     assert STOP_STALL_MS > FAIR_SERVER_MS
-    own = stalls_of(*(Stall(0, at_s * NS_PER_S, at_s * NS_PER_S + FAIR_SERVER_MS * NS_PER_MS) for at_s in range(10)))
-    assert isinstance(or_too_slow(AssertionError(), own, 0, 10 * NS_PER_S), AssertionError)
-    assert stalled_share(own.recorded, 0, 10 * NS_PER_S) < MEDIAN_SHARE
+    with_stalls = stalls_of(
+        *(Stall(0, at_s * NS_PER_S, at_s * NS_PER_S + FAIR_SERVER_MS * NS_PER_MS) for at_s in range(10))
+    )
+    assert isinstance(excuse_slow_machine(AssertionError(), with_stalls, 0, 10 * NS_PER_S), AssertionError)
+    assert stalled_share(with_stalls.recorded, 0, 10 * NS_PER_S) < MEDIAN_SHARE
 
 
-def test_many_short_stalls_make_a_machine_too_slow() -> None:
-    """A drive of which 15 % was stalled, 3 ms at a time, is run again."""
+def test_many_short_stalls_excuse_a_drive() -> None:
+    """A drive that was stalled for 15 % of its time, 3 ms at a time, is repeated."""
     many = stalls_of(*(Stall(0, at * 20 * NS_PER_MS, (at * 20 + 3) * NS_PER_MS) for at in range(50)))
-    assert isinstance(or_too_slow(AssertionError(), many, 0, NS_PER_S), HostStalled)
+    assert isinstance(excuse_slow_machine(AssertionError(), many, 0, NS_PER_S), HostStalled)

@@ -1,4 +1,4 @@
-"""Which tests belong to which lane, and what the runner of lanes says of them."""
+"""Which tests belong to which lane, and the results of the lane runner."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from tests.lanes import FOLDERS, FULL, LANES, QUICK, REPOSITORY, TESTS, Lane, chosen, runs_side_by_side
-from tests.support.lane_runner import Outcome, closing_line, counts_of, run_lanes, table
+from tests.lanes import FOLDERS, FULL, LANES, QUICK, REPOSITORY, TESTS, LaneSpec, runs_in_parallel, select_lanes
+from tests.support.lane_runner import LaneOutcome, closing_line, counts_of, run_lanes, table
 
 OPTIONS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
 PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "pytest" in lane.commands[0]}
@@ -20,7 +20,7 @@ PYTEST_LANES = {lane.name: lane.commands[0][3:] for lane in (*LANES, FULL) if "p
 
 @pytest.fixture(scope="module")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
-    """Give what each lane's command collects in a small tree with this project's options: lane to tests."""
+    """Return the tests that each lane's command collects in a small project with these options."""
     root = tmp_path_factory.mktemp("project")
     plain = "import pytest\n\ndef test_plain(): pass\n"
     marked = "".join(f"\n@pytest.mark.{marker}\ndef test_{marker}(): pass\n" for marker in ("full", "realtime"))
@@ -35,18 +35,19 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     lines = [f"{key} = {value!r}" for key, value in options.items()]
     (root / "pyproject.toml").write_text("\n".join(["[tool.pytest.ini_options]", *lines, ""]))
     return {
-        name: {line for line in said_by(root, arguments) if "::" in line} for name, arguments in PYTEST_LANES.items()
+        name: {line for line in collect_tests(root, arguments) if "::" in line}
+        for name, arguments in PYTEST_LANES.items()
     }
 
 
-def said_by(root: Path, arguments: tuple[str, ...]) -> list[str]:
-    """Return what pytest says when it only collects."""
+def collect_tests(root: Path, arguments: tuple[str, ...]) -> list[str]:
+    """Return the output lines of pytest's collection."""
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", *arguments]
     return subprocess.run(command, cwd=root, capture_output=True, text=True, check=False).stdout.splitlines()
 
 
 def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
-    """The lanes' commands together run every test, and none twice; the kernel lane runs its folder itself."""
+    """The lanes' commands together run every test exactly once; the kernel lane runs its folder itself."""
     tests = [f"tests/{folder}/test_{folder}.py::test_plain" for folder in ("cli", *FOLDERS)]
     tests += [f"tests/cli/test_cli.py::test_{marker}" for marker in ("full", "realtime")]
     tests += [f"tests/test_root.py::test_{marker}" for marker in ("plain", "full", "realtime")]
@@ -54,8 +55,8 @@ def test_every_test_belongs_to_one_lane(collected: dict[str, set[str]]) -> None:
     assert Counter(each for lane in collected.values() for each in lane) == Counter(tests)
 
 
-def test_folder_and_marker_decide(collected: dict[str, set[str]]) -> None:
-    """The folders of lanes have their own, `full` has what is marked, and the quick tests are the rest."""
+def test_folder_and_marker_select_the_lane(collected: dict[str, set[str]]) -> None:
+    """Lane folders have their own tests, `full` has the marked ones, and the rest are quick tests."""
     assert collected["quick"] == {"tests/test_root.py::test_plain", "tests/cli/test_cli.py::test_plain"}
     assert collected["full"] == {"tests/test_root.py::test_full", "tests/cli/test_cli.py::test_full"}
     assert collected["realtime"] == {
@@ -67,8 +68,8 @@ def test_folder_and_marker_decide(collected: dict[str, set[str]]) -> None:
         assert collected[folder] == {f"tests/{folder}/test_{folder}.py::test_plain"}
 
 
-def test_no_file_in_a_lane_of_its_own_is_marked() -> None:
-    """A test in the folder of a lane carries no lane's marker: it would be in two lanes, or in none."""
+def test_tests_in_lane_folders_have_no_lane_marker() -> None:
+    """A test in a lane's folder has no lane marker, because it would then be in two lanes, or in none."""
     marked = [
         path.relative_to(TESTS)
         for folder in FOLDERS
@@ -78,20 +79,20 @@ def test_no_file_in_a_lane_of_its_own_is_marked() -> None:
     assert marked == []
 
 
-def test_only_what_judges_no_times_runs_side_by_side() -> None:
-    """The quick and the full tests use all processors; single files and the other lanes run one after the other."""
+def test_only_untimed_lanes_run_in_parallel() -> None:
+    """The quick and the full tests use all processors; single files and other lanes run sequentially."""
     assert shlex.split(OPTIONS["addopts"])[-1] == QUICK
-    assert runs_side_by_side(QUICK, [])
-    assert runs_side_by_side("full", [TESTS, TESTS / "cli"])
-    assert not runs_side_by_side("realtime", [TESTS])
-    assert not runs_side_by_side(QUICK, [TESTS / "test_lanes.py"])
-    assert not any(runs_side_by_side(QUICK, [TESTS / folder]) for folder in FOLDERS)
-    assert not runs_side_by_side(QUICK, [TESTS / "kernel" / "lane"])
+    assert runs_in_parallel(QUICK, [])
+    assert runs_in_parallel("full", [TESTS, TESTS / "cli"])
+    assert not runs_in_parallel("realtime", [TESTS])
+    assert not runs_in_parallel(QUICK, [TESTS / "test_lanes.py"])
+    assert not any(runs_in_parallel(QUICK, [TESTS / folder]) for folder in FOLDERS)
+    assert not runs_in_parallel(QUICK, [TESTS / "kernel" / "lane"])
 
 
 def test_every_lane_is_documented() -> None:
-    """CONTRIBUTING.md has a line for each lane with its command."""
-    told = (REPOSITORY / "CONTRIBUTING.md").read_text()
+    """CONTRIBUTING.md names the command of each lane."""
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text()
     commands = [
         "pytest -m full",
         "pytest -m realtime",
@@ -99,14 +100,17 @@ def test_every_lane_is_documented() -> None:
         "pytest tests/interop",
         "tests/kernel/run",
     ]
-    assert [each for each in [*commands, "tests.lanes", ".ci/run"] if each not in told] == []
+    assert [each for each in [*commands, "tests.lanes", ".ci/run"] if each not in text] == []
 
 
-def test_some_lanes_can_be_chosen() -> None:
-    """Without names all lanes run, `full` beside another; named ones run one after the other, in the order given."""
-    assert chosen([]) == list(LANES)
+def test_lanes_can_be_selected_by_name() -> None:
+    """Without names all lanes run, with `full` in parallel to another; named lanes run in the given order."""
+    assert select_lanes([]) == list(LANES)
     assert [lane.name for lane in LANES if lane.meanwhile is FULL] == ["kernel"]
-    assert [(lane.name, lane.meanwhile) for lane in chosen(["full", "kernel"])] == [("full", None), ("kernel", None)]
+    assert [(lane.name, lane.meanwhile) for lane in select_lanes(["full", "kernel"])] == [
+        ("full", None),
+        ("kernel", None),
+    ]
     unknown = subprocess.run(
         [sys.executable, "-m", "tests.lanes", "quik"], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )
@@ -118,72 +122,97 @@ def shell(script: str) -> tuple[str, ...]:
     return ("sh", "-c", script)
 
 
-def run(*lanes: Lane) -> tuple[int, str]:
-    said: list[str] = []
-    return run_lanes(lanes, tell=said.append), "".join(said)
+def run(*lanes: LaneSpec) -> tuple[int, str]:
+    output: list[str] = []
+    return run_lanes(lanes, write=output.append), "".join(output)
 
 
-def test_the_runner_sums_lanes_up() -> None:
-    """Where all lanes pass the exit code is 0, their outputs are told in order, and the last line has the sums."""
-    code, said = run(
-        Lane("quick", (shell("echo one; echo '== 2 passed, 1 skipped, 3 deselected in 1.20s =='"),), 1),
-        Lane(
-            "kernel", (shell("sleep 0.3; echo '== 3 passed, 1 rerun in 62.10s (0:01:02) =='"),), 1,
-            meanwhile=Lane("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),
+def test_runner_adds_up_the_lanes() -> None:
+    """If all lanes pass, the exit code is 0, their outputs appear in order, and the last line has the totals."""
+    code, output = run(
+        LaneSpec("quick", (shell("echo one; echo '== 2 passed, 1 skipped, 3 deselected in 1.20s =='"),), 1),
+        LaneSpec(
+            "kernel",
+            (shell("sleep 0.3; echo '== 3 passed, 1 rerun in 62.10s (0:01:02) =='"),),
+            1,
+            meanwhile=LaneSpec("full", (shell("nice; echo '== 1 passed in 0.10s =='"),), 1),
         ),
-    )  # fmt: skip
+    )
     assert code == 0
-    assert said.index("one") < said.index("3 passed, 1 rerun") < said.index(f"{min(os.nice(0) + 19, 19)}\n== 1 passed")
-    assert said.splitlines()[-1].startswith("6 passed, 0 failed, 1 skipped, 1 rerun in ")
+    assert (
+        output.index("one")
+        < output.index("3 passed, 1 rerun")
+        < output.index(f"{min(os.nice(0) + 19, 19)}\n== 1 passed")
+    )
+    assert output.splitlines()[-1].startswith("6 passed, 0 failed, 1 skipped, 1 rerun in ")
 
 
 @pytest.mark.parametrize("meanwhile", [False, True])
-def test_a_lane_that_fails_fails_the_run(meanwhile: bool) -> None:
-    """A lane fails by its exit code, whatever its tests say; the others run all the same, and the table says it."""
-    bad = Lane("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
-    good = Lane("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
-    code, said = run(*([good] if meanwhile else [bad, good]))
+def test_failing_lane_fails_the_run(meanwhile: bool) -> None:
+    """A lane's exit code decides whether it fails; the other lanes still run, and the table shows it."""
+    bad = LaneSpec("bad", (shell("echo '== 1 passed in 0.10s =='; exit 3"),), 1)
+    good = LaneSpec("good", (shell("echo '== 1 passed in 0.10s =='"),), 1, meanwhile=bad if meanwhile else None)
+    code, output = run(*([good] if meanwhile else [bad, good]))
     assert code == 1
-    assert "ended with 3" in said
-    assert said.splitlines()[-1].startswith("2 passed, 1 failed in ")
+    assert "ended with 3" in output
+    assert output.splitlines()[-1].startswith("2 passed, 1 failed in ")
 
 
-def test_a_lane_ends_with_its_limit() -> None:
-    """A lane that takes too long is ended with all that it started, and says at which test it was."""
-    script = "import os, pathlib, time; pathlib.Path(os.environ['LAVT_PROGRESS']).write_text('test_a'); time.sleep(600)"
-    hangs = Lane("hangs", ((sys.executable, "-c", script), shell("echo never")), 1 / 60)
-    code, said = run(hangs, Lane("next", (shell("echo came"),), 1))
+HANGS = """
+import os, pathlib, time
+try:
+    pathlib.Path(os.environ["LAVT_PROGRESS"]).write_text("test_a")
+    time.sleep(600)
+except KeyboardInterrupt:
+    print("failed so far", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_lane_is_interrupted_at_its_time_limit() -> None:
+    """A lane that exceeds its time limit is interrupted, so that pytest lists failures, and then killed."""
+    hangs = LaneSpec("hangs", ((sys.executable, "-c", HANGS), shell("echo never")), 1 / 12)
+    code, output = run(hangs, LaneSpec("next", (shell("echo came"),), 1))
     assert code == 1
-    assert "took longer than 0.0166667 min, and was at: test_a" in said
-    assert "never" not in said
-    assert "came" in said
+    assert "took longer than 0.0833333 min, and was at: test_a" in output
+    assert "failed so far" in output
+    assert "never" not in output
+    assert "came" in output
 
 
-def test_the_tests_that_run_are_told(tmp_path: Path) -> None:
-    """A test finds its own name in the file of LAVT_PROGRESS; after the last test it is empty."""
-    told = tmp_path / "progress"
+def test_running_test_is_in_the_progress_file(tmp_path: Path) -> None:
+    """LAVT_PROGRESS has the name of the running test, and is empty after the last one."""
+    text = tmp_path / "progress"
     (tmp_path / "test_own.py").write_text(
-        f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(told)!r}).read_text()\n"
+        f"from pathlib import Path\n\ndef test_own(): assert 'test_own' in Path({str(text)!r}).read_text()\n"
     )
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "tests.support.progress"]
     subprocess.run(
-        [*command, f"--rootdir={tmp_path}", str(tmp_path)], cwd=REPOSITORY, check=True, capture_output=True,
-        env={**os.environ, "LAVT_PROGRESS": str(told)},
-    )  # fmt: skip
-    assert told.read_text() == ""
+        [*command, f"--rootdir={tmp_path}", str(tmp_path)],
+        cwd=REPOSITORY,
+        check=True,
+        capture_output=True,
+        env={**os.environ, "LAVT_PROGRESS": str(text)},
+    )
+    assert text.read_text() == ""
 
 
-def test_counts_are_read_from_pytests_closing_line() -> None:
-    """Colours, long times and more than one session in an output are understood."""
-    said = "== session starts ==\n\x1b[31m== \x1b[1m1 failed\x1b[0m, 2 passed, 2 errors in 70.00s (0:01:10) ==\x1b[0m\n"
-    assert counts_of(said + "= 1 passed in 2.00s =\n") == {"failed": 1, "passed": 3, "error": 2}
+def test_counts_are_parsed_from_pytest_output() -> None:
+    """Counts are parsed with colours, long times and several sessions in one output."""
+    output = (
+        "== session starts ==\n\x1b[31m== \x1b[1m1 failed\x1b[0m, 2 passed, 2 errors in 70.00s (0:01:10) ==\x1b[0m\n"
+    )
+    assert counts_of(output + "= 1 passed in 2.00s =\n") == {"failed": 1, "passed": 3, "error": 2}
 
 
-def test_the_table_says_what_failed() -> None:
-    """The table has a line for each lane with its time and counts, and below it why lanes failed."""
-    outcomes = [Outcome("quick", 61.2, Counter(passed=5, rerun=1)), Outcome("field", 5, Counter(failed=1), ["reason"])]
+def test_table_lists_lanes_and_failures() -> None:
+    """The table has a line with time and counts for each lane, followed by the reasons of failures."""
+    outcomes = [
+        LaneOutcome("quick", 61.2, Counter(passed=5, rerun=1)),
+        LaneOutcome("field", 5, Counter(failed=1), ["reason"]),
+    ]
     lines = table(outcomes).splitlines()
     assert lines[1].split() == ["quick", "1:01", "5", "0", "0", "0", "1", "0"]
     assert lines[2].split()[-1] == "FAILED"
-    assert lines[3] == "field: because"
+    assert lines[3] == "field: reason"
     assert closing_line(outcomes, 70) == "5 passed, 1 failed, 1 rerun in 70s"

@@ -1,4 +1,4 @@
-"""Nothing sends by itself: the last command of a program that froze must not stand."""
+"""No code uses periodic sending, which would repeat the last command of a frozen program."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SOURCE = Path(__file__).parent.parent / "src" / "lavt"
 
 PERIODIC = re.compile(
     r"send_periodic|_send_periodic_internal|\w*Cyclic\w*Task\w*|broadcastmanager|modify_data"  # python-can's
-    r"|\w*BCM\w*|\w*bcm\w*|AF_CAN|PF_CAN|CAN_RAW"  # the kernel's, and sockets that could be its
+    r"|\w*BCM\w*|\w*bcm\w*|AF_CAN|PF_CAN|CAN_RAW"  # the kernel's, and sockets that could use it
 )
-"""Whole names; a text that is one counts as well, as it may be looked up by it."""
+"""Complete names; a string with such a name counts as well, as it may be used to look it up."""
 
 
 def periodic_sending(source: str) -> list[str]:
-    """Which names in a program belong to sending that goes on by itself."""
+    """Return the names in a program that belong to periodic sending."""
     return [name for node in ast.walk(ast.parse(source)) for name in _names(node) if PERIODIC.fullmatch(name)]
 
 
@@ -37,7 +37,7 @@ def _names(node: ast.AST) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=lambda path: str(path.relative_to(SOURCE)))
 def test_none(path: Path) -> None:
-    """No module has python-can or the kernel send frames by itself, or opens a CAN socket past the port."""
+    """No module uses periodic sending of python-can or of the kernel, or opens a CAN socket of its own."""
     assert periodic_sending(path.read_text("utf-8")) == []
 
 
@@ -56,10 +56,10 @@ PLANTED = [
 
 @pytest.mark.parametrize("planted", PLANTED)
 def test_found(planted: str) -> None:
-    """A planted use is found, however it is named."""
+    """A use of periodic sending is found, however it is written."""
     assert periodic_sending(planted)
 
 
 def test_others() -> None:
-    """What sends once, or is only spoken of, is let be."""
+    """Single sends and comments are allowed."""
     assert not periodic_sending('"""Never send_periodic here."""\nbus.send(message, timeout=0)\nimport can')

@@ -1,4 +1,4 @@
-"""One loop of real parts: Zenoh routers, UDP, H.264, the relay, and a process for each side. It judges no lateness."""
+"""A drive in real time with Zenoh routers, UDP, H.264, the relay and a process per side; it asserts no upper limits."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from lavt.recording.record import Record, read_record
 
 VIDEO_MS, CONTROL_MS = 75.0, 40.0
 CHANGES = (
-    "time=real", "vehicle.scenery=none", "vehicle.time_limit_s=4",
-    f"network.video.delay_ms={VIDEO_MS}", f"network.control.delay_ms={CONTROL_MS}",
-)  # fmt: skip
+    "time=real",
+    "vehicle.scenery=none",
+    "vehicle.time_limit_s=4",
+    f"network.video.delay_ms={VIDEO_MS}",
+    f"network.control.delay_ms={CONTROL_MS}",
+)
 
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Give the directory of a drive of some seconds."""
+    """Return the output directory of a drive of some seconds."""
     directory = tmp_path_factory.mktemp("real") / "run"
     run_once(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), CHANGES)), directory)
     return directory
@@ -31,12 +34,12 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def records(out: Path) -> tuple[Record, Record]:
-    """Give the records of vehicle and client."""
+    """Return the records of server and client."""
     return read_record(out / "server.mcap"), read_record(out / "client.mcap")
 
 
 def test_pictures_arrive_and_commands_are_accepted(records: tuple[Record, Record]) -> None:
-    """The client reads stamps that the vehicle wrote in its pictures, and the vehicle obeys commands made from them."""
+    """The client reads the stamps in the vehicle's pictures, and the vehicle accepts commands made from them."""
     server, client = records
     sent, read = (set(table.ints("stamp_ns").tolist()) for table in (server.table("frame"), client.table("picture")))
     assert len(sent & read) > 30
@@ -51,7 +54,7 @@ def test_pictures_arrive_and_commands_are_accepted(records: tuple[Record, Record
 
 
 def test_the_car_moved(records: tuple[Record, Record]) -> None:
-    """The drive began, the car went along its route, and both records were finished."""
+    """The drive begins, the car moves along its route, and both records are complete."""
     server, client = records
     assert "drive_began" in server.table("event").texts("kind")
     assert max(server.table("truth").floats("progress_m")) > 1.0
@@ -59,8 +62,8 @@ def test_the_car_moved(records: tuple[Record, Record]) -> None:
     assert client.complete
 
 
-def test_nothing_passes_before_its_delay(out: Path, records: tuple[Record, Record]) -> None:
-    """What the relay delays takes at least as long, however busy the host: both sides read one clock here."""
+def test_nothing_arrives_before_its_delay(out: Path, records: tuple[Record, Record]) -> None:
+    """Pictures and commands take at least as long as the injected delays."""
     result: dict[str, Any] = json.loads((out / "result.json").read_text())
     assert result["injected_ms"] == {"video": VIDEO_MS, "control": CONTROL_MS}
     server, client = records

@@ -1,4 +1,4 @@
-"""What keeps one test from changing the pytest process for those after it."""
+"""The checks that no test changes the pytest process for later tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tests.support.process_state import process_state, process_unchanged, pytest_configure
 
 
-def ignore(number: signal.Signals) -> None:
+def ignore_signal(number: signal.Signals) -> None:
     signal.signal(number, signal.SIG_IGN)
 
 
@@ -22,13 +22,13 @@ CHANGES: dict[str, Callable[[pytest.MonkeyPatch], object]] = {
     "directory": lambda patch: patch.chdir(Path(os.sep)),
     "$LAVT_CHANGED": lambda patch: patch.setenv("LAVT_CHANGED", "1"),
     "signal mask": lambda _: signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1}),
-    "SIGINT": lambda _: ignore(signal.SIGINT),
-    "SIGTERM": lambda _: ignore(signal.SIGTERM),
+    "SIGINT": lambda _: ignore_signal(signal.SIGINT),
+    "SIGTERM": lambda _: ignore_signal(signal.SIGTERM),
 }
 
 
 @pytest.fixture
-def _put_back(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (put back as well)
+def _restore(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (restored by its fixture)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     yield
@@ -37,18 +37,18 @@ def _put_back(own_switch_interval: None) -> Iterator[None]:  # noqa: ARG001 (put
         signal.signal(number, handler)
 
 
-@pytest.mark.usefixtures("_put_back")
+@pytest.mark.usefixtures("_restore")
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_test_that_leaves_the_process_changed_fails(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A test that leaves a process-wide setting changed fails, and the message names the setting alone."""
-    with pytest.raises(pytest.fail.Exception) as failed, process_unchanged():
+def test_test_that_changes_the_process_fails(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A test that leaves a process-wide setting changed fails, and the message names only that setting."""
+    with pytest.raises(pytest.fail.Exception) as failure, process_unchanged():
         CHANGES[name](monkeypatch)
-    assert [each for each in process_state() if f"{each!r}: " in str(failed.value)] == [name]
+    assert [each for each in process_state() if f"{each!r}: " in str(failure.value)] == [name]
 
 
-@pytest.mark.usefixtures("_put_back")
-def test_ctrl_c_is_not_ignored() -> None:
-    """Tests started as a background job, where the shell has SIGINT ignored, react to Ctrl-C like those at a prompt."""
-    ignore(signal.SIGINT)
+@pytest.mark.usefixtures("_restore")
+def test_background_tests_react_to_ctrl_c() -> None:
+    """Tests in a background job, for which the shell ignores SIGINT, still react to Ctrl-C."""
+    ignore_signal(signal.SIGINT)
     pytest_configure()
     assert signal.getsignal(signal.SIGINT) == signal.default_int_handler

@@ -23,13 +23,13 @@ def paced(p50_us: float) -> control_round_trip.Measured:
 
 
 def test_a_real_command_is_sent() -> None:
-    """What goes round is a command that the vehicle can read, of about 200 bytes."""
+    """The message of the benchmark is a valid command of about 200 bytes."""
     assert decode(Command, command(7)).sequence == 7
     assert 150 < len(command(7)) < 250
 
 
 def test_medians_over_rounds_and_ratios_to_raw_udp() -> None:
-    """The last line has medians over the rounds, and how many times those of raw UDP they are."""
+    """The summary has medians over the rounds, and their ratios to those of raw UDP."""
     found = control_round_trip.summary({"udp": [paced(10), paced(20), paced(30)], "zenoh": [paced(50)]})
     assert found["udp"]["at_50_hz"]["p50_us"] == 20
     assert found["udp"]["at_50_hz"]["p50_ratio"] == 1
@@ -38,40 +38,43 @@ def test_medians_over_rounds_and_ratios_to_raw_udp() -> None:
 
 
 def test_without_raw_udp_there_are_no_ratios() -> None:
-    """A carrier that is measured alone has times only."""
+    """A carrier that is measured without raw UDP has times only."""
     assert set(control_round_trip.summary({"zenoh": [paced(50)]})["zenoh"]["at_50_hz"]) == set(paced(1)["at_50_hz"])
 
 
 def test_lost_echoes_are_counted() -> None:
-    """An echo that did not come is no time, and is told."""
+    """A lost echo is counted and is not part of the percentiles."""
     found = control_round_trip.percentiles("udp", [1000, None, 3000])
     assert (found["p50_us"], found["lost"]) == (2.0, 1)
 
 
-def test_what_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Where pyzmq is missing the benchmark says how to install it and, with nothing else asked, ends with 2."""
-    monkeypatch.setattr(process_priority, "take", lambda: None)  # it would be that of all tests
+def test_a_missing_carrier_is_reported(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """If pyzmq is missing and no other carrier is requested, the benchmark names the package and exits with 2."""
+    monkeypatch.setattr(process_priority, "raise_priority", lambda: None)  # it would change the priority of all tests
     monkeypatch.setattr(carriers, "find_spec", lambda _name: None)
     monkeypatch.setattr(sys, "argv", ["control_round_trip.py", "--only", "pyzmq"])
     assert control_round_trip.main() == 2
     assert "pip install pyzmq" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["--rounds", "0"], ["--seconds", "0"], ["--messages", "0"]])
-def test_nothing_is_not_measured(words: list[str]) -> None:
-    """A benchmark of no rounds, no time or no messages is refused with exit status 2."""
+@pytest.mark.parametrize("arguments", [["--rounds", "0"], ["--seconds", "0"], ["--messages", "0"]])
+def test_empty_measurements_are_rejected(arguments: list[str]) -> None:
+    """A benchmark without rounds, time or messages is rejected with exit status 2."""
     with pytest.raises(SystemExit) as ended:
-        control_round_trip.arguments(words)
+        control_round_trip.arguments(arguments)
     assert ended.value.code == 2
 
 
 @pytest.mark.full
-def test_the_benchmark_of_the_control_runs() -> None:
-    """`benchmarks/control_round_trip.py` measures a command through two real routers beside raw UDP."""
+def test_the_control_benchmark_runs() -> None:
+    """`benchmarks/control_round_trip.py` measures a command through two real routers compared with raw UDP."""
     done = subprocess.run(
         [sys.executable, PROGRAM, "--only", "udp", "--only", "zenoh", "--rounds", "1", "--seconds", "1"],
-        capture_output=True, text=True, check=False, timeout=200,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=200,
+    )
     assert done.returncode == 0, done.stderr
     last = json.loads(done.stdout.splitlines()[-1])
     assert list(last) == ["udp", "zenoh"]
@@ -81,8 +84,8 @@ def test_the_benchmark_of_the_control_runs() -> None:
     assert "| Zenoh " in done.stdout
 
 
-def test_a_carrier_that_is_installed_brings_an_echo_back() -> None:
-    """Pyzmq and CycloneDDS, where they are installed, carry a command there and back as it was."""
+def test_an_installed_carrier_returns_the_echo() -> None:
+    """Pyzmq and CycloneDDS, if installed, return the echo of a command unchanged."""
     names = [name for name, carrier in carriers.CARRIERS.items() if carrier.module and not carrier.missing]
     if not names:
         pytest.skip("needs pyzmq or cyclonedds: pip install pyzmq cyclonedds")

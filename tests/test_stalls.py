@@ -36,7 +36,7 @@ QUIET, BUSY = "cpu 0 0 0 0 0 0 0 0 0 0", "cpu 90 0 0 10 0 0 0 0 0 0"
 
 @dataclass
 class FakeProbe:
-    """Reports what it is given, one report after the other."""
+    """A fake probe that returns given reports in order."""
 
     reports: list[tuple[int, list[Stall]]] = field(default_factory=list)
     above: bool = True
@@ -58,27 +58,27 @@ def stalls_of(*recorded: Stall) -> Stalls:
     ("since_ms", "until_ms", "found"),
     [(0, 99, 0), (0, 100, 1), (120, 130, 1), (150, 200, 1), (151, 200, 0), (0, 1000, 2)],
 )
-def test_a_stall_counts_where_it_overlaps_the_time(since_ms: int, until_ms: int, found: int) -> None:
-    """A stall that ended before the time, or began after it, is not among those that overlap it."""
+def test_only_overlapping_stalls_count(since_ms: int, until_ms: int, found: int) -> None:
+    """A stall that ended before an interval, or began after it, does not overlap it."""
     stalls = [Stall(0, 100 * MS, 150 * MS), Stall(1, 600 * MS, 610 * MS)]
     assert len(overlapping(stalls, since_ms * MS, until_ms * MS)) == found
 
 
-def test_a_short_stall_does_not_count() -> None:
-    """Only stalls of the length that the caller names count."""
+def test_short_stalls_do_not_count() -> None:
+    """Only stalls of at least the given length count."""
     stalls = [Stall(0, 0, 29 * MS), Stall(0, 100 * MS, 131 * MS)]
     assert overlapping(stalls, 0, 1000 * MS, at_least_ms=30) == [stalls[1]]
 
 
-def test_the_share_is_that_of_the_worst_processor_within_the_time() -> None:
-    """Stalls of one processor add up, those of another do not, and what is outside of the time does not count."""
+def test_stalled_share_is_that_of_the_worst_processor() -> None:
+    """Stalls of one processor within the interval add up; those of other processors are not added."""
     stalls = [Stall(0, 0, 20 * MS), Stall(0, 50 * MS, 60 * MS), Stall(1, 0, 15 * MS), Stall(0, 90 * MS, 500 * MS)]
     assert stalled_share(stalls, 10 * MS, 100 * MS) == pytest.approx((10 + 10 + 10) / 90)
     assert stalled_share([], 0, 100) == 0
 
 
-def test_what_is_in_time_asks_for_no_record() -> None:
-    """A verdict on what is as it should be does not wait for the probes."""
+def test_passing_check_does_not_query_probes() -> None:
+    """A check that passes does not wait for the probes."""
     stalls = stalls_of()
     requested = stalls.probes[0].requested  # type: ignore[attr-defined]
     stalls.require(True, "late", 0, 100)
@@ -97,8 +97,8 @@ def test_what_is_in_time_asks_for_no_record() -> None:
         (Stall(0, 1001 * MS, 2000 * MS), AssertionError),
     ],
 )
-def test_only_a_stall_at_the_moment_excuses_a_failure(stall: Stall | None, raised: type[Exception]) -> None:
-    """What is late fails, unless a stall of at least 30 ms overlaps the time that counts; the message says both."""
+def test_only_an_overlapping_stall_excuses_a_failure(stall: Stall | None, raised: type[Exception]) -> None:
+    """A late result fails unless a stall of at least 30 ms overlaps the interval; the message has both."""
     stalls = stalls_of(*([stall] if stall else []))
     with pytest.raises(raised, match="it was late") as caught:
         stalls.require(False, "it was late", 0, 1000 * MS)
@@ -107,16 +107,16 @@ def test_only_a_stall_at_the_moment_excuses_a_failure(stall: Stall | None, raise
 
 
 @pytest.mark.parametrize(("share", "raised"), [(0.05, HostStalled), (0.2, AssertionError)])
-def test_a_rate_is_excused_by_a_share_of_the_time(share: float, raised: type[Exception]) -> None:
-    """A rate that is wrong fails, unless a processor was stalled for the share of the time that the caller names."""
+def test_stalled_share_excuses_a_rate(share: float, raised: type[Exception]) -> None:
+    """A wrong rate fails unless a processor was stalled for the given share of the interval."""
     stalls = stalls_of(*(Stall(0, at * 100 * MS, (at * 100 + 10) * MS) for at in range(10)))
     with pytest.raises(raised, match="slow") as caught, stalls.judging(0, 1000 * MS, share=share):
         raise AssertionError("slow")
     assert caught.type is raised
 
 
-def test_a_verdict_waits_for_a_record_that_reaches_the_time() -> None:
-    """Probes are asked until each has reported beyond the end of the time that counts."""
+def test_verdict_waits_for_a_complete_record() -> None:
+    """Probes are queried until each has reported beyond the end of the interval."""
     late = Stall(0, 50 * MS, 90 * MS)
     slow = FakeProbe([(0, []), (80 * MS, []), (99 * MS, [late]), (101 * MS, [])])
     assert Stalls([slow], lambda: QUIET).during(0, 100 * MS) == [late]
@@ -124,7 +124,7 @@ def test_a_verdict_waits_for_a_record_that_reaches_the_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inconclusive", "tests", "idle", "fails"),
+    ("inconclusive", "tests", "idle", "expected"),
     [
         (0, 0, 1.0, False),
         (0, 100, 0.9, False),
@@ -137,23 +137,23 @@ def test_a_verdict_waits_for_a_record_that_reaches_the_time() -> None:
         (6, 100, 0.51, True),
     ],
 )
-def test_an_idle_machine_may_not_leave_many_tests_inconclusive(
-    inconclusive: int, tests: int, idle: float, *, fails: bool
+def test_many_inconclusive_tests_fail_on_an_idle_machine(
+    inconclusive: int, tests: int, idle: float, *, expected: bool
 ) -> None:
-    """Above 5 % inconclusive tests, and more than one, the session fails where the machine was more than half idle."""
-    assert inconclusive_too_often(inconclusive, tests, idle) is fails
+    """More than 5 % and more than one inconclusive tests fail a session on a machine that was over half idle."""
+    assert inconclusive_too_often(inconclusive, tests, idle) is expected
 
 
-def test_the_idle_share_counts_work_at_low_priority_as_idle() -> None:
-    """Idle time, waiting for disks and programs with a positive niceness are idle; stolen time is not."""
+def test_low_priority_work_counts_as_idle() -> None:
+    """Idle time, waiting for disks and niceness above zero count as idle; stolen time does not."""
     before, after = "cpu  100 100 100 100 100 100 100 100 0 0", "cpu  110 120 110 130 110 100 100 120 0 0"
     assert idle_share(before, after) == pytest.approx((20 + 30 + 10) / 100)
     assert idle_share(before, before) == 0
 
 
 @pytest.mark.parametrize(("stall", "raised"), [(None, AssertionError), (Stall(0, 0, 31 * MS), HostStalled)])
-def test_an_assertion_inside_is_excused_by_a_stall(stall: Stall | None, raised: type[Exception]) -> None:
-    """An assertion that fails while times are judged is excused as a sentence is; any other exception is not."""
+def test_stall_excuses_an_assertion_about_times(stall: Stall | None, raised: type[Exception]) -> None:
+    """A stall excuses a failed assertion about times, but no other exception."""
     stalls = stalls_of(*([stall] if stall else []))
     with pytest.raises(raised, match="late") as caught, stalls.judging(0, 100 * MS):
         raise AssertionError("late")
@@ -163,8 +163,8 @@ def test_an_assertion_inside_is_excused_by_a_stall(stall: Stall | None, raised: 
         raise ValueError("broken")
 
 
-def test_what_many_tests_share_is_made_anew_after_a_stall() -> None:
-    """It is made once while nothing is excused, again after each excuse, at most three times in all."""
+def test_shared_value_is_made_again_after_a_stall() -> None:
+    """A shared value is made once, and again after each excuse, at most three times in all."""
     stalls, numbers = stalls_of(), iter(range(9))
     shared = Shared(stalls, lambda: next(numbers))
     assert [shared.get(), shared.get()] == [0, 0]
@@ -176,8 +176,8 @@ def test_what_many_tests_share_is_made_anew_after_a_stall() -> None:
     assert shared.get() == 2
 
 
-def test_what_cannot_be_made_on_a_stalled_host_is_given_up() -> None:
-    """Where the host stalls each of three attempts, what comes after says so and attempts nothing."""
+def test_shared_value_is_given_up_after_three_stalls() -> None:
+    """If the host stalls each of three attempts, later requests raise without another attempt."""
     attempts = []
 
     def stalled() -> None:
@@ -294,7 +294,7 @@ def test_tries():
 
 
 class EndedProbe(FakeProbe):
-    """Has ended after its first report."""
+    """A fake probe that ends after its first report."""
 
     def report(self) -> tuple[int, list[Stall]]:  # noqa: D102 (of `Probe`)
         if self.requested:
@@ -310,42 +310,44 @@ def run_inner(
     return pytester.runpytest_inprocess("-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:randomly")
 
 
-def test_a_test_that_is_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
-    """After two more attempts a stalled test is listed as inconclusive with its stalls; it neither passes nor fails."""
+def test_test_stalled_each_time_is_inconclusive(pytester: pytest.Pytester) -> None:
+    """After two more attempts a stalled test is listed as inconclusive; it neither passes nor fails."""
     result = run_inner(pytester, TESTS)
     assert result.parseoutcomes() == {"passed": 3, "rerun": 5, "inconclusive": 3}
     assert result.ret == pytest.ExitCode.OK
-    result.stdout.fnmatch_lines([
-        "AGAIN *::test_stalled_once: *HostStalled: 300 ms",
-        "INCONCLUSIVE *::test_stalled_each_time: *HostStalled: 300 ms",
-        "INCONCLUSIVE *::test_given_up: *: 300 ms",
-        "INCONCLUSIVE *::test_stalled_in_setup: *HostStalled: in its setup",
-        "HOST *; the machine was 10% idle; 3 of 6 tests inconclusive",
-    ])  # fmt: skip
+    result.stdout.fnmatch_lines(
+        [
+            "AGAIN *::test_stalled_once: *HostStalled: 300 ms",
+            "INCONCLUSIVE *::test_stalled_each_time: *HostStalled: 300 ms",
+            "INCONCLUSIVE *::test_given_up: *: 300 ms",
+            "INCONCLUSIVE *::test_stalled_in_setup: *HostStalled: in its setup",
+            "HOST *; the machine was 10% idle; 3 of 6 tests inconclusive",
+        ]
+    )
 
 
-def test_a_test_that_judges_times_is_excused_by_a_stall_while_it_ran(pytester: pytest.Pytester) -> None:
-    """A marked test is run again where a stall overlaps it, and fails at once where none does."""
+def test_stall_excuses_a_test_with_the_marker(pytester: pytest.Pytester) -> None:
+    """A marked test is repeated if a stall overlaps it, and fails immediately otherwise."""
     result = run_inner(pytester, JUDGED)
     assert result.parseoutcomes() == {"passed": 2, "failed": 1, "rerun": 1}
 
 
-def test_a_fault_fails_at_once_whatever_else_was_stalled(pytester: pytest.Pytester) -> None:
-    """Nothing but `HostStalled` itself lets a test be run again, and an attempt that fails is not excused by others."""
+def test_fault_is_never_excused(pytester: pytest.Pytester) -> None:
+    """Only `HostStalled` itself lets a test be repeated, and earlier stalls do not excuse a failed attempt."""
     result = run_inner(pytester, FAULTS)
     assert result.parseoutcomes() == {"failed": 3, "rerun": 1, "passed": 1}
     assert result.ret == pytest.ExitCode.TESTS_FAILED
 
 
-def test_many_inconclusive_tests_on_an_idle_machine_fail_the_session(pytester: pytest.Pytester) -> None:
-    """Three inconclusive tests of six fail a session whose machine was idle, and it says so."""
+def test_session_fails_for_inconclusive_tests_on_an_idle_machine(pytester: pytest.Pytester) -> None:
+    """Three inconclusive tests of six fail the session of an idle machine, with a message."""
     result = run_inner(pytester, TESTS, after="cpu 40 0 0 60 0 0 0 0 0 0")
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.stdout.fnmatch_lines(["FAILED: 3 of 6 tests were inconclusive on a machine that was 60% idle"])
 
 
-def test_a_probe_that_ends_fails_the_session(pytester: pytest.Pytester) -> None:
-    """Though all tests pass, the session fails where a probe did not last as long as it."""
+def test_ended_probe_fails_the_session(pytester: pytest.Pytester) -> None:
+    """A session fails if a probe ended early, even if all tests pass."""
     result = run_inner(pytester, "def test_good(stalls): pass", probe=EndedProbe)
     assert result.parseoutcomes() == {"passed": 1}
     assert result.ret == pytest.ExitCode.TESTS_FAILED
@@ -374,7 +376,7 @@ def spin(processor: int, how: str, duration_ms: int) -> tuple[int, int]:
 
 
 @contextmanager
-def measuring() -> Iterator[Stalls]:
+def measuring_stalls() -> Iterator[Stalls]:
     measured = Stalls.measured()
     try:
         if not all(probe.above for probe in measured.probes):
@@ -385,9 +387,9 @@ def measuring() -> Iterator[Stalls]:
 
 
 @pytest.mark.realtime
-def test_a_stalled_processor_is_recorded() -> None:
-    """A processor that a program of higher real-time priority takes for 100 ms is recorded as stalled so long."""
-    with measuring() as stalls:
+def test_stalled_processor_is_recorded() -> None:
+    """A processor that a program of higher real-time priority takes for 100 ms is recorded as stalled for that time."""
+    with measuring_stalls() as stalls:
         processor = min(os.sched_getaffinity(0))
         began_ns, ended_ns = spin(processor, "real-time", 100)
         recorded = stalls.during(began_ns, ended_ns, at_least_ms=60)
@@ -395,18 +397,18 @@ def test_a_stalled_processor_is_recorded() -> None:
 
 
 @pytest.mark.realtime
-def test_a_program_that_occupies_a_processor_is_no_stall() -> None:
-    """The highest priority that LAVT's programs have does not delay a probe: it excuses nothing that such a one does.
+def test_busy_program_is_no_stall() -> None:
+    """LAVT's highest process priority does not delay a probe, so a busy LAVT program is never recorded as a stall.
 
-    One of five tries without a stall shows it: the host may stall this machine meanwhile.
+    One of five attempts without a stall is enough, because the host itself may stall the machine.
     """
-    with measuring() as stalls:
+    with measuring_stalls() as stalls:
         tries = [spin(min(os.sched_getaffinity(0)), "nice", 200) for _ in range(5)]
         assert not all(stalls.during(*each, at_least_ms=20) for each in tries)
 
 
 @pytest.mark.realtime
-def test_a_probe_costs_next_to_nothing() -> None:
+def test_probe_uses_little_processor_time() -> None:
     """A probe uses less than 2 % of its processor."""
     probe = ProbeProcess(min(os.sched_getaffinity(0)))
     try:
@@ -431,8 +433,8 @@ time.sleep(60)
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_probes_end_with_the_tests(how: signal.Signals) -> None:
-    """However pytest is killed, no probe is left."""
+def test_probes_end_with_pytest(how: signal.Signals) -> None:
+    """However pytest is killed, no probe remains."""
     parent = subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     probes = parent.stdout.readline().split()
@@ -460,8 +462,8 @@ def is_running(pid: int) -> bool:
     return state != "Z"
 
 
-def test_a_probe_that_is_killed_is_noticed() -> None:
-    """Whoever asks a probe that has ended gets an error, not an empty record."""
+def test_killed_probe_is_reported() -> None:
+    """Querying a killed probe raises an error instead of returning an empty record."""
     probe = ProbeProcess(min(os.sched_getaffinity(0)))
     os.kill(probe.pid, signal.SIGKILL)
     wait_for_end(probe.pid)

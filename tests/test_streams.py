@@ -6,8 +6,8 @@ from lavt.streams import IndexedStream, stream
 
 
 @pytest.mark.parametrize("seed", [0, 7, 2**63 - 1])
-def test_an_indexed_stream_gives_what_the_stream_gives(seed: int) -> None:
-    """Entries asked for in any order, again too, are those of a generator made for each of them."""
+def test_an_indexed_stream_equals_the_stream(seed: int) -> None:
+    """An indexed stream returns the same values as `stream`, in any order and repeatedly."""
     entries = IndexedStream(seed, "video")
     for index in (5, 0, 2**32 - 1, 5, 2**64 - 1):
         generator = entries.at(index)

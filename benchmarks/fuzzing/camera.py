@@ -1,4 +1,4 @@
-"""Fuzzes what the vehicle's machine reads from UDP: the video's feedback and path, probes of its clock."""
+"""Fuzz the UDP inputs of the vehicle: RTCP feedback, path validation, and clock probes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import count
 
 from benchmarks.fuzzing.mutation import Chance, Corpus
-from benchmarks.fuzzing.target import START, Bench, Target, Wrong, expect, of, total
+from benchmarks.fuzzing.target import START, InvariantViolation, NodeBench, Target, expect, payloads_on, total
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
@@ -30,8 +30,8 @@ from lavt.vehicle.camera import CapturedFrame
 STEP_NS = NS_PER_MS
 
 
-class Still:
-    """A camera, and the sender of its pictures, for which a picture is its number."""
+class FakeCamera:
+    """A camera and a codec for which a picture is its number."""
 
     model = CameraModel(width_px=64, height_px=64)
     rate_hz = 30.0
@@ -41,25 +41,25 @@ class Still:
         self.limit_bps: int | None = None
 
     def capture(self, number: int, at_ns: int, _pose: Pose | None) -> CapturedFrame:
-        """Give a picture."""
+        """Return the number as a picture."""
         return CapturedFrame(number, at_ns, number)
 
     def prepare(self, picture: int) -> tuple[int, int]:
-        """Take it as it is."""
+        """Return the picture unchanged, and a hash."""
         return picture, picture & 0xFFFFFFFF
 
     def write_stamp(self, prepared: int, _stamp_ns: int) -> int:
-        """Leave it as it is."""
+        """Return the picture unchanged."""
         return prepared
 
     def encode(self, _stamped: int, *, keyframe: bool) -> bytes:
-        """Give an access unit of three packets, larger where a keyframe was asked for."""
+        """Return an access unit of three packets, or a larger one for a keyframe."""
         return b"\x00\x00\x00\x01\x65" + bytes([7] * (6000 if keyframe else 3000))
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """Remember it."""
+        """Store the limit; raise `InvariantViolation` for a negative one."""
         if limit_bps is not None and limit_bps < 0:
-            raise Wrong(f"a bit rate of {limit_bps}")
+            raise InvariantViolation(f"a bit rate of {limit_bps}")
         self.limit_bps = limit_bps
 
 
@@ -73,15 +73,15 @@ STRANGERS: Sequence[tuple[str, int]] = (
 
 
 def rtcp_reports() -> list[bytes]:
-    """What a receiver of the stream 2 says."""
+    """Return RTCP datagrams of a receiver of the stream with SSRC 2."""
     report = ReceptionReport(2, 500, 0.1, 20, 30, 5, NS_PER_S)
-    fewer = replace(report, cumulative_lost=-5, highest_sequence=700)
-    said = [receiver_report(1, each, clock_ns=START.mono_ns) for each in (report, fewer)]
-    return [*said, picture_loss(1, 2), max_bit_rate(1, 2, 2_000_000), said[0] + picture_loss(1, 2)]
+    negative_loss = replace(report, cumulative_lost=-5, highest_sequence=700)
+    reports = [receiver_report(1, each, clock_ns=START.mono_ns) for each in (report, negative_loss)]
+    return [*reports, picture_loss(1, 2), max_bit_rate(1, 2, 2_000_000), reports[0] + picture_loss(1, 2)]
 
 
 def old_path() -> list[bytes]:
-    """Hello, answer and challenge of a session that is over."""
+    """Return hello, answer and challenge of an earlier session."""
     client, server = PathClient(bytes(16)), PathServer(lambda: bytes(32))
     server.set_token(bytes(16))
     challenge = server.receive(client.hello(0), STRANGERS[0], START.mono_ns) or b""
@@ -89,47 +89,47 @@ def old_path() -> list[bytes]:
 
 
 def feedback(seed: int) -> Target:
-    """Datagrams at the video's port: its path stays where it was proven, and nobody gets more than he has sent."""
-    entropy, still = SeededEntropy(seed, "feedback"), Still()
+    """Make a target for the video port: video goes to the validated address only, and replies amplify nothing."""
+    entropy, camera = SeededEntropy(seed, "feedback"), FakeCamera()
     stream = StreamSender(Packetizer(2, 0), RepairSender(3, 0))
-    node = CameraNode(still, still, stream, PathServer(lambda: entropy.token(32)), start_ns=START.mono_ns)
+    node = CameraNode(camera, camera, stream, PathServer(lambda: entropy.token(32)), start_ns=START.mono_ns)
     frames = strayed = 0
 
-    def hear(send: Send) -> None:
+    def on_send(send: Send) -> None:
         nonlocal frames, strayed
         frames += send.channel == "frame"
         strayed += send.channel == "rtp" and send.peer != HOME and not send.payload.startswith(b"LAVT")
 
-    bench = Bench(node, hear)
+    bench = NodeBench(node, on_send)
     token, reports = entropy.token(16), rtcp_reports()
     path = Corpus(old_path(), fields=((4, 1), (5, 1), (6, 8), (14, 16)))
     words = tuple((at, 4) for at in range(4, 64, 4))
     rtcp = Corpus(reports, fields=((0, 1), (1, 1), (2, 2), *words))
-    bench.give("video_token", token)
+    bench.deliver("video_token", token)
     inputs = 0
 
-    def prove() -> None:
+    def validate_path() -> None:
         client = PathClient(token)
         hello = client.hello(0)
-        [challenged] = bench.give("feedback", hello, HOME)
+        [challenged] = bench.deliver("feedback", hello, HOME)
         answer = client.answer(challenged.payload) or b""
-        bench.give("feedback", answer, HOME)
-        path.heard.extend((hello, answer))
+        bench.deliver("feedback", answer, HOME)
+        path.replays.extend((hello, answer))
 
     def feed(channel: str, data: bytes, chance: Chance) -> None:
         nonlocal inputs
         inputs += 1
         if inputs % 2000 == 1:
-            prove()
+            validate_path()
         peer = HOME if channel == "rtcp" and chance.below(2) else chance.choice(STRANGERS)
-        sends = bench.give("feedback", data, peer)
+        sends = bench.deliver("feedback", data, peer)
         for send in sends:
-            expect(send.peer == peer and len(send.payload) <= len(data), "more came back than was sent")
-        expect(is_rtcp(data) or not sends or data in path.heard, "a stranger's hello was answered")
-        bench.go(STEP_NS)
+            expect(send.peer == peer and len(send.payload) <= len(data), "a reply was longer than its request")
+        expect(is_rtcp(data) or not sends or data in path.replays, "a stranger's hello was answered")
+        bench.advance(STEP_NS)
         if inputs % 500 == 0:
-            bench.give("feedback", reports[0], HOME)
-        expect(strayed == 0, "video went where nobody has proven to be")
+            bench.deliver("feedback", reports[0], HOME)
+        expect(strayed == 0, "video went to an address that was not validated")
 
     def rejected() -> int:
         return total(node.counts, "path_", "feedback_")
@@ -141,23 +141,25 @@ def feedback(seed: int) -> Target:
     return Target({"path": path, "rtcp": rtcp}, feed, rejected, finish)
 
 
-def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
-    """Probes of the server's clock: what is answered is a probe, and as long as what was sent."""
+def probe_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
+    """Make a target for the clock probe of the vehicle: a reply is as long as its request."""
     node = ClockSyncNode(START.mono_ns)
-    bench = Bench(node)
+    bench = NodeBench(node)
     sequence = count()
-    corpus = Corpus([encode_request(next(sequence), START.wall_ns + each) for each in range(8)],
-                    fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)))  # fmt: skip
+    corpus = Corpus(
+        [encode_request(next(sequence), START.wall_ns + each) for each in range(8)],
+        fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
+    )
     inputs = answered = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, answered
         inputs += 1
-        for reply in of(bench.give(channel, data, STRANGERS[0]), "probe_reply"):
+        for reply in payloads_on(bench.deliver(channel, data, STRANGERS[0]), "probe_reply"):
             decode_reply(reply)
-            expect(len(reply) == len(data) == LAYOUT.size, "more came back than was sent")
+            expect(len(reply) == len(data) == LAYOUT.size, "a reply was longer than its request")
             answered += 1
-        bench.go(STEP_NS)
+        bench.advance(STEP_NS)
 
     def finish() -> str:
         expect(answered + node.counts["probes_rejected"] == inputs, "probes were lost")

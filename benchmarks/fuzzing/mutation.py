@@ -1,4 +1,4 @@
-"""Makes inputs that are nearly right: valid ones, damaged in a way that follows from a seed and from nothing else."""
+"""Make nearly valid inputs: valid ones with mutations that depend only on a seed."""
 
 from __future__ import annotations
 
@@ -12,54 +12,103 @@ import numpy as np
 
 from lavt.streams import stream
 
-LONGEST_RANDOM = 1500
-MOST_MUTATIONS = 3
-"""Of one input."""
+MAX_NOISE_BYTES = 1500
+MAX_MUTATIONS = 3
+"""Per input."""
 
-INTEGERS: Final = (
-    0, 1, -1, 2, 127, 128, 255, 256, 65_535, 65_536, 2**31 - 1, 2**31, 2**32, 2**53 + 1, 2**62, 2**62 + 1, 2**63 - 1,
-    2**63, 2**64 - 1, -(2**31), -(2**63),
-)  # fmt: skip
-NUMBERS: Final = (0.0, -0.0, 0.1, 1.0, -1.0, 1.0000001, 100.0, 1e308, -1e308, 5e-324, float("inf"), -float("inf"),
-                  float("nan"))  # fmt: skip
+SMALL_INTEGERS: Final = (0, 1, -1, 2, 127, 128, 255, 256, 65_535, 65_536)
+LARGE_INTEGERS: Final = (2**31 - 1, 2**31, 2**32, 2**53 + 1, 2**62, 2**62 + 1, 2**63 - 1, 2**63, 2**64 - 1)
+INTEGERS: Final = (*SMALL_INTEGERS, *LARGE_INTEGERS, -(2**31), -(2**63))
+FINITE: Final = (0.0, -0.0, 0.1, 1.0, -1.0, 1.0000001, 100.0, 1e308, -1e308, 5e-324)
+NUMBERS: Final = (*FINITE, float("inf"), -float("inf"), float("nan"))
 WORDS: Final = (
-    "", "a", "arm", "drive", "stop", "hold", "ask", "release", "emergency_stop", "clear_emergency_stop", "driving",
-    "arming", "degraded", "safe_stop", "disarmed", "park", "reverse", "pareto", "uniform", "**", "lavt/**", "\x00",
-    "x" * 33, "x" * 200, "x" * 201, "é" * 100, "\U0001f697" * 50, "1e5", "None",
-)  # fmt: skip
+    "",
+    "a",
+    "arm",
+    "drive",
+    "stop",
+    "hold",
+    "ask",
+    "release",
+    "emergency_stop",
+    "clear_emergency_stop",
+    "driving",
+    "arming",
+    "degraded",
+    "safe_stop",
+    "disarmed",
+    "park",
+    "reverse",
+    "pareto",
+    "uniform",
+    "**",
+    "lavt/**",
+    "\x00",
+    "x" * 33,
+    "x" * 200,
+    "x" * 201,
+    "é" * 100,
+    "\U0001f697" * 50,
+    "1e5",
+    "None",
+)
 OTHERS: Final[tuple[Any, ...]] = (
-    None, True, False, b"", bytes(16), bytes(32), b"\xff\xfe", bytes(300), [], [0] * 10, [float("nan")] * 10,
-    [1.0] * 9 + [float("inf")], ["x"] * 10, [[[[]]]], {}, {"a": 1}, {1: 2}, msgpack.ExtType(5, b"x"),
+    None,
+    True,
+    False,
+    b"",
+    bytes(16),
+    bytes(32),
+    b"\xff\xfe",
+    bytes(300),
+    [],
+    [0] * 10,
+    [float("nan")] * 10,
+    [1.0] * 9 + [float("inf")],
+    ["x"] * 10,
+    [[[[]]]],
+    {},
+    {"a": 1},
+    {1: 2},
+    msgpack.ExtType(5, b"x"),
     msgpack.Timestamp(0),
-)  # fmt: skip
+)
 VALUES: Final[tuple[Any, ...]] = (*INTEGERS, *NUMBERS, *WORDS, *OTHERS)
 
 BOMBS: Final = (
-    b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 1000,
-    b"\x81" * 1000, b"\xc7\xff\x01", b"\xc1", b"\xd8\xff", b"",
-)  # fmt: skip
-"""Beginnings that announce more than there is, or nest deeper than any message does."""
+    b"\xdd\xff\xff\xff\xff",
+    b"\xdf\xff\xff\xff\xff",
+    b"\xdb\xff\xff\xff\xff",
+    b"\xc6\xff\xff\xff\xff",
+    b"\x91" * 1000,
+    b"\x81" * 1000,
+    b"\xc7\xff\x01",
+    b"\xc1",
+    b"\xd8\xff",
+    b"",
+)
+"""Prefixes that claim more data than there is, or nest deeper than any message does."""
 
 Item = TypeVar("Item")
 
 
 class Chance:
-    """Random numbers of a named stream, some thousands at a time: one by one they would take longer than parsers."""
+    """Random numbers of a named stream, drawn by the thousand, because single draws are slower than the parsers."""
 
     def __init__(self, seed: int, name: str) -> None:
         self._generator = stream(seed, f"fuzz {name}")
         self._next = _numbers(self._generator).__next__
 
     def below(self, bound: int) -> int:
-        """Give an integer in [0, bound)."""
+        """Return an integer in [0, bound)."""
         return self._next() % bound
 
     def choice(self, items: Sequence[Item]) -> Item:
-        """Give one of the items."""
+        """Return one of the items."""
         return items[self._next() % len(items)]
 
     def bytes(self, length: int) -> bytes:
-        """Give random bytes."""
+        """Return random bytes."""
         return self._generator.bytes(length)
 
 
@@ -70,31 +119,31 @@ def _numbers(generator: np.random.Generator) -> Iterator[int]:
 
 @dataclass
 class Corpus:
-    """Valid inputs of one channel.
+    """The valid inputs of one channel.
 
-    `fields` are offsets and lengths of what means something in a binary layout; of `packed` inputs, which are msgpack
-    arrays, single values are replaced. `heard` are inputs that are said again just as they were, and never changed.
+    `fields` are offsets and lengths of the fields of a binary layout. In `packed` inputs, which are msgpack arrays,
+    single values are replaced. `replays` are repeated without changes.
     """
 
     entries: Sequence[bytes]
     fields: Sequence[tuple[int, int]] = ()
     packed: bool = False
-    heard: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
+    replays: deque[bytes] = field(default_factory=lambda: deque(maxlen=64))
 
 
 Mutation = Callable[[bytes, Corpus, Chance], bytes]
 
 
-def an_input(corpus: Corpus, chance: Chance) -> bytes:
-    """Give the next input: a valid one with up to three mutations, one said again, or mere noise."""
+def next_input(corpus: Corpus, chance: Chance) -> bytes:
+    """Return the next input: a valid one with up to three mutations, a replay, or noise."""
     kind = chance.below(16)
     if kind == 0:
-        return chance.bytes(chance.below(LONGEST_RANDOM))
-    if kind <= 2 and corpus.heard:
-        return chance.choice(corpus.heard)
+        return chance.bytes(chance.below(MAX_NOISE_BYTES))
+    if kind <= 2 and corpus.replays:
+        return chance.choice(corpus.replays)
     data = chance.choice(corpus.entries)
     mutations = PACKED if corpus.packed else BINARY if corpus.fields else PLAIN
-    for _ in range(chance.below(MOST_MUTATIONS + 1)):
+    for _ in range(chance.below(MAX_MUTATIONS + 1)):
         data = chance.choice(mutations)(data, corpus, chance)
     return data
 
@@ -108,7 +157,7 @@ def _flip(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return bytes(changed)
 
 
-def _cut(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+def _truncate(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return data[: chance.below(len(data) + 1)]
 
 
@@ -127,36 +176,36 @@ def _overwrite(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return data[:at] + (filled if chance.below(2) else chance.bytes(length)) + data[at + length :]
 
 
-def _leave_out(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+def _remove(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     at = chance.below(len(data) + 1)
     return data[:at] + data[at + 1 + chance.below(16) :]
 
 
 def _change_field(data: bytes, corpus: Corpus, chance: Chance) -> bytes:
-    """Put something else into a field: near to what was there, or far from it."""
+    """Replace a field by a value that is near to or far from the old one."""
     at, length = chance.choice(corpus.fields)
     if at + length > len(data):
         return data
-    was, most = int.from_bytes(data[at : at + length], "big"), (1 << 8 * length) - 1
+    old, mask = int.from_bytes(data[at : at + length], "big"), (1 << 8 * length) - 1
     near, half = chance.below(32), 1 << (8 * length - 1)
-    new: int = chance.choice((was + near, was - near, was + half, half, most, chance.choice(INTEGERS)))
-    return data[:at] + (new & most).to_bytes(length, "big") + data[at + length :]
+    new: int = chance.choice((old + near, old - near, old + half, half, mask, chance.choice(INTEGERS)))
+    return data[:at] + (new & mask).to_bytes(length, "big") + data[at + length :]
 
 
 def _change_value(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
-    """Replace single values of a message, so that its shape stays right."""
+    """Replace single values of a message, whose shape stays valid."""
     try:
         values = msgpack.unpackb(data)
         for _ in range(1 + chance.below(2)):
             values[chance.below(len(values))] = chance.choice(VALUES)
         packed: bytes = msgpack.packb(values, use_bin_type=chance.below(8) > 0)
-    except Exception:  # what an earlier mutation has left of the message
+    except Exception:  # an earlier mutation broke the message
         return data
     return packed
 
 
 def _change_shape(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
-    """Let a message have a value more, one less, or two in each other's place."""
+    """Insert, remove or swap values of a message."""
     try:
         values = msgpack.unpackb(data)
         at, other = chance.below(len(values)), chance.below(len(values))
@@ -173,10 +222,10 @@ def _change_shape(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return packed
 
 
-def _announce(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
+def _prepend_bomb(data: bytes, _corpus: Corpus, chance: Chance) -> bytes:
     return chance.choice(BOMBS) + data
 
 
-PLAIN: Final[tuple[Mutation, ...]] = (_flip, _cut, _lengthen, _splice, _overwrite, _leave_out)
+PLAIN: Final[tuple[Mutation, ...]] = (_flip, _truncate, _lengthen, _splice, _overwrite, _remove)
 BINARY: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_field,) * len(PLAIN))
-PACKED: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_value,) * len(PLAIN), _change_shape, _announce)
+PACKED: Final[tuple[Mutation, ...]] = (*PLAIN, *(_change_value,) * len(PLAIN), _change_shape, _prepend_bomb)

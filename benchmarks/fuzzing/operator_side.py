@@ -1,4 +1,4 @@
-"""Fuzzes what the operator's side reads: states, replies, the video, answers of the clock probe, pictures."""
+"""Fuzz the inputs of the operator's side: states, replies, video datagrams, clock-probe replies and pictures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from benchmarks.fuzzing.mutation import Chance, Corpus
-from benchmarks.fuzzing.target import START, Bench, Target, expect, of, total
+from benchmarks.fuzzing.target import START, NodeBench, Target, expect, payloads_on, total
 
 from lavt.control.drive_controller import PRESETS, make_controller
 from lavt.control.driver_limits import CLIENT_LIMITS
@@ -15,12 +15,12 @@ from lavt.domain import (
     NS_PER_MS,
     NS_PER_S,
     Command,
+    FramePayload,
     Lane,
     NetemReply,
     Picture,
     SessionReply,
     SessionRequest,
-    Sight,
     State,
 )
 from lavt.errors import BadPacket
@@ -57,54 +57,53 @@ from lavt.transport.video.stamp import (
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
-ANEW = 2000
-"""A client that is told that it has lost the vehicle is started anew after so many inputs."""
+RESTART_INTERVAL = 2000
+"""Number of inputs after which the client is restarted, because it may have lost control."""
 WIDTH_PX, HEIGHT_PX = 128, 96
 TOKEN = bytes(range(16))
 
 
-class AlwaysALane:
-    """Sees the same lane in whatever it is shown."""
+class FixedLaneDetector:
+    """A lane detector that always returns the same lane."""
 
     def forget(self) -> None:
-        """Forget nothing."""
+        """Do nothing."""
 
-    def detect(self, _picture: Sight) -> Lane:
-        """Give the lane."""
+    def detect(self, _picture: FramePayload) -> Lane:
+        """Return the lane."""
         return Lane((0.3, 0.01, 0.001), 3.5, 3.6, 20.0, 1.0)
 
 
 def new_driver() -> DriverNode:
-    """Make a driver with the real controller and the real decoder."""
+    """Make a driver node with the real controller and the real decoder."""
     return DriverNode(
         PictureReader(VideoReceiver(Decoder(), (HEIGHT_PX, WIDTH_PX))),
-        AlwaysALane(),
+        FixedLaneDetector(),
         make_controller("lane_keeper", PRESETS["designed"], 2.8448),
         ClientSession("alice", 7, rearm=True, start_ns=START.mono_ns, clear_stop=True),
         CLIENT_LIMITS,
     )
 
 
-def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG001 (there is no chance in it)
-    """States and replies: whatever they say, each command and query that is sent can be read by the vehicle.
+def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG001 (it uses no random numbers)
+    """Make a target for states and replies: the vehicle can decode every command and request that the driver sends.
 
-    After so many inputs a person stops the vehicle; None: never, but the client is started anew again and again, since
-    a state may tell it that it has lost the vehicle.
+    With `stops_after` a person stops the vehicle after that many inputs. Without it the client is restarted repeatedly.
     """
-    commands = modes = unreadable = 0
+    commands = drive_commands = unreadable = 0
 
-    def hear(send: Send) -> None:
-        nonlocal commands, modes
+    def on_send(send: Send) -> None:
+        nonlocal commands, drive_commands
         if send.channel == "control":
             command = decode(Command, send.payload)
             commands += 1
-            modes += command.mode == "drive"
+            drive_commands += command.mode == "drive"
         elif send.channel == "session":
             decode(SessionRequest, send.payload)
         elif send.channel == "path_token":
             PathClient(send.payload.token)
 
-    bench = Bench(new_driver(), hear)
+    bench = NodeBench(new_driver(), on_send)
     wall_ns = START.wall_ns
     state = State(
         wall_ns, START.mono_ns, 8.0, 0.01, "drive", "driving", "armed by the client", 12, "", active_operator="alice"
@@ -112,36 +111,36 @@ def driver(seed: int, *, stops_after: int | None = None) -> Target:  # noqa: ARG
     stopped = replace(state, speed_mps=0.0, safety="safe_stop", rejected="not the epoch in force", requested_by="bob")
     reply = SessionReply(True, "", 2**63 + 1, TOKEN, 5600, "kernel", 0)
     states = Corpus([encode(each) for each in (state, stopped, replace(stopped, safety="emergency_stop"))], packed=True)
-    replies = Corpus([encode(each) for each in (reply, SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns))],
-                     packed=True)  # fmt: skip
+    rejection = SessionReply(False, "held by bob", 0, b"", 5600, "", wall_ns)
+    replies = Corpus([encode(each) for each in (reply, rejection)], packed=True)
     picture = RenderedPicture(np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8))
     inputs = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs, unreadable
         inputs += 1
-        if stops_after is None and inputs % ANEW == 0:
+        if stops_after is None and inputs % RESTART_INTERVAL == 0:
             unreadable = rejected()
             bench.node = new_driver()
-        bench.give(channel, data)
-        bench.go(STEP_NS)
+        bench.deliver(channel, data)
+        bench.advance(STEP_NS)
         if inputs % 33 == 0:
-            bench.give("view", DecodedFrame(bench.now.wall_ns, bench.now.wall_ns, picture))
+            bench.deliver("view", DecodedFrame(bench.now.wall_ns, bench.now.wall_ns, picture))
         if inputs == stops_after:
-            bench.give("operator", "emergency_stop")
+            bench.deliver("operator", "emergency_stop")
 
     def rejected() -> int:
         return unreadable + total(bench.node.counts, "states_unreadable", "session_replies_unreadable")
 
     def finish() -> str:
-        expect(inputs < 1000 or commands > 0, "the driver said nothing")
-        return f"{commands} commands, {modes} of them to drive"
+        expect(inputs < 1000 or commands > 0, "the driver sent no commands")
+        return f"{commands} commands, {drive_commands} of them in mode drive"
 
     return Target({"state": states, "session_reply": replies}, feed, rejected, finish)
 
 
-def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
-    """Answers to queries for the network's condition: each is in force or is not, in words."""
+def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
+    """Make a target for replies to requests of a network condition: each one is reported to the driver."""
     node = InjectionClient(
         "alice",
         7,
@@ -151,30 +150,30 @@ def condition_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no cha
         state_delay_ms=0.0,
         start_ns=START.mono_ns,
     )
-    bench = Bench(node)
-    inputs = told = 0
+    bench = NodeBench(node)
+    inputs = reported = 0
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
-        nonlocal inputs, told
+        nonlocal inputs, reported
         inputs += 1
-        told += len(of(bench.give(channel, data), "condition_in_force"))
-        bench.go(STEP_NS)
+        reported += len(payloads_on(bench.deliver(channel, data), "condition_in_force"))
+        bench.advance(STEP_NS)
         if inputs % 500 == 0:
-            bench.give("injected", InjectionResult(1, "", "", (("control", 75.1),)))
+            bench.deliver("injected", InjectionResult(1, "", "", (("control", 75.1),)))
 
     def rejected() -> int:
         return node.counts["netem_replies_unreadable"]
 
     def finish() -> str:
-        expect(told + rejected() == inputs, "replies were lost")
-        return f"{told} told to the driver"
+        expect(reported + rejected() == inputs, "replies were lost")
+        return f"{reported} reported to the driver"
 
-    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob holds the vehicle"))], packed=True)
+    corpus = Corpus([encode(NetemReply(True, "")), encode(NetemReply(False, "bob has control"))], packed=True)
     return Target({"netem_reply": corpus}, feed, rejected, finish)
 
 
 def units(seed: int, number: int) -> list[tuple[int, bytes]]:
-    """Give access units of small noisy pictures, each with its stamp; a keyframe every ten."""
+    """Return access units of small noisy pictures with their stamps; every tenth is a keyframe."""
     encoder = Encoder(WIDTH_PX, HEIGHT_PX, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=10)
     generator = stream(seed, "fuzz pictures")
     made = []
@@ -187,14 +186,14 @@ def units(seed: int, number: int) -> list[tuple[int, bytes]]:
 
 
 HEADER = ((0, 1), (1, 1), (2, 2), (4, 4), (8, 4), (12, 1), (13, 1), (14, 2))
-"""Fields of an RTP packet, and the first ones of its payload."""
+"""Fields of the RTP header and of the beginning of the payload."""
 
 
 def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
-    """Datagrams of a stream of another sender's, and of one with the true one's name: media, repair, RTCP."""
+    """Return media, repair and RTCP datagrams of two foreign streams, one of them with the true stream's SSRC."""
     media, repair = [], []
-    for stray in (Packetizer(99, 5), Packetizer(77, 65_100)):
-        frames = [stray.packetize(unit, 3000 * each) for each, unit in enumerate(encoded)]
+    for foreign in (Packetizer(99, 5), Packetizer(77, 65_100)):
+        frames = [foreign.packetize(unit, 3000 * each) for each, unit in enumerate(encoded)]
         media += [datagram for frame in frames for datagram in frame]
         repair += RepairSender(98, 0).repair(frames[0], 2)
     answered = [ReferenceAnswer(0x4C415654, 12345, NS_PER_MS)]
@@ -214,11 +213,11 @@ def video_corpora(encoded: Sequence[bytes]) -> dict[str, Corpus]:
 
 
 def video(seed: int) -> Target:
-    """Datagrams at the client's video port, a true stream among them: what is reported can be read by the sender."""
+    """Make a target for the client's video port, which also gets a true stream: the sender can decode all feedback."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 2_000_000)
     shown = whole = inputs = frame = 0
 
-    def hear(send: Send) -> None:
+    def on_send(send: Send) -> None:
         nonlocal shown, whole
         if send.channel == "feedback" and not is_path_datagram(send.payload):
             parse_feedback(send.payload)
@@ -226,28 +225,28 @@ def video(seed: int) -> Target:
             shown += 1
             whole += send.payload.complete
 
-    bench = Bench(node, hear)
-    bench.give("path_token", PathToken(TOKEN, 5600))
+    bench = NodeBench(node, on_send)
+    bench.deliver("path_token", PathToken(TOKEN, 5600))
     packetizer, repairs = Packetizer(77, 65_000), RepairSender(78, 0)
     encoded = [unit for _, unit in units(seed, 30)]
     corpora = video_corpora(encoded[:10])
 
     def true_frame() -> None:
-        """Of every second frame the first packet is lost."""
+        """Deliver the next frame of the true stream; every second one loses its first packet."""
         nonlocal frame
         datagrams = packetizer.packetize(encoded[frame % len(encoded)], frame * 3000 % 2**32)
         protecting = repairs.repair(datagrams, frame % 3)
-        corpora["rtp"].heard.extend(datagrams)
-        corpora["repair"].heard.extend(protecting)
+        corpora["rtp"].replays.extend(datagrams)
+        corpora["repair"].replays.extend(protecting)
         for datagram in (*datagrams[frame % 2 :], *protecting):
-            bench.give("rtp", datagram)
+            bench.deliver("rtp", datagram)
         frame += 1
 
     def feed(_channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs
         inputs += 1
-        bench.give("rtp", data)
-        bench.go(STEP_NS)
+        bench.deliver("rtp", data)
+        bench.advance(STEP_NS)
         if inputs % 33 == 0:
             true_frame()
 
@@ -257,31 +256,31 @@ def video(seed: int) -> Target:
 
     def finish() -> str:
         recovered = node.counts["packets_recovered"]
-        return f"{shown} access units, {whole} whole, {recovered} packets made again"
+        return f"{shown} access units, {whole} complete, {recovered} packets recovered"
 
     return Target(corpora, feed, rejected, finish)
 
 
 def pictures(seed: int) -> Target:
-    """Access units into the decoder: no picture is shown whose stamp is not the one that its packets say."""
+    """Make a target for the decoder: no picture is shown whose stamp contradicts the timestamp of its packets."""
     node = new_driver()
-    bench = Bench(node)
+    bench = NodeBench(node)
     true_units = units(seed, 40)
     corpus = Corpus([unit for _, unit in true_units], fields=tuple((at, 1) for at in range(64)))
     inputs = views = 0
 
     def decoded(data: bytes, stamp_ns: int, *, complete: bool) -> Sequence[DecodedFrame]:
         unit = ReceivedUnit(data, rtp_timestamp(stamp_ns), complete, complete, bench.now.mono_ns)
-        shown: Sequence[DecodedFrame] = of(bench.give("access_unit", unit), "view")
+        shown: Sequence[DecodedFrame] = payloads_on(bench.deliver("access_unit", unit), "view")
         for view in shown:
-            expect(stamp_agrees(view.stamp_ns, unit.rtp_timestamp), "a picture was shown with another's stamp")
+            expect(stamp_agrees(view.stamp_ns, unit.rtp_timestamp), "a picture was shown with a wrong stamp")
         return shown
 
     def feed(_channel: str, data: bytes, chance: Chance) -> None:
         nonlocal inputs, views
         inputs += 1
         decoded(data, chance.choice(true_units)[0], complete=bool(chance.below(2)))
-        bench.go(STEP_NS)
+        bench.advance(STEP_NS)
         if inputs % 20 == 0:
             views += sum(len(decoded(unit, stamp_ns, complete=True)) for stamp_ns, unit in true_units[:2])
 
@@ -292,8 +291,8 @@ def pictures(seed: int) -> Target:
     return Target({"access_unit": corpus}, feed, lambda: node.counts["frames_unreadable"], finish)
 
 
-def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
-    """Answers to probes of the clock: each request is answered once at most."""
+def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
+    """Make a target for clock-probe replies: at most one reply is accepted for each request."""
     node = ProbingClockSyncNode(START.mono_ns)
     corpus = Corpus(
         [
@@ -302,36 +301,36 @@ def probe_at_operator(seed: int) -> Target:  # noqa: ARG001 (there is no chance 
         ],
         fields=((0, 2), (2, 1), (3, 1), (4, 4), (8, 8), (16, 8), (24, 8), (32, 8), (40, 8)),
     )
-    requested = taken = inputs = 0
+    requested = accepted = inputs = 0
 
-    def hear(send: Send) -> None:
-        nonlocal requested, taken
-        taken += send.channel == "clock_probe"
+    def on_send(send: Send) -> None:
+        nonlocal requested, accepted
+        accepted += send.channel == "clock_probe"
         if send.channel == "probe_request":
             requested += 1
             sequence, sent_wall_ns = decode_request(send.payload)
-            corpus.heard.append(
+            corpus.replays.append(
                 encode_reply(ProbeReply(sequence, sent_wall_ns, sent_wall_ns + 5, sent_wall_ns + 9, None, None))
             )
 
-    bench = Bench(node, hear)
+    bench = NodeBench(node, on_send)
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         nonlocal inputs
         inputs += 1
-        bench.give(channel, data)
-        bench.go(STEP_NS)
+        bench.deliver(channel, data)
+        bench.advance(STEP_NS)
 
     def finish() -> str:
-        expect(taken <= requested, "a request was answered twice")
-        expect(taken + node.counts["probes_rejected"] == inputs, "answers were lost")
-        return f"{taken} of {requested} probes answered"
+        expect(accepted <= requested, "two replies to one request were accepted")
+        expect(accepted + node.counts["probes_rejected"] == inputs, "replies were lost")
+        return f"{accepted} of {requested} probes answered"
 
     return Target({"probe_reply": corpus}, feed, lambda: node.counts["probes_rejected"], finish)
 
 
 def stamps(seed: int) -> Target:
-    """Planes of any shape with the remains of a stamp: what is read is a number of 64 bits."""
+    """Make a target for stamps in luma planes of any shape: a stamp that is read has at most 64 bits."""
     generator = stream(seed, "fuzz planes")
     planes = []
     for each in range(16):

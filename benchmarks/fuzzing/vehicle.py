@@ -1,4 +1,4 @@
-"""Fuzzes what the vehicle's side reads: commands, and queries of all kinds."""
+"""Fuzz the inputs of the vehicle's side: commands, session requests and netem requests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.fuzzing.mutation import Chance, Corpus
-from benchmarks.fuzzing.target import START, Bench, Target, Wrong, expect, of, total
+from benchmarks.fuzzing.target import START, InvariantViolation, NodeBench, Target, expect, payloads_on, total
 
 from lavt.assembly.entropy import SeededEntropy
 from lavt.domain import (
@@ -26,9 +26,10 @@ from lavt.node import Send
 from lavt.nodes.actuator import ActuatorNode
 from lavt.nodes.injection import InjectionNode
 from lavt.nodes.payloads import FrameWritten, StationaryStatus
-from lavt.safety.gate import LARGEST_STORED_NUMBER, SafetyGate
+from lavt.safety.gate import SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
+from lavt.safety.session import LARGEST_STORED_NUMBER
 from lavt.transport.emulation.impairment import check_flows
 from lavt.transport.messages import MAX_MESSAGE_BYTES, decode, encode
 from lavt.transport.netem.injector import InjectionOrder, InjectionResult
@@ -36,9 +37,9 @@ from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 FRAME_NS = NS_PER_S // 30
 STEP_NS = NS_PER_MS
-"""Between two inputs."""
-TURN = 20
-"""The true operator has a turn, a command from a new picture, after so many inputs."""
+"""Time between two inputs."""
+OPERATOR_INTERVAL = 20
+"""Number of inputs after which the true operator sends a command from a new picture."""
 STRAIGHT = (0.0,) * 10
 CAPABILITIES = Capabilities(
     simulated=True,
@@ -53,8 +54,8 @@ CAPABILITIES = Capabilities(
 )
 
 
-class Standing:
-    """A vehicle on a lift: it never moves, and remembers the last thing it was asked to do."""
+class StationaryVehicle:
+    """A vehicle that never moves and stores the last actuation."""
 
     capabilities = CAPABILITIES
 
@@ -63,67 +64,67 @@ class Standing:
         self.requested = Actuation(0.0, 0.0, 1.0)
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
-        """Live until then."""
+        """Advance the time."""
         self.now_ns = max(self.now_ns, to_ns)
         return []
 
     def apply(self, actuation: Actuation, _now_ns: int) -> None:
-        """Obey."""
+        """Store the actuation."""
         self.requested = actuation
 
     def engage(self, wanted: bool, now_ns: int) -> None:
         """Do nothing."""
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Tell nothing."""
+        """Return nothing."""
         return []
 
     def state(self) -> VehicleState:
-        """Stand."""
+        """Return the state at standstill."""
         return VehicleState(self.now_ns, 0.0, 0.0, "drive")
 
     def ground_truth(self) -> GroundTruth | None:
-        """Know of none."""
+        """Return None: there is no ground truth."""
         return None
 
     def next_wake_ns(self) -> int:
-        """Ask for a life every 5 ms."""
+        """Return the next time to advance, every 5 ms."""
         return self.now_ns + 5 * NS_PER_MS
 
 
-class Vehicle:
-    """The actuator's node, a camera that writes stamps, and the operator who may drive."""
+class VehicleSide:
+    """The actuator node, a camera that writes stamps, and the active operator."""
 
     def __init__(self, seed: int) -> None:
         entropy = SeededEntropy(seed, "vehicle")
         limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
         self.gate = SafetyGate(
-            LIMITS, limiter, new_epoch=lambda: entropy.number(64), new_token=lambda: entropy.token(16), video_port=5600,
-        )  # fmt: skip
-        self.vehicle = Standing()
+            LIMITS, limiter, new_epoch=lambda: entropy.number(64), new_token=lambda: entropy.token(16), video_port=5600
+        )
+        self.vehicle = StationaryVehicle()
         self.node = ActuatorNode(self.vehicle, self.gate, start_ns=START.mono_ns)
-        self.bench = Bench(self.node)
+        self.bench = NodeBench(self.node)
         self._epoch = self._sequence = self._frame = self.stamp_ns = 0
         self.control = Corpus(old_commands(), packed=True)
         self.session = Corpus(requests(), packed=True)
 
     def picture(self) -> None:
-        """Write a stamp: whoever sees the video knows it."""
+        """Write a new stamp, as in the video."""
         self._frame += 1
         self.stamp_ns = self.bench.now.wall_ns
         frame = FrameWritten(self._frame, self.stamp_ns, self.bench.now.mono_ns, None, self._frame, 5000)
-        self.bench.give("frame", frame)
+        self.bench.deliver("frame", frame)
 
     def ask(self, operation: Any, number: int = 0) -> SessionReply:
-        """Ask as the operator; what is granted is remembered."""
+        """Send a session request of the operator and store the granted epoch."""
         request = encode(SessionRequest(operation, "operator", 2**63 + 5, number))
-        [payload] = of(self.bench.give("session", request, 1), "session_reply")
+        [payload] = payloads_on(self.bench.deliver("session", request, 1), "session_reply")
         reply = decode(SessionReply, payload)
         self._epoch = reply.epoch or self._epoch
         return reply
 
-    def turn(self) -> None:
-        """Send the operator's next command, and let others hear it."""
+    def send_command(self) -> None:
+        """Send the operator's next command, which others may replay."""
         self.picture()
         if self.gate.state not in ("arming", "driving", "degraded"):
             reply = self.ask("hold")
@@ -133,25 +134,34 @@ class Vehicle:
         driving = self.gate.state in ("driving", "degraded")
         now_ns = self.bench.now.wall_ns
         command = Command(
-            self._epoch, self._sequence, now_ns, self.stamp_ns, now_ns, 0.0, 0.3 if driving else 0.0,
-            0.0 if driving else 1.0, STRAIGHT, "drive" if driving else "arm", 0,
-        )  # fmt: skip
+            self._epoch,
+            self._sequence,
+            now_ns,
+            self.stamp_ns,
+            now_ns,
+            steering_rad=0.0,
+            throttle=0.3 if driving else 0.0,
+            brake=0.0 if driving else 1.0,
+            path_curvature_per_m=STRAIGHT,
+            mode="drive" if driving else "arm",
+            emergency_stop=0,
+        )
         payload = encode(command)
-        self.control.heard.append(payload)
-        self.bench.give("control", payload)
+        self.control.replays.append(payload)
+        self.bench.deliver("control", payload)
 
     def arm(self) -> None:
-        """Arm the vehicle, with nobody in between; while it is kept for another one the operator goes on asking."""
+        """Arm the vehicle without other inputs; repeat the request while the vehicle is reserved for somebody else."""
         for _ in range(3000):
-            self.bench.go(20 * NS_PER_MS)
-            self.turn()
+            self.bench.advance(20 * NS_PER_MS)
+            self.send_command()
             if self.gate.state == "driving":
                 return
-        raise Wrong(f"the operator cannot arm the vehicle: {self.gate.rejected}")
+        raise InvariantViolation(f"the operator cannot arm the vehicle: {self.gate.rejected}")
 
 
 def old_commands() -> list[bytes]:
-    """Commands of a session that is over; their stamps are of no picture of this one."""
+    """Return commands of an earlier session, whose stamps belong to no picture of this one."""
     base = Command(
         2**63 + 12345, 2**40, START.wall_ns, START.wall_ns, START.wall_ns, 0.1, 0.5, 0.0, STRAIGHT, "drive", 0
     )
@@ -162,68 +172,75 @@ def old_commands() -> list[bytes]:
 
 
 def requests() -> list[bytes]:
-    """Session queries of somebody else."""
-    known = [SessionRequest(operation, "stranger", 77, 0) for operation in ("hold", "ask", "release")]
-    stops = [SessionRequest(operation, "stranger", 77, START.wall_ns) for operation in
-             ("emergency_stop", "clear_emergency_stop")]  # fmt: skip
-    return [encode(each) for each in (*known, *stops)]
+    """Return session requests of a stranger."""
+    start_ns = START.wall_ns
+    return [
+        encode(each)
+        for each in (
+            SessionRequest("hold", "stranger", 77, 0),
+            SessionRequest("ask", "stranger", 77, 0),
+            SessionRequest("release", "stranger", 77, 0),
+            SessionRequest("emergency_stop", "stranger", 77, start_ns),
+            SessionRequest("clear_emergency_stop", "stranger", 77, start_ns),
+        )
+    ]
 
 
-def _feed(side: Vehicle, channel: str, data: bytes) -> list[Send]:
-    """Give an input of a stranger's: none of his commands is obeyed, and what he is answered can be read."""
-    sends = side.bench.give(channel, data, 2)
-    for admission in of(sends, "admission"):
-        expect(admission.verdict == "rejected", "a stranger's command was obeyed")
-    for reply in of(sends, "session_reply"):
+def _feed(side: VehicleSide, channel: str, data: bytes) -> list[Send]:
+    """Deliver a stranger's input; check that no command is accepted and that replies can be decoded."""
+    sends = side.bench.deliver(channel, data, 2)
+    for admission in payloads_on(sends, "admission"):
+        expect(admission.verdict == "rejected", "a stranger's command was accepted")
+    for reply in payloads_on(sends, "session_reply"):
         decode(SessionReply, reply)
         expect(len(reply) <= MAX_MESSAGE_BYTES, "a reply is too long")
     return sends
 
 
-def _counted(side: Vehicle, given: dict[str, int]) -> None:
+def _check_counts(side: VehicleSide, given: dict[str, int]) -> None:
     counts = side.node.counts
-    commands = counts.get("commands_unreadable", 0) + total(counts, "refused: ")
+    commands = counts.get("commands_unreadable", 0) + total(counts, "rejected: ")
     expect(commands == given["control"], f"{given['control']} commands were given, {commands} counted")
     queries = counts.get("session_requests_unreadable", 0) + total(counts, "session ")
     expect(queries == given["session"], f"{given['session']} queries were given, {queries} counted")
 
 
-def _rejected(side: Vehicle) -> int:
+def _rejected(side: VehicleSide) -> int:
     counts = side.node.counts
     rejections = sum(number for name, number in counts.items() if name.startswith("session ") and "rejected" in name)
     unreadable = counts.get("commands_unreadable", 0) + counts.get("session_requests_unreadable", 0)
-    return unreadable + total(counts, "refused: ") + rejections
+    return unreadable + total(counts, "rejected: ") + rejections
 
 
 def vehicle_at_rest(seed: int) -> Target:
-    """Nobody drives, and strangers send commands and queries: the vehicle brakes and is never armed."""
-    side = Vehicle(seed)
+    """Make a target for a vehicle without an operator: it brakes and is never armed by strangers."""
+    side = VehicleSide(seed)
     given = {"control": 0, "session": 0}
 
     def feed(channel: str, data: bytes, _chance: Chance) -> None:
         given[channel] += 1
-        side.bench.go(STEP_NS)
+        side.bench.advance(STEP_NS)
         if sum(given.values()) % 33 == 0:
             side.picture()
         _feed(side, channel, data)
-        expect(side.gate.state in ("disarmed", "emergency_stop"), f"a stranger has led to {side.gate.state}")
+        expect(side.gate.state in ("disarmed", "emergency_stop"), f"a stranger caused {side.gate.state}")
         requested = side.vehicle.requested
         expect((requested.throttle, requested.brake) == (0.0, 1.0), "the vehicle does not brake")
 
     def finish() -> str:
-        _counted(side, given)
+        _check_counts(side, given)
         return f"ended {side.gate.state}"
 
     return Target({"control": side.control, "session": side.session}, feed, lambda: _rejected(side), finish)
 
 
 def vehicle_driven(seed: int) -> Target:
-    """An operator drives, and strangers send commands, his own again among them, and queries: only he is obeyed.
+    """Make a target for a driven vehicle: no command of a stranger, nor a replayed one, is accepted.
 
-    Anybody may stop the vehicle, and without signatures anybody may take one that stands stopped, and clear the stop;
-    then the operator takes it back and arms it anew. Most numbers of emergency stops are old ones here.
+    Anybody may stop the vehicle. Without signatures anybody may also take control of it after an emergency stop and
+    clear the stop; the operator then takes control again and arms it. Most emergency-stop numbers are old ones here.
     """
-    side = Vehicle(seed)
+    side = VehicleSide(seed)
     side.ask("hold")
     side.ask("emergency_stop", LARGEST_STORED_NUMBER)
     side.arm()
@@ -234,23 +251,22 @@ def vehicle_driven(seed: int) -> Target:
         inputs += 1
         if side.gate.state != "driving" and inputs % 500 == 0:
             side.arm()
-        before, active_operator = side.gate.state, side.gate.active_operator
+        before, active_operator = side.gate.state, side.gate.session.active_operator
         driven += before == "driving"
         _feed(side, channel, data)
-        taken = (
+        is_taken_over = (
             before == "emergency_stop"
-            and side.gate.active_operator is not None
-            and side.gate.active_operator[0] != "operator"
+            and side.gate.session.active_operator is not None
+            and side.gate.session.active_operator[0] != "operator"
         )
-        allowed = (before, "emergency_stop", *(("disarmed",) if taken else ()))
-        expect(side.gate.state in allowed, f"a stranger has led from {before} to {side.gate.state}")
-        expect(
-            side.gate.active_operator == active_operator or before != "driving", "a stranger has taken a driven vehicle"
-        )
-        side.bench.go(STEP_NS)
-        if inputs % TURN == 0 and side.gate.state == "driving":
-            side.turn()
-            expect(side.vehicle.requested.throttle > 0, f"the operator is not obeyed: {side.gate.rejected}")
+        allowed = (before, "emergency_stop", *(("disarmed",) if is_taken_over else ()))
+        expect(side.gate.state in allowed, f"a stranger caused a transition from {before} to {side.gate.state}")
+        keeps_control = side.gate.session.active_operator == active_operator or before != "driving"
+        expect(keeps_control, "a stranger took control of a driven vehicle")
+        side.bench.advance(STEP_NS)
+        if inputs % OPERATOR_INTERVAL == 0 and side.gate.state == "driving":
+            side.send_command()
+            expect(side.vehicle.requested.throttle > 0, f"the operator's command was rejected: {side.gate.rejected}")
 
     return Target(
         {"control": side.control, "session": side.session},
@@ -260,12 +276,12 @@ def vehicle_driven(seed: int) -> Target:
     )
 
 
-def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chance in it)
-    """Queries for the network's condition: whatever is granted is one that the queues can do."""
+def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (it uses no random numbers)
+    """Make a target for requests of a network condition: only conditions that netem supports are granted."""
     node = InjectionNode(allowed=True, simulated=True, video_port=5600, control=("udp", 7448))
     newest = 0
 
-    def hear(send: Send) -> None:
+    def on_send(send: Send) -> None:
         nonlocal newest
         if send.channel == "inject":
             order: InjectionOrder = send.payload
@@ -275,8 +291,8 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
         elif send.channel == "netem_reply":
             decode(NetemReply, send.payload)
 
-    bench = Bench(node, hear)
-    bench.give("rest", StationaryStatus(True, None))
+    bench = NodeBench(node, on_send)
+    bench.deliver("rest", StationaryStatus(True, None))
     base = NetemRequest("alice", 7, "L4", 5000, 150.0, 0.0, 0.0, "normal", 0.0, 0.0, 0, 0.0, 0.0)
     lossy = replace(base, condition="x", jitter_ms=20.0, loss=0.05, loss_burst_packets=3.0, rate_bps=10**6, reorder=0.1)
     corpus = Corpus([encode(base), encode(lossy), encode(replace(lossy, lease_ms=0))], packed=True)
@@ -285,14 +301,14 @@ def condition_at_vehicle(seed: int) -> Target:  # noqa: ARG001 (there is no chan
     def feed(channel: str, data: bytes, chance: Chance) -> None:
         nonlocal inputs
         inputs += 1
-        bench.give(channel, data, inputs)
-        bench.go(STEP_NS * chance.below(20))
-        if inputs % 500 == 0:  # the queues are slow: until then nobody is answered who asked for another condition
+        bench.deliver(channel, data, inputs)
+        bench.advance(STEP_NS * chance.below(20))
+        if inputs % 500 == 0:  # netem is slow: until then a request for another condition gets no reply
             reason = "" if chance.below(4) else "there is no such interface"
-            bench.give("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
+            bench.deliver("injected", InjectionResult(newest, reason, "", (("video", 150.2),)))
 
     def rejected() -> int:
-        return node.counts["netem_requests_unreadable"] + node.counts["netem refused"]
+        return node.counts["netem_requests_unreadable"] + node.counts["netem rejected"]
 
     def finish() -> str:
         answered = rejected() + node.counts["netem granted"]

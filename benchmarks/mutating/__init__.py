@@ -1,1 +1,1 @@
-"""The parts of `benchmarks/mutation.py`: where a module can be mutated, in which tree it is tried, and the report."""
+"""The parts of `benchmarks/mutation.py`: sites of mutations, trees in which they run, and the report."""

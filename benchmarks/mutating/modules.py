@@ -1,4 +1,4 @@
-"""The modules that are mutated, and the tests that are about them."""
+"""The modules to mutate, and their tests."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ _ADAPTER = tuple(
 
 MODULES: Final[dict[str, tuple[str, ...]]] = {
     "safety/gate.py": _SAFETY,
+    "safety/session.py": _SAFETY,
+    "safety/state_machine.py": _SAFETY,
+    "safety/watchdog.py": _SAFETY,
     "safety/takeover_requests.py": ("safety/test_safety_session.py",),
     "safety/limits.py": (*_SAFETY, "safety/test_limiter.py", "nodes/test_driver_node.py"),
     "safety/limiter.py": ("safety/test_limiter.py", "safety/test_safety_path.py", "nodes/test_actuator_node.py"),
@@ -91,14 +94,14 @@ MODULES: Final[dict[str, tuple[str, ...]]] = {
     f"{_DBW}/codec.py": (f"{_DBW}/test_codec.py", f"{_DBW}/test_profile_dbc.py", f"{_DBW}/test_adapter_vectors.py"),
     f"{_DBW}/crc8.py": (f"{_DBW}/test_crc8.py",),
     f"{_DBW}/profile.py": (f"{_DBW}/test_profile.py", f"{_DBW}/test_profile_dbc.py", *_ADAPTER),
-    f"{_DBW}/proving.py": (f"{_DBW}/test_proving.py",),
+    f"{_DBW}/watchdog_test.py": (f"{_DBW}/test_watchdog_test.py",),
     f"{_DBW}/reports.py": (f"{_DBW}/test_reports.py", *_ADAPTER),
     f"{_DBW}/sending.py": _ADAPTER,
     f"{_DBW}/states.py": (*_ADAPTER, f"{_DBW}/test_by_wire_page.py"),
     f"{_DBW}/traffic.py": (f"{_DBW}/test_traffic.py",),
     f"{_DBW}/vehicle.py": (f"{_DBW}/test_vehicle.py", *_ADAPTER, "assembly/test_assembly_by_wire.py"),
 }
-"""Path below `src/lavt` to paths below `tests`, the most special ones first."""
+"""Path below `src/lavt` to paths below `tests`, the most specific ones first."""
 
 AREAS: Final[dict[str, tuple[str, ...]]] = {
     "safety": ("safety", "nodes", "test_life_of_a_frame.py"),
@@ -110,24 +113,24 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
         "experiment/report",
         "experiment/runs/test_join.py",
         "experiment/runs/test_plan.py",
-    ),  # those that make up records; the others drive
+    ),  # the tests that analyse records; the others drive
     _DBW: (_DBW, "assembly/test_assembly_by_wire.py"),
 }
-"""Folder of a module, or one above it, to the wider tests: they are run for what its own tests let pass."""
+"""Folder of a module to the wider tests, which run if the module's own tests pass."""
 
 
 def own_tests(module: str) -> tuple[str, ...]:
-    """Return the paths of the tests about a module, from the repository's top."""
+    """Return the paths of a module's own tests, from the repository's top."""
     return tuple(f"tests/{path}" for path in MODULES[module])
 
 
 def area_of(module: str) -> tuple[str, ...]:
-    """Return the paths of the wider tests around a module, from the repository's top."""
+    """Return the paths of the tests of a module's area, from the repository's top."""
     folder = next(folder for folder in sorted(AREAS, key=len, reverse=True) if module.startswith(f"{folder}/"))
     return tuple(f"tests/{path}" for path in AREAS[folder])
 
 
 def rest_of_area(module: str) -> tuple[str, ...]:
-    """Return pytest's arguments for the wider tests without those about the module itself."""
+    """Return pytest's arguments for the tests of the area without the module's own."""
     own = own_tests(module)
     return *(path for path in area_of(module) if path not in own), *(f"--ignore={path}" for path in own)

@@ -17,9 +17,17 @@ from lavt.errors import UserError
 ACCEPTED_FILE: Final = Path(__file__).with_name("accepted.toml")
 KEYS: Final = ("module", "function", "line", "mutated")
 _KINDS: Final[dict[str, type | tuple[type, ...]]] = {
-    "module": str, "function": str, "line": str, "mutated": str, "occurrence": int, "line_number": int, "operator": str,
-    "caught": bool, "by": str, "took_s": (int, float),
-}  # fmt: skip
+    "module": str,
+    "function": str,
+    "line": str,
+    "mutated": str,
+    "occurrence": int,
+    "line_number": int,
+    "operator": str,
+    "caught": bool,
+    "by": str,
+    "took_s": (int, float),
+}
 
 Place = tuple[str, str, str, str]
 """Module, function, line and mutated line."""
@@ -27,7 +35,7 @@ Place = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one mutant."""
+    """The result of one mutant."""
 
     module: str
     function: str
@@ -38,35 +46,35 @@ class Result:
     operator: str
     caught: bool
     by: str
-    """The first test that failed, `timeout`, or how pytest ended; empty: nothing caught it."""
+    """The first test that failed, `timeout`, or pytest's exit status; empty if nothing caught it."""
     took_s: float
 
     @property
     def key(self) -> tuple[str, str, str, str, int]:
-        """As `Mutation.key`."""
+        """The same as `Mutation.key`."""
         return self.module, self.function, self.line, self.mutated, self.occurrence
 
     @property
     def place(self) -> Place:
-        """What an accepted survivor is named by."""
+        """The key of an accepted survivor."""
         return self.module, self.function, self.line, self.mutated
 
 
-def result_of(mutation: Mutation, by: str, took_s: float) -> Result:
-    """Return the result of a mutation that was caught by something, or by nothing."""
+def make_result(mutation: Mutation, by: str, took_s: float) -> Result:
+    """Return the result of a mutation; an empty `by` means that nothing caught it."""
     return Result(
         *mutation.key, mutation.line_number, mutation.operator, caught=bool(by), by=by, took_s=round(took_s, 2)
     )
 
 
-def described(mutant: Mutation | Result) -> str:
+def describe(mutant: Mutation | Result) -> str:
     """Return one line: file and line number, the source line before and after, and the operator."""
-    where = f"{SOURCES}/{mutant.module}:{mutant.line_number}"
-    return f"{where}: `{mutant.line}` -> `{mutant.mutated}` ({mutant.operator})"
+    location = f"{SOURCES}/{mutant.module}:{mutant.line_number}"
+    return f"{location}: `{mutant.line}` -> `{mutant.mutated}` ({mutant.operator})"
 
 
 def read_results(path: Path) -> dict[tuple[str, str, str, str, int], Result]:
-    """Return the last result of each mutant. Raises `UserError` for a line that is none."""
+    """Return the last result of each mutant. Raise `UserError` for an invalid line."""
     results = {}
     for number, line in enumerate(path.read_text().splitlines() if path.exists() else (), start=1):
         try:
@@ -74,14 +82,14 @@ def read_results(path: Path) -> dict[tuple[str, str, str, str, int], Result]:
             if set(fields) != set(_KINDS) or not all(isinstance(fields[name], _KINDS[name]) for name in _KINDS):
                 raise ValueError
         except (ValueError, TypeError):
-            raise UserError(f"{path}, line {number}: no result of this program; choose another --out") from None
+            raise UserError(f"{path}, line {number}: not a result of this program; choose another --out") from None
         result = Result(**fields)
         results[result.key] = result
     return results
 
 
 def append_result(path: Path, result: Result) -> None:
-    """Add a line to a file of results."""
+    """Append a line to a file of results."""
     with path.open("a") as file:
         file.write(json.dumps(asdict(result)) + "\n")
 
@@ -89,7 +97,7 @@ def append_result(path: Path, result: Result) -> None:
 def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place, str]:
     """Return the accepted survivors with their reasons.
 
-    Raises `UserError` for an entry that lacks something or matches no mutation of the sources.
+    Raise `UserError` for an entry that is incomplete or matches no mutation of the sources.
     """
     places = {
         (mutation.module, mutation.function, mutation.line, mutation.mutated)
@@ -104,7 +112,7 @@ def load_accepted(path: Path, sites: Mapping[str, Iterable[Site]]) -> dict[Place
         raise UserError(f"{path}: {error}; correct the file") from error
     for number, entry in enumerate(entries, start=1):
         if set(entry) != {*KEYS, "reason"} or not all(isinstance(value, str) for value in entry.values()):
-            raise UserError(f"{path}: entry {number} needs {', '.join(KEYS)} and reason, all of them text")
+            raise UserError(f"{path}: entry {number} needs {', '.join(KEYS)} and reason, each as text")
         place = (entry["module"], entry["function"], entry["line"], entry["mutated"])
         if place not in places:
             raise UserError(
@@ -118,14 +126,18 @@ def report(results: Collection[Result], accepted: Mapping[Place, str]) -> str:
     """Return the survivors line by line, and a table of the modules."""
     survivors = sorted((each for each in results if not each.caught), key=lambda each: (each.module, each.line_number))
     new = [each for each in survivors if each.place not in accepted]
-    known = [each for each in survivors if each.place in accepted]
-    lines = [f"survived: {described(each)}" for each in new]
-    lines += [f"accepted: {described(each)}: {accepted[each.place]}" for each in known]
+    already_accepted = [each for each in survivors if each.place in accepted]
+    lines = [f"survived: {describe(each)}" for each in new]
+    lines += [f"accepted: {describe(each)}: {accepted[each.place]}" for each in already_accepted]
     lines += ["", "| module | mutants | caught | survived | accepted |", "|---|---|---|---|---|"]
     for module in (*sorted({each.module for each in results}), ""):
-        mutants, survived, kept = (sum(module in (each.module, "") for each in some) for some in (results, new, known))
-        lines.append(f"| {module or 'all'} | {mutants} | {mutants - survived - kept} | {survived} | {kept} |")
-    counted = len(results) - len(known)
+        mutants, survived, accepted_count = (
+            sum(module in (each.module, "") for each in some) for some in (results, new, already_accepted)
+        )
+        lines.append(
+            f"| {module or 'all'} | {mutants} | {mutants - survived - accepted_count} | {survived} | {accepted_count} |"
+        )
+    counted = len(results) - len(already_accepted)
     if counted:
         share = (counted - len(new)) / counted
         lines += ["", f"caught: {counted - len(new)} of {counted} mutants that are not accepted, {share:.1%}"]

@@ -1,8 +1,8 @@
-"""Find the places of a module where it can be mutated, and the replacements of each place.
+"""Find the sites of a module where it can be mutated, and the replacements for each site.
 
-A mutation replaces the text of one node or operator. The rest of the file, and the number of its lines, stay the same.
+A mutation replaces the text of one node or operator. The rest of the file and the number of lines stay the same.
 Annotations, decorators, type aliases, `__all__`, `__slots__`, `TYPE_CHECKING` blocks, log calls and strings are left
-out: they have no behaviour of their own, or only text.
+out, because they have no behaviour of their own, or only text.
 """
 
 from __future__ import annotations
@@ -17,14 +17,32 @@ from itertools import pairwise
 from typing import Final
 
 COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, ...]]] = {
-    ast.Lt: ("<=", ">"), ast.LtE: ("<", ">="), ast.Gt: (">=", "<"), ast.GtE: (">", "<="),
-    ast.Eq: ("!=",), ast.NotEq: ("==",), ast.Is: ("is not",), ast.IsNot: ("is",),
-    ast.In: ("not in",), ast.NotIn: ("in",),
-}  # fmt: skip
+    ast.Lt: ("<=", ">"),
+    ast.LtE: ("<", ">="),
+    ast.Gt: (">=", "<"),
+    ast.GtE: (">", "<="),
+    ast.Eq: ("!=",),
+    ast.NotEq: ("==",),
+    ast.Is: ("is not",),
+    ast.IsNot: ("is",),
+    ast.In: ("not in",),
+    ast.NotIn: ("in",),
+}
 ARITHMETIC: Final[dict[type[ast.operator], str]] = {
-    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*",
-    ast.LShift: ">>", ast.RShift: "<<", ast.BitAnd: "|", ast.BitOr: "&", ast.BitXor: "&", ast.MatMult: "*",
-}  # fmt: skip
+    ast.Add: "-",
+    ast.Sub: "+",
+    ast.Mult: "/",
+    ast.Div: "*",
+    ast.FloorDiv: "*",
+    ast.Mod: "*",
+    ast.Pow: "*",
+    ast.LShift: ">>",
+    ast.RShift: "<<",
+    ast.BitAnd: "|",
+    ast.BitOr: "&",
+    ast.BitXor: "&",
+    ast.MatMult: "*",
+}
 EXTREMES: Final = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum"}
 LOGGERS: Final = ("log", "logger", "logging", "warnings")
 NEGATED_BY_OPERATOR: Final = (ast.Eq, ast.NotEq, ast.Is, ast.IsNot, ast.In, ast.NotIn)
@@ -32,15 +50,15 @@ NEGATED_BY_OPERATOR: Final = (ast.Eq, ast.NotEq, ast.Is, ast.IsNot, ast.In, ast.
 
 @dataclass(frozen=True)
 class Mutation:
-    """One replacement in one place.
+    """One replacement at one site.
 
-    Module, function, line, mutated line and occurrence identify it, also after other lines of the file have changed.
+    Module, function, line, mutated line and occurrence identify it, even after other lines of the file have changed.
     """
 
     module: str
     """Path below `src/lavt`."""
     function: str
-    """Qualified name of the function or class around it; empty at module level."""
+    """Qualified name of the enclosing function or class; empty at module level."""
     line_number: int
     operator: str
     line: str
@@ -48,29 +66,29 @@ class Mutation:
     mutated: str
     """The same line after the replacement."""
     occurrence: int
-    """Number of this mutation among those of the function with the same line before and after."""
+    """Index of this mutation among those of the function with the same line before and after."""
     begin: int
     end: int
     replacement: str
 
     @property
     def key(self) -> tuple[str, str, str, str, int]:
-        """What identifies the mutation."""
+        """The identity of the mutation."""
         return self.module, self.function, self.line, self.mutated, self.occurrence
 
-    def applied_to(self, source: str) -> str:
+    def apply_to(self, source: str) -> str:
         """Return the mutated source of the module."""
-        return replaced(source, self.begin, self.end, self.replacement)
+        return replace_text(source, self.begin, self.end, self.replacement)
 
 
 Site = tuple[Mutation, ...]
-"""The replacements of one place."""
+"""The replacements at one place."""
 
 
-def replaced(source: str, begin: int, end: int, text: str) -> str:
-    """Return the source with other text between two offsets, and as many lines as before."""
-    missing_lines = source.count("\n", begin, end) - text.count("\n")
-    return source[:begin] + text + "\n" * missing_lines + source[end:]
+def replace_text(source: str, begin: int, end: int, text: str) -> str:
+    """Replace the text between two offsets, and keep the number of lines."""
+    removed_lines = source.count("\n", begin, end) - text.count("\n")
+    return source[:begin] + text + "\n" * removed_lines + source[end:]
 
 
 def find_sites(module: str, source: str) -> list[Site]:
@@ -79,13 +97,13 @@ def find_sites(module: str, source: str) -> list[Site]:
     finder.visit(ast.parse(source))
     seen: Counter[tuple[str, str, str]] = Counter()
     sites = []
-    for begin, end, operator, function, replacements in sorted(finder.found):
+    for begin, end, operator, function, replacements in sorted(finder.sites):
         number = source.count("\n", 0, begin) + 1
         first, last = source.rfind("\n", 0, begin) + 1, source.find("\n", end)
         line = source[first:].partition("\n")[0].strip()
         mutations = []
         for text in replacements:
-            mutated = replaced(source[first:last], begin - first, end - first, text).partition("\n")[0].strip()
+            mutated = replace_text(source[first:last], begin - first, end - first, text).partition("\n")[0].strip()
             occurrence = seen[function, line, mutated]
             seen[function, line, mutated] += 1
             mutations.append(Mutation(module, function, number, operator, line, mutated, occurrence, begin, end, text))
@@ -94,10 +112,10 @@ def find_sites(module: str, source: str) -> list[Site]:
 
 
 class _Finder(ast.NodeVisitor):
-    """Collects begin, end, operator, function and replacements of each site."""
+    """A visitor that collects begin, end, operator, function and replacements of each site."""
 
     def __init__(self, source: str) -> None:
-        self.found: list[tuple[int, int, str, str, tuple[str, ...]]] = []
+        self.sites: list[tuple[int, int, str, str, tuple[str, ...]]] = []
         self._source = source
         self._lines = source.split("\n")
         self._starts = [0]
@@ -112,10 +130,10 @@ class _Finder(ast.NodeVisitor):
         self._in_function = [False]
 
     def _add(self, begin: int, end: int, operator: str, *replacements: str) -> None:
-        self.found.append((begin, end, operator, ".".join(self._names), replacements))
+        self.sites.append((begin, end, operator, ".".join(self._names), replacements))
 
-    def _range(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        """Return the offsets of a node in characters; `ast` counts the bytes of UTF-8."""
+    def _offsets(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
+        """Return the offsets of a node in characters, where `ast` counts bytes of UTF-8."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
         return self._offset(node.lineno, node.col_offset), self._offset(node.end_lineno, node.end_col_offset)
@@ -125,28 +143,28 @@ class _Finder(ast.NodeVisitor):
 
     def _between(self, before: ast.expr, after: ast.expr) -> tuple[int, int]:
         """Return the offsets of the operator between two operands."""
-        begin, end = self._range(before)[1], self._range(after)[0]
+        begin, end = self._offsets(before)[1], self._offsets(after)[0]
         tokens = self._tokens[bisect_left(self._tokens, (begin, "")) : bisect_left(self._tokens, (end, ""))]
         return tokens[0][0], tokens[-1][0] + len(tokens[-1][1])
 
     def _text(self, node: ast.expr | ast.stmt) -> str:
-        begin, end = self._range(node)
+        begin, end = self._offsets(node)
         return self._source[begin:end]
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> None:
-        """Leave formatted text out."""
+        """Skip formatted text."""
 
     def visit_arg(self, node: ast.arg) -> None:
-        """Leave the annotation of an argument out."""
+        """Skip the annotation of an argument."""
 
     def _visit_function(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> None:
         self.visit(node.args)
         self._visit_body(node, in_function=True)
 
-    visit_FunctionDef = visit_AsyncFunctionDef = _visit_function  # noqa: N815 the names that `ast` calls
+    visit_FunctionDef = visit_AsyncFunctionDef = _visit_function  # noqa: N815 (the names that `ast` calls)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
-        """Visit the body only."""
+        """Visit only the body."""
         self._visit_body(node, in_function=False)
 
     def _visit_body(self, node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef, *, in_function: bool) -> None:
@@ -158,7 +176,7 @@ class _Finder(ast.NodeVisitor):
         self._names.pop()
 
     def visit_If(self, node: ast.If) -> None:
-        """Leave out what only the type checker reads."""
+        """Skip code for type checkers, and negate the condition."""
         if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             for statement in node.orelse:
                 self.visit(statement)
@@ -187,19 +205,19 @@ class _Finder(ast.NodeVisitor):
         negated = isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not)
         compared = isinstance(test, ast.Compare) and len(test.ops) == 1 and isinstance(test.ops[0], NEGATED_BY_OPERATOR)
         if not (negated or compared or isinstance(test, ast.Constant)):
-            self._add(*self._range(test), "not added", f"not ({self._text(test)})")
+            self._add(*self._offsets(test), "not added", f"not ({self._text(test)})")
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
         """Remove `not`."""
         if isinstance(node.op, ast.Not):
-            begin = self._range(node)[0]
+            begin = self._offsets(node)[0]
             end = begin + len("not")
             spaces = len(self._source[end:]) - len(self._source[end:].lstrip(" "))
             self._add(begin, end + spaces, "not removed", "")
         self.generic_visit(node)
 
     def visit_Compare(self, node: ast.Compare) -> None:
-        """Replace each comparison by its neighbours."""
+        """Replace each comparison by similar ones."""
         for (before, after), operator in zip(pairwise([node.left, *node.comparators]), node.ops, strict=True):
             self._add(*self._between(before, after), "comparison", *COMPARISONS[type(operator)])
         self.generic_visit(node)
@@ -217,42 +235,42 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_AugAssign(self, node: ast.AugAssign) -> None:
-        """Swap the operator, or remove the statement."""
+        """Swap the operator, and remove the statement."""
         if not _is_text(node.value):
             self._add(*self._between(node.target, node.value), "arithmetic", ARITHMETIC[type(node.op)] + "=")
         self._statement(node)
         self.generic_visit(node)
 
     def visit_Constant(self, node: ast.Constant) -> None:
-        """Flip a boolean, change a number; text is left out."""
+        """Flip a boolean, or change a number; skip text."""
         if isinstance(node.value, bool):
-            self._add(*self._range(node), "boolean", str(not node.value))
+            self._add(*self._offsets(node), "boolean", str(not node.value))
         elif isinstance(node.value, (int, float)):
             others = dict.fromkeys((node.value + 1, node.value * 2))
             others.pop(node.value, None)
             in_hex = self._text(node).lower().startswith("0x")
-            self._add(*self._range(node), "number", *(f"{other:#x}" if in_hex else repr(other) for other in others))
+            self._add(*self._offsets(node), "number", *(f"{other:#x}" if in_hex else repr(other) for other in others))
 
     def visit_Call(self, node: ast.Call) -> None:
-        """Swap `min` and `max`; leave log calls and the types of casts out."""
+        """Swap `min` and `max`; skip log calls and the types of casts."""
         if _is_log_call(node):
             return
         name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
         if name in EXTREMES:
-            end = self._range(node.func)[1]
+            end = self._offsets(node.func)[1]
             self._add(end - len(name), end, "min/max", EXTREMES[name])
         if name == "cast":
             node.args = node.args[1:]
         self.generic_visit(node)
 
     def visit_Expr(self, node: ast.Expr) -> None:
-        """Remove a call; a string by itself is a docstring."""
+        """Remove a call; a string alone is a docstring."""
         if isinstance(node.value, (ast.Call, ast.Await)) and not _is_log_call(node.value):
             self._statement(node)
         self.generic_visit(node)
 
     def visit_Assign(self, node: ast.Assign) -> None:
-        """Remove an assignment in a function; leave type aliases and lists of names out."""
+        """Remove an assignment in a function; skip type aliases and name lists."""
         target = node.targets[0]
         name = target.id if isinstance(target, ast.Name) else ""
         if not self._in_function[-1] and (name in ("__all__", "__slots__") or _is_type_name(name)):
@@ -261,30 +279,30 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        """Remove an assignment in a function; leave the annotation out."""
+        """Remove an assignment in a function; skip the annotation."""
         if node.value is not None:
             self._statement(node)
             self.visit(node.value)
 
     def _statement(self, node: ast.stmt) -> None:
-        """Remove a statement of a function: without one of a module or class nothing would start."""
+        """Remove a statement of a function; without statements of a module or class nothing would run."""
         if self._in_function[-1]:
-            self._add(*self._range(node), "statement", "pass")
+            self._add(*self._offsets(node), "statement", "pass")
 
     def visit_Return(self, node: ast.Return) -> None:
-        """Return None instead; False is flipped already."""
+        """Return None instead; False is already flipped."""
         if node.value is not None:
             if not (isinstance(node.value, ast.Constant) and (node.value.value is None or node.value.value is False)):
-                self._add(*self._range(node.value), "return value", "None")
+                self._add(*self._offsets(node.value), "return value", "None")
             self.visit(node.value)
 
     def visit_Break(self, node: ast.Break) -> None:
-        """Go on instead."""
-        self._add(*self._range(node), "break/continue", "continue")
+        """Continue instead."""
+        self._add(*self._offsets(node), "break/continue", "continue")
 
     def visit_Continue(self, node: ast.Continue) -> None:
-        """End the loop instead."""
-        self._add(*self._range(node), "break/continue", "break")
+        """Break instead."""
+        self._add(*self._offsets(node), "break/continue", "break")
 
 
 def _is_text(node: ast.expr) -> bool:

@@ -1,4 +1,4 @@
-"""Run tests in a copy of the repository in which one module is mutated."""
+"""Trials of mutants: tests run in a copy of the repository in which one module is mutated."""
 
 from __future__ import annotations
 
@@ -22,28 +22,44 @@ from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
 
 COPIED: Final = ("src", "tests", "benchmarks")
-"""The rest is linked; tests only read it."""
-LEFT_OUT: Final = (
-    ".git", ".hypothesis", ".kernel", ".mypy_cache", ".pytest_cache", ".ruff_cache", ".venv", "out", "output.txt",
+"""The rest is linked, because tests only read it."""
+EXCLUDED: Final = (
+    ".git",
+    ".hypothesis",
+    ".kernel",
+    ".mypy_cache",
+    ".pytest_cache",
+    ".ruff_cache",
+    ".venv",
+    "out",
+    "output.txt",
     "temporary",
-)  # fmt: skip
+)
 MEMORY_BYTES: Final = 8 * 2**30
-"""Address space of a process: a mutant that allocates without end is ended by it."""
+"""Address-space limit of a process, for mutants that allocate memory endlessly."""
 OPTIONS: Final = (
-    "-x", "--timeout=120", "-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "--hypothesis-profile=mutation",
+    "-x",
+    "--timeout=120",
+    "-q",
+    "-n",
+    "0",
+    "-p",
+    "no:cacheprovider",
+    "--tb=no",
+    "--hypothesis-profile=mutation",
     "--basetemp=temporary",
-)  # fmt: skip
+)
 ENDLESS: Final = "timeout"
 _CLOCK = MachineClock()
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What some tests said."""
+    """The result of a run of tests."""
 
     passed: bool
     failed_test: str
-    """The first test that failed, or how pytest ended."""
+    """The first test that failed, or pytest's exit status."""
     took_s: float
 
 
@@ -56,7 +72,7 @@ class WorkTree:
         for path in repository.iterdir():
             if path.name in COPIED:
                 shutil.copytree(path, directory / path.name)
-            elif path.name not in LEFT_OUT:
+            elif path.name not in EXCLUDED:
                 (directory / path.name).symlink_to(path.resolve())
 
     def source(self, module: str) -> Path:
@@ -64,47 +80,51 @@ class WorkTree:
         return self.directory / SOURCES / module
 
     def run(self, tests: Sequence[str], limit_s: float, *, unchanged: bool = False) -> Trial:
-        """Run the tests on what is in the tree now; an `unchanged` tree keeps the compiled files for later runs."""
+        """Run the tests on the tree; an `unchanged` tree keeps the compiled files for later runs."""
         with (self.directory / "output.txt").open("w+") as output:
             begin_ns = _CLOCK.now().mono_ns
             process = subprocess.Popen(
                 [sys.executable, "-m", "pytest", *OPTIONS, *tests],
-                cwd=self.directory, env=self._environment(unchanged), stdin=subprocess.DEVNULL, stdout=output,
-                stderr=subprocess.STDOUT, start_new_session=True,
-            )  # fmt: skip
+                cwd=self.directory,
+                env=self._environment(unchanged),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
             resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
             try:
                 status: int | None = process.wait(timeout=limit_s)
             except subprocess.TimeoutExpired:
                 status = None
             finally:
-                with suppress(ProcessLookupError):  # its children, too
+                with suppress(ProcessLookupError):  # including its children
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
             took_s = (_CLOCK.now().mono_ns - begin_ns) / NS_PER_S
             output.seek(0)
-            said = output.read()
-        return Trial(status == 0, "" if status == 0 else _failure(status, said), took_s)
+            output_text = output.read()
+        return Trial(status == 0, "" if status == 0 else _failure(status, output_text), took_s)
 
     def run_mutated(self, mutation: Mutation, tests: Sequence[str], limit_s: float) -> Trial:
-        """Run the tests on a mutated module, and put it back."""
+        """Run the tests on a mutated module, and restore the module."""
         path = self.source(mutation.module)
         source = path.read_text()
         cached = path.parent / "__pycache__" / f"{path.stem}.{sys.implementation.cache_tag}.pyc"
-        cached.unlink(missing_ok=True)  # one of the same length and second would count as this one's
+        cached.unlink(missing_ok=True)  # a file of the same length and second would count as compiled from this source
         try:
-            path.write_text(mutation.applied_to(source))
+            path.write_text(mutation.apply_to(source))
             return self.run(tests, limit_s)
         finally:
             path.write_text(source)
 
     def _environment(self, unchanged: bool) -> dict[str, str]:
-        own = {"PYTHONPATH": str(self.directory / "src"), "PYTHONDONTWRITEBYTECODE": "" if unchanged else "1"}
-        return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")} | own
+        variables = {"PYTHONPATH": str(self.directory / "src"), "PYTHONDONTWRITEBYTECODE": "" if unchanged else "1"}
+        return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")} | variables
 
 
-def _failure(status: int | None, said: str) -> str:
+def _failure(status: int | None, output_text: str) -> str:
     if status is None:
         return ENDLESS
-    failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", said, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", output_text, re.MULTILINE)
     return failed[1] if failed else f"exit status {status}"

@@ -21,7 +21,7 @@ from typing import Any, Final, Protocol
 import zenoh
 
 from lavt.config_file import shipped
-from lavt.transport.zenoh_link import ARRIVING_KEPT, CONTROL
+from lavt.transport.zenoh_link import CONTROL, RECEIVE_RING_LENGTH
 
 LONGEST_BYTES: Final = 65_507
 LOOPBACK: Final = "127.0.0.1"
@@ -95,7 +95,7 @@ class Zenoh:
         said, heard = ("ask", "echo") if asks else ("echo", "ask")
         qos: dict[str, Any] = CONTROL
         self._publisher = self._session.declare_publisher(f"lavt/round-trip/{said}", **qos)
-        ring: Any = zenoh.handlers.RingChannel(ARRIVING_KEPT)
+        ring: Any = zenoh.handlers.RingChannel(RECEIVE_RING_LENGTH)
         self._subscriber = self._session.declare_subscriber(f"lavt/round-trip/{heard}", ring)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()

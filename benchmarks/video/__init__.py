@@ -1,1 +1,1 @@
-"""The processes of `video_vs_gstreamer.py` and `endurance.py`, and what both sides share."""
+"""The processes of `video_vs_gstreamer.py` and `endurance.py`, and the code that both sides share."""

@@ -1,4 +1,4 @@
-"""The clean part: both sides in turns on loopback, with the codec's floor measured in between."""
+"""The clean-link part: both sides in turns on loopback, with the latency of the codec alone in between."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.video.run import Run
-from benchmarks.video.sides import Outcome, Side, floor_ms, frames_of, measure
+from benchmarks.video.sides import RunOutcome, Side, frames_of, measure, measure_floor_ms
 
 FLOOR_S = 6.0
 USUAL_JITTER_MS = 200
@@ -17,7 +17,7 @@ USUAL_JITTER_MS = 200
 
 @dataclass(frozen=True)
 class Size:
-    """A size of picture, and what is made of it."""
+    """A picture size with its bit rate."""
 
     name: str
     width_px: int
@@ -29,46 +29,46 @@ SIZES = (Size("480p", 640, 480, 2_000_000), Size("720p", 1280, 720, 4_000_000))
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Ours, tuned GStreamer and the floor, measured one after the other."""
+class ComparisonPair:
+    """Ours, tuned GStreamer and the codec's floor, measured one after the other."""
 
-    ours: Outcome
-    tuned: Outcome
+    ours: RunOutcome
+    tuned: RunOutcome
     floor_ms: float
 
     @property
     def median_ratio(self) -> float:
-        """Median latency of ours, as a share of GStreamer's."""
+        """Our median latency divided by GStreamer's."""
         return self.ours.median_ms / self.tuned.median_ms
 
     @property
     def p95_ratio(self) -> float:
-        """The same of what 95 % of the frames keep to."""
+        """Our 95th percentile of latency divided by GStreamer's."""
         return self.ours.p95_ms / self.tuned.p95_ms
 
     @property
     def cpu_ratio(self) -> float:
-        """CPU time of a frame of ours, as a share of GStreamer's."""
+        """Our CPU time for a frame divided by GStreamer's."""
         return self.ours.cpu_ms / self.tuned.cpu_ms
 
     @property
     def over_floor_ms(self) -> float:
-        """How much longer ours takes than encoding and decoding alone."""
+        """Our median latency minus that of encoding and decoding alone."""
         return self.ours.median_ms - self.floor_ms
 
 
-def clean_run(folder: Path, size: Size, seconds: float) -> Run:
-    """Describe a run of a size."""
+def describe_clean_run(folder: Path, size: Size, seconds: float) -> Run:
+    """Return the description of a run with a picture size."""
     return Run(str(folder), size.width_px, size.height_px, size.bit_rate_bps, frames_of(seconds))
 
 
-def measure_pairs(run: Run, pairs: int) -> Iterator[Pair]:
-    """Measure so many pairs; every second one begins with GStreamer."""
+def measure_pairs(run: Run, pairs: int) -> Iterator[ComparisonPair]:
+    """Yield `pairs` measured pairs; every second one begins with GStreamer."""
     for number in range(pairs):
         sides: tuple[Side, Side] = ("ours", "gstreamer") if number % 2 == 0 else ("gstreamer", "ours")
-        first, floor, second = measure(sides[0], run), _floor(run), measure(sides[1], run)
+        first, floor, second = measure(sides[0], run), _measure_floor_ms(run), measure(sides[1], run)
         ours, tuned = (first, second) if sides[0] == "ours" else (second, first)
-        pair = Pair(ours, tuned, floor)
+        pair = ComparisonPair(ours, tuned, floor)
         print(
             f"  pair {number + 1}: ours {ours.median_ms:.2f}, GStreamer {tuned.median_ms:.2f}, floor {floor:.2f} ms",
             file=sys.stderr,
@@ -76,36 +76,36 @@ def measure_pairs(run: Run, pairs: int) -> Iterator[Pair]:
         yield pair
 
 
-def _floor(run: Run) -> float:
-    return floor_ms(replace(run, frames=min(run.frames, frames_of(FLOOR_S))))
+def _measure_floor_ms(run: Run) -> float:
+    return measure_floor_ms(replace(run, frames=min(run.frames, frames_of(FLOOR_S))))
 
 
-def usual(run: Run) -> Outcome:
-    """Measure GStreamer as it is usually configured: encoder tuned, but a jitter buffer, and pictures when due."""
+def measure_usual(run: Run) -> RunOutcome:
+    """Measure GStreamer's usual configuration: a tuned encoder, but a jitter buffer and pictures shown when due."""
     return measure("gstreamer", replace(run, jitter_ms=USUAL_JITTER_MS, synchronous=True))
 
 
-def row(name: str, outcome: Outcome) -> str:
-    """Write a row of the table."""
+def format_row(name: str, outcome: RunOutcome) -> str:
+    """Return a row of the table."""
     return (
         f"| {name} | {outcome.median_ms:.2f} | {outcome.p95_ms:.2f} | {outcome.sender_cpu_ms:.2f} "
         f"| {outcome.receiver_cpu_ms:.2f} | {len(outcome.latency_ms)} of {outcome.sent} |"
     )
 
 
-def clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> dict[str, float]:
-    """Measure a size, print its table, and give what the last line says of it."""
-    run = clean_run(folder, size, seconds)
+def run_clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> dict[str, float]:
+    """Measure a picture size, print its table, and return its values for the last line."""
+    run = describe_clean_run(folder, size, seconds)
     print(f"\n## {size.name}, {size.bit_rate_bps / 1e6:g} Mb/s, {pairs} pairs of {seconds:g} s\n")
     print("| run | median ms | p95 ms | CPU sender ms/frame | CPU receiver ms/frame | frames shown |")
     print("|---|---|---|---|---|---|")
     measured = []
     for pair in measure_pairs(run, pairs):
         measured.append(pair)
-        print(row(f"ours {len(measured)}", pair.ours))
-        print(row(f"GStreamer, tuned {len(measured)}", pair.tuned))
+        print(format_row(f"ours {len(measured)}", pair.ours))
+        print(format_row(f"GStreamer, tuned {len(measured)}", pair.tuned))
         print(f"| floor {len(measured)} | {pair.floor_ms:.2f} | | | | |", flush=True)
-    print(row("GStreamer, usual", usual(run)))
+    print(format_row("GStreamer, usual", measure_usual(run)))
     ratios = {
         "median_ratio": median(pair.median_ratio for pair in measured),
         "cpu_ratio": median(pair.cpu_ratio for pair in measured),
@@ -114,7 +114,7 @@ def clean_part(folder: Path, size: Size, *, pairs: int, seconds: float) -> dict[
     p95 = median(pair.p95_ratio for pair in measured)
     print(
         f"\nOurs / tuned GStreamer, median over pairs: median {ratios['median_ratio']:.2f}, p95 {p95:.2f}, "
-        f"CPU {ratios['cpu_ratio']:.2f}; ours is {ratios['over_floor_ms']:.2f} ms over the codec's floor.",
+        f"CPU {ratios['cpu_ratio']:.2f}; ours is {ratios['over_floor_ms']:.2f} ms above the codec's floor.",
         flush=True,
     )
     return {name: round(value, 3) for name, value in ratios.items()}

@@ -1,4 +1,4 @@
-"""What no video path is faster than: encoding and decoding alone, in one process, with PyAV, at the same pace."""
+"""The lower bound of the latency: encoding and decoding alone, in one process, with PyAV, at the same frame rate."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from benchmarks.video.pictures import picture_of, planes_loop
-from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, freeze, requested_run, tell, wall_ns
+from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Pace, Run, freeze, print_json, requested_run, wall_ns
 
 from lavt.transport.video.stamp import write_stamp_i420
 
 
 def main() -> None:
-    """Measure as many frames as asked."""
+    """Measure the requested number of frames."""
     run = requested_run()
     loop = planes_loop(run.loop)
-    encoder, decoder = _encoder(run), plain_decoder()
+    encoder, decoder = _open_encoder(run), open_decoder()
     planes = np.empty_like(loop[0])
     took_ns = []
     freeze()
@@ -34,10 +34,10 @@ def main() -> None:
         for packet in encoder.encode(frame):
             decoder.decode(av.Packet(bytes(packet)))
         took_ns.append(wall_ns() - begin_ns)
-    tell({"took_ns": took_ns})
+    print_json({"took_ns": took_ns})
 
 
-def _encoder(run: Run) -> VideoCodecContext:
+def _open_encoder(run: Run) -> VideoCodecContext:
     context = av.CodecContext.create("libx264", "w")
     context.width, context.height, context.pix_fmt = run.width_px, run.height_px, "yuv420p"
     context.time_base, context.framerate = Fraction(1, RATE_HZ), Fraction(RATE_HZ)
@@ -49,8 +49,8 @@ def _encoder(run: Run) -> VideoCodecContext:
     return context
 
 
-def plain_decoder() -> VideoCodecContext:
-    """Open FFmpeg's decoder with one thread, which gives each picture as soon as its access unit is there."""
+def open_decoder() -> VideoCodecContext:
+    """Open FFmpeg's decoder with one thread, so that it returns each picture with its access unit."""
     context = av.CodecContext.create("h264", "r")
     context.thread_type, context.thread_count = ThreadType.SLICE, 1
     return context

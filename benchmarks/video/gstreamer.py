@@ -1,4 +1,4 @@
-"""GStreamer in this interpreter, and its two pipelines."""
+"""GStreamer's Python modules, and the two pipelines of the benchmark."""
 
 from __future__ import annotations
 
@@ -9,22 +9,30 @@ from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 
 from lavt.errors import UserError
 
-DEBIANS_PACKAGES = "/usr/lib/python3/dist-packages"
-NEEDED = (
-    "this needs GStreamer: apt-get install python3-gst-1.0 gir1.2-gst-plugins-base-1.0 "
+DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
+INSTALL_HINT = (
+    "this benchmark needs GStreamer: apt-get install python3-gst-1.0 gir1.2-gst-plugins-base-1.0 "
     "gstreamer1.0-plugins-{base,good,bad,ugly} gstreamer1.0-libav"
 )
 ELEMENTS = (
-    "appsrc", "appsink", "x264enc", "rtph264pay", "rtph264depay", "rtpjitterbuffer", "avdec_h264", "udpsrc", "udpsink",
-)  # fmt: skip
+    "appsrc",
+    "appsink",
+    "x264enc",
+    "rtph264pay",
+    "rtph264depay",
+    "rtpjitterbuffer",
+    "avdec_h264",
+    "udpsrc",
+    "udpsink",
+)
 BUFFER_BYTES = 4 * 1024 * 1024
-"""Of the receiving socket, as ours has."""
+"""Buffer of the receiving socket, as large as ours."""
 
 
-def gstreamer() -> Any:
-    """Load GStreamer, for whose Python modules Debian has a folder of its own; `UserError` names what is missing."""
-    if DEBIANS_PACKAGES not in sys.path:
-        sys.path.append(DEBIANS_PACKAGES)
+def load_gstreamer() -> Any:
+    """Import and initialize GStreamer from Debian's folder; raises `UserError` that names what is missing."""
+    if DEBIAN_PACKAGES not in sys.path:
+        sys.path.append(DEBIAN_PACKAGES)
     try:
         import gi  # noqa: PLC0415 (only now it can be found)
 
@@ -32,16 +40,16 @@ def gstreamer() -> Any:
         gi.require_version("GstApp", "1.0")
         from gi.repository import Gst, GstApp  # noqa: F401, PLC0415 (GstApp gives appsrc and appsink their methods)
     except (ImportError, ValueError) as error:
-        raise UserError(NEEDED) from error
+        raise UserError(INSTALL_HINT) from error
     Gst.init(None)
     missing = [name for name in ELEMENTS if Gst.ElementFactory.find(name) is None]
     if missing:
-        raise UserError(f"{NEEDED} (there is no {', '.join(missing)})")
+        raise UserError(f"{INSTALL_HINT} (missing elements: {', '.join(missing)})")
     return Gst
 
 
-def sending(run: Run) -> str:
-    """Describe the pipeline that sends: no look-ahead, one thread, the same rate, decoder buffer and GOP as ours."""
+def sender_pipeline(run: Run) -> str:
+    """Return the sender's pipeline: no look-ahead, one thread, the same rate, decoder buffer and GOP as ours."""
     kept = "! tee name=units units. ! appsink name=kept sync=false units. " if run.keep else ""
     return (
         "appsrc name=source is-live=true format=time max-bytes=0 "
@@ -55,8 +63,8 @@ def sending(run: Run) -> str:
     )
 
 
-def receiving(run: Run) -> str:
-    """Describe the pipeline that receives."""
+def receiver_pipeline(run: Run) -> str:
+    """Return the receiver's pipeline."""
     return (
         f"udpsrc name=socket address=127.0.0.1 port=0 buffer-size={BUFFER_BYTES} "
         "caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96 "

@@ -1,4 +1,4 @@
-"""The receiving process of GStreamer: pictures out of `appsink`, each looked at where it lies."""
+"""GStreamer's receiving process: it pulls pictures from `appsink` and reads their stamps in place."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.video.gstreamer import gstreamer, receiving
-from benchmarks.video.run import Run, freeze, requested_run, tell, wait_for_line, wall_ns
-from benchmarks.video.watch import Watch
+from benchmarks.video.gstreamer import load_gstreamer, receiver_pipeline
+from benchmarks.video.picture_log import PictureLog
+from benchmarks.video.run import Run, freeze, print_json, requested_run, wait_for_line, wall_ns
 
 from lavt.transport.video.stamp import read_stamp
 
 
 def main() -> None:
-    """Receive until it is told to end."""
+    """Receive until a line arrives on stdin."""
     run = requested_run()
-    gst = gstreamer()
-    pipeline = gst.parse_launch(receiving(run))
+    gst = load_gstreamer()
+    pipeline = gst.parse_launch(receiver_pipeline(run))
     pipeline.set_state(gst.State.PLAYING)
     pipeline.get_state(5 * gst.SECOND)
-    watch = Watch(run)
+    log = PictureLog(run)
     ended = threading.Event()
     freeze()
-    tell({"port": pipeline.get_by_name("socket").get_property("port")})
+    print_json({"port": pipeline.get_by_name("socket").get_property("port")})
     threading.Thread(target=_wait_for_end, args=(ended,), daemon=True).start()
-    _receive(gst, run, pipeline.get_by_name("pictures"), watch, ended)
+    _receive(gst, run, pipeline.get_by_name("pictures"), log, ended)
     pipeline.set_state(gst.State.NULL)
-    watch.save(Path(run.folder) / "read.npz")
-    tell({"counts": {}})
+    log.save(Path(run.folder) / "read.npz")
+    print_json({"counts": {}})
 
 
 def _wait_for_end(ended: threading.Event) -> None:
@@ -37,7 +37,7 @@ def _wait_for_end(ended: threading.Event) -> None:
     ended.set()
 
 
-def _receive(gst: Any, run: Run, pictures: Any, watch: Watch, ended: threading.Event) -> None:
+def _receive(gst: Any, run: Run, pictures: Any, log: PictureLog, ended: threading.Event) -> None:
     while not ended.is_set():
         sample = pictures.try_pull_sample(gst.SECOND // 2)
         if sample is None:
@@ -46,7 +46,7 @@ def _receive(gst: Any, run: Run, pictures: Any, watch: Watch, ended: threading.E
         _, mapped = buffer.map(gst.MapFlags.READ)
         luma = np.frombuffer(mapped.data, np.uint8, run.width_px * run.height_px).reshape(run.height_px, run.width_px)
         stamp_ns = read_stamp(luma)
-        watch.note(stamp_ns, wall_ns(), luma)
+        log.note(stamp_ns, wall_ns(), luma)
         buffer.unmap(mapped)
 
 

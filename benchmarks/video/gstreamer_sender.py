@@ -1,13 +1,23 @@
-"""The sending process of GStreamer: a frame into `appsrc` whenever one is due."""
+"""GStreamer's sending process: it pushes a frame into `appsrc` whenever one is due."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from benchmarks.video.gstreamer import gstreamer, sending
+from benchmarks.video.gstreamer import load_gstreamer, sender_pipeline
 from benchmarks.video.pictures import picture_of, planes_loop
-from benchmarks.video.run import Pace, Run, cpu_ns, freeze, requested_run, save_units, tell, wait_for_line, wall_ns
+from benchmarks.video.run import (
+    Pace,
+    Run,
+    cpu_ns,
+    freeze,
+    print_json,
+    requested_run,
+    save_units,
+    wait_for_line,
+    wall_ns,
+)
 from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_S
@@ -15,20 +25,20 @@ from lavt.transport.video.stamp import write_stamp_i420
 
 
 def main() -> None:
-    """Send as many frames as asked from when it is told to begin."""
+    """Send the requested number of frames after a line arrives on stdin."""
     run = requested_run()
-    gst = gstreamer()
-    pipeline = gst.parse_launch(sending(run))
+    gst = load_gstreamer()
+    pipeline = gst.parse_launch(sender_pipeline(run))
     pipeline.set_state(gst.State.PLAYING)
     loop = planes_loop(run.loop)
-    tell({})
+    print_json({})
     wait_for_line()
     cpu = _send(gst, run, pipeline.get_by_name("source"), loop)
     pipeline.get_by_name("source").end_of_stream()
     pipeline.get_bus().timed_pop_filtered(5 * gst.SECOND, gst.MessageType.EOS | gst.MessageType.ERROR)
-    save_units(run, _kept(gst, pipeline) if run.keep else [])
+    save_units(run, _pull_units(gst, pipeline) if run.keep else [])
     pipeline.set_state(gst.State.NULL)
-    tell({"cpu_ns": cpu})
+    print_json({"cpu_ns": cpu})
 
 
 def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]:
@@ -54,7 +64,7 @@ def _send(gst: Any, run: Run, source: Any, loop: NDArray[np.uint8]) -> list[int]
     return cpu
 
 
-def _kept(gst: Any, pipeline: Any) -> list[bytes]:
+def _pull_units(gst: Any, pipeline: Any) -> list[bytes]:
     units = []
     while (sample := pipeline.get_by_name("kept").try_pull_sample(0)) is not None:
         buffer = sample.get_buffer()

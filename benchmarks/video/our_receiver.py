@@ -1,48 +1,48 @@
-"""The receiving process of ours: the receiver and the driver in their runtime."""
+"""Our receiving process: the receiver node and the watcher node in their runtime."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from benchmarks.video.product import LOOPBACK, Ends, WatchedPictures, receiver_nodes
-from benchmarks.video.run import TOKEN, requested_run, tell, wait_for_line
-from benchmarks.video.watch import Watch
+from benchmarks.video.picture_log import PictureLog
+from benchmarks.video.product import LOOPBACK, LastPictureReceiver, SideRuntime, build_receiver_nodes
+from benchmarks.video.run import TOKEN, print_json, requested_run, wait_for_line
 
 from lavt.domain import Now
 from lavt.nodes.payloads import PathToken
 
 
-class ReadPictures:
-    """In the place of the record: notes each picture with its stamp."""
+class PictureRecorder:
+    """A recorder that notes each picture with its stamp, and the nodes' counts."""
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, log: PictureLog) -> None:
         self.counts: dict[str, int] = {}
-        self.watched: WatchedPictures | None = None
-        self._watch = watch
+        self.pictures: LastPictureReceiver | None = None
+        self._log = log
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the recorder's)
-        """Note a picture that was read, and at the end what the nodes counted."""
-        if topic == "picture" and payload.readable and self.watched is not None:
-            self._watch.note(payload.stamp_ns, payload.read_wall_ns, self.watched.last.luma)
+        """Note a picture whose stamp was read, and finally the nodes' counts."""
+        if topic == "picture" and payload.readable and self.pictures is not None:
+            self._log.note(payload.stamp_ns, payload.read_wall_ns, self.pictures.last.luma)
         elif topic == "counts":
             self.counts |= {name: count for name, count in payload.items() if name != "node" and count}
 
 
 def main() -> None:
-    """Receive until it is told to end."""
+    """Receive until a line arrives on stdin."""
     run = requested_run()
-    watch = Watch(run)
-    read = ReadPictures(watch)
-    ends = Ends("rtp", read, remote=(LOOPBACK, run.port))
-    nodes, read.watched = receiver_nodes(run, ends.clock)
-    runtime = ends.start(nodes)
-    runtime.deliver("path_token", PathToken(TOKEN, run.port), ends.clock.now())
-    tell({"port": ends.port})
+    log = PictureLog(run)
+    recorder = PictureRecorder(log)
+    side = SideRuntime("rtp", recorder, remote=(LOOPBACK, run.port))
+    nodes, recorder.pictures = build_receiver_nodes(run, side.clock)
+    runtime = side.start(nodes)
+    runtime.deliver("path_token", PathToken(TOKEN, run.port), side.clock.now())
+    print_json({"port": side.port})
     wait_for_line()
-    ends.close()
-    watch.save(Path(run.folder) / "read.npz")
-    tell({"counts": read.counts})
+    side.close()
+    log.save(Path(run.folder) / "read.npz")
+    print_json({"counts": recorder.counts})
 
 
 if __name__ == "__main__":

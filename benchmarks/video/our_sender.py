@@ -1,4 +1,4 @@
-"""The sending process of ours: the camera node in its runtime."""
+"""Our sending process: the camera node in its runtime."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import threading
 from typing import Any
 
 import numpy as np
-from benchmarks.video.product import Ends, sender_nodes
-from benchmarks.video.run import TOKEN, Run, Table, cpu_ns, requested_run, save_units, tell, wait_for_line
+from benchmarks.video.product import SideRuntime, build_sender_nodes
+from benchmarks.video.run import TOKEN, Run, Table, cpu_ns, print_json, requested_run, save_units, wait_for_line
 
 from lavt.domain import Now
 
 
-class SentFrames:
-    """In the place of the record: writes the table of what was sent, and keeps access units."""
+class SentFrameRecorder:
+    """A recorder that writes the table of sent frames and keeps access units."""
 
     def __init__(self, run: Run) -> None:
         self.done = threading.Event()
@@ -24,7 +24,7 @@ class SentFrames:
         self._run = run
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the recorder's)
-        """Note a frame that was sent."""
+        """Note a sent frame."""
         sent = self.sent
         if sent >= self._run.frames:
             return
@@ -41,19 +41,19 @@ class SentFrames:
 
 
 def main() -> None:
-    """Send as many frames as asked from when it is told to begin."""
+    """Send the requested number of frames after a line arrives on stdin."""
     run = requested_run()
-    sent = SentFrames(run)
-    ends = Ends("feedback", sent)
-    tell({"port": ends.port})
+    recorder = SentFrameRecorder(run)
+    side = SideRuntime("feedback", recorder)
+    print_json({"port": side.port})
     wait_for_line()
-    runtime = ends.start(sender_nodes(run, ends.clock, ends.port))
-    runtime.deliver("video_token", TOKEN, ends.clock.now())
-    while not sent.done.wait(0.5) and not runtime.stopped.is_set():
+    runtime = side.start(build_sender_nodes(run, side.clock, side.port))
+    runtime.deliver("video_token", TOKEN, side.clock.now())
+    while not recorder.done.wait(0.5) and not runtime.stopped.is_set():
         pass
-    ends.close()
-    save_units(run, sent.units)
-    tell({"cpu_ns": sent.cpu_ns[: sent.sent].tolist()})
+    side.close()
+    save_units(run, recorder.units)
+    print_json({"cpu_ns": recorder.cpu_ns[: recorder.sent].tolist()})
 
 
 if __name__ == "__main__":

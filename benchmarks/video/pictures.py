@@ -1,4 +1,4 @@
-"""The pictures that both sides send: a loop of the simulator's without a seam, in files mapped into memory."""
+"""The pictures that both sides send: a seamless loop of the simulator's pictures, in files mapped into memory."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ Planes = NDArray[np.uint8]
 
 
 def render_loop(stem: Path, width_px: int, height_px: int) -> None:
-    """Write a drive at 30 km/h, forth and then back, as STEM.npy; every picture has its noise."""
+    """Write a drive at 30 km/h, forward and then back, as STEM.npy; every picture has its own noise."""
     road = load_road(ROUTE)
     renderer = Renderer(road, CameraModel(width_px, height_px), seed=1, scenery="full")
     shape = (LOOP_FRAMES, height_px * 3 // 2, width_px)
     planes = np.lib.format.open_memmap(stem.with_suffix(".npy"), "w+", np.uint8, shape)
     for number in range(LOOP_FRAMES):
-        place = min(number, LOOP_FRAMES - number)
-        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + place * FRAME_M))
+        step = min(number, LOOP_FRAMES - number)
+        x_m, y_m, heading_rad, _ = (float(each) for each in road.point(FROM_M + step * FRAME_M))
         picture = renderer.render(Pose(0, x_m, y_m, heading_rad), number)
         cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420, dst=planes[number])
 
 
 def planes_loop(stem: Path) -> NDArray[np.uint8]:
-    """Map the loop, in I420; what is written to it stays in this process."""
+    """Map the loop, in I420; writes to it are private to this process."""
     loop: NDArray[np.uint8] = np.load(stem.with_suffix(".npy"), mmap_mode="c")
-    loop.reshape(-1)[::4096].sum()  # no frame pays for the mapping of its pages
+    loop.reshape(-1)[::4096].sum()  # maps all pages now, so that no frame is delayed by it
     return loop
 
 
-def squared_error(luma: NDArray[np.uint8], filmed: Planes) -> float:
-    """Mean squared error of a luma plane, (height, width), to what was filmed, without the corner of the stamp."""
+def squared_error(luma: NDArray[np.uint8], source: Planes) -> float:
+    """Return the mean squared error of a luma plane, (height, width), to the source picture, without the stamp."""
     height_px, width_px = luma.shape
-    below = cv2.norm(luma[STAMP_PX:], filmed[STAMP_PX:height_px], cv2.NORM_L2SQR)
-    beside = cv2.norm(luma[:STAMP_PX, STAMP_PX:], filmed[:STAMP_PX, STAMP_PX:], cv2.NORM_L2SQR)
-    error: float = (below + beside) / (height_px * width_px - STAMP_PX**2)
+    below = cv2.norm(luma[STAMP_PX:], source[STAMP_PX:height_px], cv2.NORM_L2SQR)
+    right = cv2.norm(luma[:STAMP_PX, STAMP_PX:], source[:STAMP_PX, STAMP_PX:], cv2.NORM_L2SQR)
+    error: float = (below + right) / (height_px * width_px - STAMP_PX**2)
     return error
 
 
 def picture_of(loop: NDArray[np.uint8], number: int) -> Picture:
-    """Give the picture that a frame shows."""
-    shown: Picture = loop[number % LOOP_FRAMES]
-    return shown
+    """Return the picture of a frame."""
+    picture: Picture = loop[number % LOOP_FRAMES]
+    return picture

@@ -1,4 +1,4 @@
-"""Our two sides as `lavt server` and `lavt client` build them, less what has nothing to do with the video."""
+"""Our two sides as `lavt server` and `lavt client` build them, without the parts that do not concern the video."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from benchmarks.video.run import GOP_FRAMES, RATE_HZ, VBV_MS, Run
 from lavt.assembly.entropy import MachineEntropy
 from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.nodes import build_client, build_server
-from lavt.assembly.vehicles import VehicleSetup, build_unpictured
+from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import CameraModel, Now, Pose
-from lavt.node import Hop, Message, Node, Send
+from lavt.node import Message, Node, Send, Stage
 from lavt.nodes.picture_reader import PictureReader
 from lavt.nodes.watcher import WatcherNode
 from lavt.runtime.realtime import RealRuntime
@@ -28,7 +28,7 @@ LOOPBACK = "127.0.0.1"
 
 
 class LoopCamera:
-    """A camera that plays the loop into a buffer of its own, in I420, as the other side does."""
+    """A camera that copies the loop's pictures into its own buffer, in I420, as the other side does."""
 
     rate_hz = float(RATE_HZ)
     phase_ns = 0
@@ -39,65 +39,65 @@ class LoopCamera:
         self._planes = self._loop[0].copy()
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame:  # noqa: ARG002 (nothing moves)
-        """Give a frame of the loop."""
+        """Return a frame of the loop."""
         self._planes[:] = picture_of(self._loop, number)
         return CapturedFrame(number, at_ns, self._planes)
 
 
-class Deaf:
-    """Stands for a node that only listens: takes the messages of some channels and forgets them."""
+class SinkNode:
+    """A node that discards the messages of some channels."""
 
     counts: Mapping[str, int] = {}
 
     def __init__(self, name: str, *channels: str) -> None:
         self.name = name
-        self.chains: Mapping[str, Sequence[Hop]] = dict.fromkeys(channels, (("forget", _forget),))
+        self.pipelines: Mapping[str, Sequence[Stage]] = dict.fromkeys(channels, (("forget", _forget),))
 
     def next_wake_ns(self) -> None:
-        """It sleeps."""
+        """Return None: the node is never woken."""
 
 
 def _forget(_message: Message, _now: Now) -> None: ...
 
 
-class Nowhere:
-    """A link that leads nowhere."""
+class NullLink:
+    """A link that discards messages."""
 
     def send(self, *sends: Send) -> None:
-        """Forget messages."""
+        """Discard messages."""
 
 
-class Note(Protocol):
-    """What is done with the messages that a run's record would hold."""
+class MessageRecorder(Protocol):
+    """A recorder of the messages that a run's record would contain."""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Take one."""
+        """Record a message."""
         ...
 
 
-class Ends:
-    """A side at work: its nodes, its video socket and its runtime."""
+class SideRuntime:
+    """One side of the benchmark: its nodes, its video socket and its runtime."""
 
-    def __init__(self, channel: str, note: Note, *, remote: tuple[str, int] | None = None) -> None:
+    def __init__(self, channel: str, recorder: MessageRecorder, *, remote: tuple[str, int] | None = None) -> None:
         self.clock = MachineClock()
         self.runtime: RealRuntime | None = None
-        self._note = note
+        self._recorder = recorder
         self._link = UdpLink(self.clock, channel, self._deliver, bind=(LOOPBACK, 0), remote=remote)
 
     @property
     def port(self) -> int:
-        """The video's port."""
+        """The port of the video socket."""
         return self._link.port
 
     def start(self, nodes: Sequence[Node]) -> RealRuntime:
-        """Start the nodes, then let messages in."""
-        self.runtime = RealRuntime(self.clock, nodes, self._note, lambda: None)
-        self.runtime.start({"video": self._link, "zenoh": Nowhere()})
+        """Start the nodes, then receive messages."""
+        self.runtime = RealRuntime(self.clock, nodes, self._recorder, lambda: None)
+        self.runtime.start({"video": self._link, "zenoh": NullLink()})
         self._link.start()
         return self.runtime
 
     def close(self) -> None:
-        """Stop everything; raises what ended a node before its time."""
+        """Stop the runtime and close the socket; raises the error that stopped a node."""
         if self.runtime is not None:
             self.runtime.stop()
         self._link.close()
@@ -109,8 +109,8 @@ class Ends:
             self.runtime.deliver(channel, payload, arrived, peer)
 
 
-def sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
-    """Build the server's camera node for a loop of pictures."""
+def build_sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
+    """Build the server's camera node with a loop of pictures."""
     config = ServerConfig.model_validate(
         {
             "camera": {"width_px": run.width_px, "height_px": run.height_px, "rate_hz": RATE_HZ},
@@ -118,16 +118,16 @@ def sender_nodes(run: Run, clock: MachineClock, port: int) -> Sequence[Node]:
         }
     )
 
-    def plant(config: ServerConfig) -> VehicleSetup:
-        return replace(build_unpictured(config), camera=LoopCamera(run))
+    def vehicle_setup(config: ServerConfig) -> VehicleSetup:
+        return replace(build_geometry_setup(config), camera=LoopCamera(run))
 
-    fidelity = replace(VIDEO, plant=plant)
+    fidelity = replace(VIDEO, vehicle_setup=vehicle_setup)
     nodes = build_server(config, clock.now, MachineEntropy(), host="", video_port=port, fidelity=fidelity)
-    return [nodes.camera, Deaf("actuator", "frame")]
+    return [nodes.camera, SinkNode("actuator", "frame")]
 
 
-class WatchedPictures:
-    """The client's decoder, with its last picture at hand."""
+class LastPictureReceiver:
+    """The client's decoder, which keeps its last picture."""
 
     def __init__(self, pictures: PictureReceiver) -> None:
         self.last: Any = None
@@ -135,14 +135,14 @@ class WatchedPictures:
         self._read_stamp = pictures.read_stamp
 
     def read_stamp(self, received: Any) -> int:
-        """Read the stamp, and keep what it was read from."""
+        """Read the stamp and keep the picture."""
         self.last = received
         return self._read_stamp(received)
 
 
-def receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], WatchedPictures]:
-    """Build the client's receiver, and what reads its pictures."""
+def build_receiver_nodes(run: Run, clock: MachineClock) -> tuple[Sequence[Node], LastPictureReceiver]:
+    """Build the client's receiver node and a watcher node; return them with the decoder of the pictures."""
     size = {"width_px": run.width_px, "height_px": run.height_px}
     config = ClientConfig.model_validate({"camera": {**size, "rate_hz": RATE_HZ}})
-    watched = WatchedPictures(VIDEO.receiver(config))
-    return [build_client(config, clock.now, MachineEntropy()).receiver, WatcherNode(PictureReader(watched))], watched
+    pictures = LastPictureReceiver(VIDEO.receiver(config))
+    return [build_client(config, clock.now, MachineEntropy()).receiver, WatcherNode(PictureReader(pictures))], pictures

@@ -1,7 +1,7 @@
-"""The impaired link between the two processes of a run, of either side: every datagram waits, some are lost.
+"""The impaired link between the two processes of a run: it delays every datagram and loses some.
 
-What comes from the sender is delayed and lost by the packet's number, so that both sides meet the same law with the
-same chance; what goes back is delayed alike, and datagrams that only prove the path are not lost.
+Delay and loss of the sender's packets depend on the packet's number, so that both sides meet the same impairment.
+Datagrams of the reverse direction get the constant delay; datagrams of the path validation are not lost.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import os
 import select
 import socket
 import sys
-import time  # noqa: TID251 (what it holds back is timed)
+import time  # noqa: TID251 (the relay delays datagrams)
 from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from benchmarks.video.run import freeze, requested_run, tell
+from benchmarks.video.run import freeze, print_json, requested_run
 from benchmarks.video.sides import WARM_UP_FRAMES
 
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -37,46 +37,46 @@ Address = tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Case:
-    """What the link does beside its 20 ms each way."""
+class LinkCase:
+    """The impairment of the link in addition to its 20 ms each way."""
 
     name: str
     jitter_ms: float = 0.0
-    """A further delay, uniform from 0 to this, for each packet by itself: they overtake each other."""
+    """A further delay, uniform from 0 to this, independent for each packet, so that packets are reordered."""
     loss: float = 0.0
     burst_packets: float = 0.0
-    """Mean length of a burst; 0: each packet is lost by itself."""
+    """Mean length of a burst; 0: packets are lost independently."""
 
-    def told(self) -> str:
-        """Write the case for the relay's command line."""
+    def to_json(self) -> str:
+        """Return the case as JSON for the relay's command line."""
         return json.dumps(asdict(self))
 
 
-class Fate:
-    """What becomes of each packet of the video."""
+class PacketImpairment:
+    """The delays and losses of the video's packets."""
 
-    def __init__(self, case: Case) -> None:
-        law = Impairment(loss=case.loss, loss_burst_packets=case.burst_packets)
-        self._losses = LossProcess(SEED, "loss", case.loss, gilbert(law) if case.burst_packets else None)
+    def __init__(self, case: LinkCase) -> None:
+        impairment = Impairment(loss=case.loss, loss_burst_packets=case.burst_packets)
+        self._losses = LossProcess(SEED, "loss", case.loss, gilbert(impairment) if case.burst_packets else None)
         self._jitter = Draws(SEED, "jitter")
         self._jitter_ns = case.jitter_ms * NS_PER_MS
         self._number = 0
 
-    def delay_ns(self) -> int | None:
-        """Give how much longer than usual the next packet takes; None: it is lost."""
+    def next_delay_ns(self) -> int | None:
+        """Return the further delay of the next packet; None: it is lost."""
         number = self._number
         self._number += 1
-        lost = self._losses.takes(number)
+        lost = self._losses.is_lost(number)
         return None if lost else round(self._jitter.at(number) * self._jitter_ns)
 
 
-class Tally:
-    """What the sender gave to carry, after the warm-up."""
+class TrafficCounter:
+    """Counters of the sender's traffic after the warm-up."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.late_ms: list[float] = []
-        """How much later than due each datagram left: this machine's doing, and not the law's."""
+        """How much later than due each datagram left: an error of this machine, not the impairment."""
         self._frames = 0
 
     def note(self, datagram: bytes, *, lost: bool) -> None:
@@ -91,53 +91,55 @@ class Tally:
         self.counts[f"{name}_lost"] += lost
 
 
-def carry(near: socket.socket, far: socket.socket, there: Address, case: Case, *, near_sends: bool) -> Tally:
-    """Carry datagrams between whoever comes to `near` and the process at `there`, until a line comes on stdin."""
-    fate, tally = Fate(case), Tally()
+def relay(
+    near: socket.socket, far: socket.socket, far_peer: Address, case: LinkCase, *, near_sends: bool
+) -> TrafficCounter:
+    """Relay datagrams between the peer that sends to `near` and `far_peer` until a line arrives on stdin."""
+    impairment, traffic = PacketImpairment(case), TrafficCounter()
     waiting: list[tuple[int, int, bytes, socket.socket, Address]] = []
-    guest: Address | None = None
+    near_peer: Address | None = None
     number = 0
     while True:
         pause_s = 1.0 if not waiting else max(0.0, (waiting[0][0] - time.monotonic_ns()) / NS_PER_S)
         ready, _, _ = select.select((near, far, sys.stdin), (), (), pause_s)
         if sys.stdin in ready:
-            return tally
-        for opened in (near, far):
-            if opened not in ready:
+            return traffic
+        for receiver in (near, far):
+            if receiver not in ready:
                 continue
-            datagram, address = opened.recvfrom(LONGEST_DATAGRAM)
+            datagram, address = receiver.recvfrom(LONGEST_DATAGRAM)
             due_ns = time.monotonic_ns() + ONE_WAY_MS * NS_PER_MS
-            guest = address if opened is near else guest
-            if (opened is near) is near_sends and datagram[0] >> 6 == 2:
-                longer_ns = fate.delay_ns()
-                tally.note(datagram, lost=longer_ns is None)
-                if longer_ns is None:
+            near_peer = address if receiver is near else near_peer
+            if (receiver is near) is near_sends and datagram[0] >> 6 == 2:
+                delay_ns = impairment.next_delay_ns()
+                traffic.note(datagram, lost=delay_ns is None)
+                if delay_ns is None:
                     continue
-                due_ns += longer_ns
-            out, to = (far, there) if opened is near else (near, guest)
-            if to is not None:
+                due_ns += delay_ns
+            sender, peer = (far, far_peer) if receiver is near else (near, near_peer)
+            if peer is not None:
                 number += 1
-                heapq.heappush(waiting, (due_ns, number, datagram, out, to))
+                heapq.heappush(waiting, (due_ns, number, datagram, sender, peer))
         while waiting and waiting[0][0] <= time.monotonic_ns():
-            due_ns, _, datagram, out, to = heapq.heappop(waiting)
-            tally.late_ms.append((time.monotonic_ns() - due_ns) / NS_PER_MS)
-            out.sendto(datagram, to)
+            due_ns, _, datagram, sender, peer = heapq.heappop(waiting)
+            traffic.late_ms.append((time.monotonic_ns() - due_ns) / NS_PER_MS)
+            sender.sendto(datagram, peer)
 
 
 def main() -> None:
-    """Carry until told to end, then tell what was carried."""
-    run, side, case = requested_run(), sys.argv[2], Case(**json.loads(sys.argv[3]))
+    """Relay until a line arrives on stdin, then print the counters."""
+    run, side, case = requested_run(), sys.argv[2], LinkCase(**json.loads(sys.argv[3]))
     near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     for each in (near, far):
         each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         each.bind(("127.0.0.1", 0))
     freeze()
-    with suppress(OSError):  # the link is no program: where it may, it goes before both sides
+    with suppress(OSError):  # the relay stands for the network, so it gets priority over both sides if permitted
         os.setpriority(os.PRIO_PROCESS, 0, -20)
-    tell({"port": near.getsockname()[1]})
-    tally = carry(near, far, ("127.0.0.1", run.port), case, near_sends=side == "gstreamer")
-    late_ms = tally.late_ms or [0.0]
-    tell({**tally.counts, "late_p99_ms": float(np.percentile(late_ms, 99)), "late_max_ms": max(late_ms)})
+    print_json({"port": near.getsockname()[1]})
+    traffic = relay(near, far, ("127.0.0.1", run.port), case, near_sends=side == "gstreamer")
+    late_ms = traffic.late_ms or [0.0]
+    print_json({**traffic.counts, "late_p99_ms": float(np.percentile(late_ms, 99)), "late_max_ms": max(late_ms)})
 
 
 if __name__ == "__main__":

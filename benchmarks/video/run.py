@@ -1,4 +1,4 @@
-"""What one run of either side is told, and what its two processes tell of it."""
+"""The description of a run, and the exchange with its processes: arguments, lines of JSON and shared files."""
 
 from __future__ import annotations
 
@@ -19,56 +19,56 @@ RATE_HZ = 30
 VBV_MS = 100
 GOP_FRAMES = 30
 TOKEN = bytes(16)
-"""Opens the path of our video; in a drive it comes with the session."""
-ROOM = 1 << 17
-"""So many frames fit into the table of what was sent: more than an hour of them."""
+"""Token of our video path; in a drive it comes with the session."""
+MAX_FRAMES = 1 << 17
+"""Capacity of the table of sent frames: more than an hour."""
 
 Table = NDArray[np.int64]
-"""A row for each frame that was sent, (stamp_ns, number), zero until then; both processes have it in memory."""
+"""A row (stamp_ns, number) for each sent frame, zero until it is sent; both processes map it into memory."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: what is sent where, and what is kept of it."""
+    """The description of one run."""
 
     folder: str
     width_px: int
     height_px: int
     bit_rate_bps: int
     frames: int
-    """So many are sent, those of the warm-up among them."""
+    """Number of frames to send, including the warm-up."""
     port: int = 0
-    """The other end's; known to the process that is started second."""
+    """Port of the process that was started first."""
     keep: bool = False
-    """Write down access units, and how far each received picture is from what was filmed."""
+    """Save the access units and the error of each received picture."""
     jitter_ms: int = 0
     """GStreamer's jitter buffer."""
     synchronous: bool = False
-    """GStreamer shows each picture when it is due, not when it is there."""
+    """GStreamer shows each picture when it is due, instead of immediately."""
 
     @property
     def loop(self) -> Path:
-        """The folder's pictures of this size, without the end of their names."""
+        """Path of the pictures of this size, without suffix."""
         return Path(self.folder) / f"{self.width_px}x{self.height_px}"
 
     def table(self) -> Table:
-        """Map the table of what was sent into memory."""
+        """Map the table of sent frames into memory."""
         return np.asarray(np.load(Path(self.folder) / "sent.npy", mmap_mode="r+"))
 
 
-def new_table(folder: Path) -> None:
-    """Begin a new run's table."""
-    np.save(folder / "sent.npy", np.zeros((ROOM, 2), np.int64))
+def create_table(folder: Path) -> None:
+    """Create an empty table of sent frames."""
+    np.save(folder / "sent.npy", np.zeros((MAX_FRAMES, 2), np.int64))
 
 
 def save_units(run: Run, units: Sequence[bytes]) -> None:
-    """Write down the access units of a run, in the order of its table."""
+    """Save the access units of a run, in the order of its table."""
     sizes = np.array([len(each) for each in units], np.int64)
     np.savez(Path(run.folder) / "units.npz", data=np.frombuffer(b"".join(units), np.uint8), sizes=sizes)
 
 
 def load_units(run: Run) -> list[bytes]:
-    """Read them again."""
+    """Load the access units of a run."""
     with np.load(Path(run.folder) / "units.npz") as saved:
         ends = np.cumsum(saved["sizes"]).tolist()
         data = saved["data"].tobytes()
@@ -76,43 +76,43 @@ def load_units(run: Run) -> list[bytes]:
 
 
 def requested_run() -> Run:
-    """Take the run from the command line."""
+    """Return the run described on the command line."""
     return Run(**json.loads(sys.argv[1]))
 
 
-def told(run: Run) -> str:
-    """Write a run for the command line of a process."""
+def to_json(run: Run) -> str:
+    """Return a run as JSON for the command line of a process."""
     return json.dumps(asdict(run))
 
 
-def tell(entries: Mapping[str, object]) -> None:
-    """Print a line for the program that started this process."""
+def print_json(entries: Mapping[str, object]) -> None:
+    """Print a line of JSON for the program that started this process."""
     print(json.dumps(entries), flush=True)
 
 
 def wait_for_line() -> None:
-    """Wait until the program that started this process says so, or has ended."""
+    """Wait for a line from the program that started this process, or for its end."""
     sys.stdin.readline()
 
 
 def freeze() -> None:
-    """What `RealRuntime` does about garbage: what exists by now stays."""
+    """Exclude existing objects from garbage collection, as `RealRuntime` does."""
     gc.collect()
     gc.freeze()
 
 
 def cpu_ns() -> int:
-    """CPU time of this process so far."""
+    """Return the CPU time of this process."""
     return time.process_time_ns()
 
 
 def wall_ns() -> int:
-    """The wall clock, in which stamps are."""
+    """Return the wall clock, which stamps use."""
     return time.time_ns()
 
 
 class Pace:
-    """Due times of frames, from the number each time."""
+    """A pace of frames, whose due times are computed from the frame number."""
 
     def __init__(self) -> None:
         self._begin_ns = time.monotonic_ns()

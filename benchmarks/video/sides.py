@@ -1,4 +1,4 @@
-"""Starting a run's processes, and what comes of it."""
+"""Start the processes of a run and evaluate its results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from benchmarks.video.run import RATE_HZ, Run, new_table, told
+from benchmarks.video.run import RATE_HZ, Run, create_table, to_json
 from numpy.typing import NDArray
 
 import lavt
@@ -23,46 +23,49 @@ from lavt.errors import WorkError
 Side = Literal["ours", "gstreamer"]
 
 WARM_UP_FRAMES = 3 * RATE_HZ
-"""Sent first, and not counted."""
+"""Frames that are sent first and not counted."""
 DRAIN_S = 0.5
-"""What is on its way at the end has so long to arrive."""
+"""Time for the last packets to arrive."""
 FOLDER = Path(__file__).parents[2]
 
 
-class Process:
-    """A process of a run: begins when told to, and tells things by lines of JSON."""
+class BenchmarkProcess:
+    """A process of a run, which is controlled by lines on its stdin and prints lines of JSON."""
 
     def __init__(self, name: str, run: Run, *more: str) -> None:
         paths = os.pathsep.join([str(FOLDER), str(Path(lavt.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
         self.name = name
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"benchmarks.video.{name}", told(run), *more],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=FOLDER,
+            [sys.executable, "-m", f"benchmarks.video.{name}", to_json(run), *more],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=FOLDER,
             env={**os.environ, "PYTHONPATH": paths},
-        )  # fmt: skip
+        )
 
     @property
     def process_id(self) -> int:
-        """Its number in the system."""
+        """The process id."""
         return self._process.pid
 
-    def heard(self) -> dict[str, Any]:
-        """Wait for its next line; raises `WorkError` when it ends without one."""
+    def read_line(self) -> dict[str, Any]:
+        """Wait for its next line of JSON; raises `WorkError` if it ends without one."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:
-            raise WorkError(f"the process {self.name} of the benchmark ended before its time; see above")
+            raise WorkError(f"the process {self.name} of the benchmark ended early; see above")
         entries: dict[str, Any] = json.loads(line)
         return entries
 
-    def tell(self) -> None:
-        """Say that it may begin, or that it shall end."""
+    def send_line(self) -> None:
+        """Send a line, which lets it begin or end."""
         assert self._process.stdin is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
 
     def close(self) -> None:
-        """Wait for its end, or bring it about."""
+        """Wait for its end; kill it after 5 s."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -73,23 +76,24 @@ class Process:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What a run gave, of the frames after the warm-up."""
+class RunOutcome:
+    """The results of a run for the frames after the warm-up."""
 
     sent: int
     latency_ms: NDArray[np.float64]
-    """Of each frame whose picture came out with its stamp."""
+    """Latency of each frame whose picture was shown with its stamp."""
     sender_cpu_ms: float
-    """For a frame, like the next."""
+    """CPU time for a frame."""
     receiver_cpu_ms: float
+    """CPU time for a frame."""
     errors: dict[int, float]
-    """Mean squared error of each picture that came out, by its place in the table; empty where nothing was kept."""
+    """Mean squared error of each shown picture by its row in the table; -1 if errors were not requested."""
     relayed: dict[str, Any]
     counts: dict[str, int]
 
     @property
     def shown(self) -> float:
-        """Share of the frames whose picture came out with its stamp."""
+        """Share of frames whose picture was shown with its stamp."""
         return len(self.latency_ms) / self.sent
 
     @property
@@ -99,12 +103,12 @@ class Outcome:
 
     @property
     def p95_ms(self) -> float:
-        """What 95 % of the frames kept to."""
+        """95th percentile of the latency."""
         return float(np.percentile(self.latency_ms, 95)) if len(self.latency_ms) else float("nan")
 
     @property
     def cpu_ms(self) -> float:
-        """CPU time for a frame, of both processes."""
+        """CPU time of both processes for a frame."""
         return self.sender_cpu_ms + self.receiver_cpu_ms
 
 
@@ -113,16 +117,16 @@ def measure(
     run: Run,
     relay: Sequence[str] = (),
     *,
-    when_started: Callable[[Sequence[Process]], None] = lambda _processes: None,
-) -> Outcome:
-    """Do a run; `relay` is what the relay is told, if there is one. `when_started` gets the processes."""
-    new_table(Path(run.folder))
+    when_started: Callable[[Sequence[BenchmarkProcess]], None] = lambda _processes: None,
+) -> RunOutcome:
+    """Run one side; `relay` are the arguments of the relay, if there is one. `when_started` gets the processes."""
+    create_table(Path(run.folder))
     order = {"ours": ("our_sender", "our_receiver"), "gstreamer": ("gstreamer_receiver", "gstreamer_sender")}[side]
-    processes: list[Process] = []
+    processes: list[BenchmarkProcess] = []
 
     def start(name: str, port: int, *more: str) -> dict[str, Any]:
-        processes.append(Process(name, replace(run, port=port), *more))
-        return processes[-1].heard()
+        processes.append(BenchmarkProcess(name, replace(run, port=port), *more))
+        return processes[-1].read_line()
 
     try:
         port = start(order[0], 0)["port"]
@@ -131,34 +135,34 @@ def measure(
         start(order[1], port)
         sender, receiver = (processes[0], processes[-1]) if side == "ours" else (processes[-1], processes[0])
         when_started(processes)
-        sender.tell()
-        sent = sender.heard()
+        sender.send_line()
+        sent = sender.read_line()
         time.sleep(DRAIN_S)
-        receiver.tell()
-        received = receiver.heard()
+        receiver.send_line()
+        received = receiver.read_line()
         relayed = {}
         if relay:
-            processes[1].tell()
-            relayed = processes[1].heard()
+            processes[1].send_line()
+            relayed = processes[1].read_line()
     finally:
         for each in processes:
             each.close()
-    return _outcome(run, sent["cpu_ns"], received["counts"], relayed)
+    return _evaluate(run, sent["cpu_ns"], received["counts"], relayed)
 
 
-def _outcome(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relayed: dict[str, Any]) -> Outcome:
+def _evaluate(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relayed: dict[str, Any]) -> RunOutcome:
     stamps = run.table()[WARM_UP_FRAMES : run.frames, 0].tolist()
-    places = {stamp_ns: WARM_UP_FRAMES + place for place, stamp_ns in enumerate(stamps)}
+    rows = {stamp_ns: row for row, stamp_ns in enumerate(stamps, WARM_UP_FRAMES)}
     latency_ms, errors, cpu_ns = [], {}, []
     with np.load(Path(run.folder) / "read.npz") as read:
         for (stamp_ns, read_ns, at_cpu_ns), error in zip(read["rows"].tolist(), read["errors"].tolist(), strict=True):
-            place = places.pop(stamp_ns, None)
-            if place is not None:
+            row = rows.pop(stamp_ns, None)
+            if row is not None:
                 latency_ms.append((read_ns - stamp_ns) / NS_PER_MS)
                 cpu_ns.append(at_cpu_ns)
-                errors[place] = error
+                errors[row] = error
     steps = sender_cpu_ns[WARM_UP_FRAMES:]
-    return Outcome(
+    return RunOutcome(
         len(stamps),
         np.array(latency_ms),
         (steps[-1] - steps[0]) / (len(steps) - 1) / NS_PER_MS,
@@ -169,16 +173,16 @@ def _outcome(run: Run, sender_cpu_ns: list[int], counts: dict[str, int], relayed
     )
 
 
-def floor_ms(run: Run) -> float:
-    """Measure the median of encoding and decoding alone."""
-    process = Process("floor", run)
+def measure_floor_ms(run: Run) -> float:
+    """Measure the median time of encoding and decoding alone."""
+    process = BenchmarkProcess("floor", run)
     try:
-        took_ns = process.heard()["took_ns"]
+        took_ns = process.read_line()["took_ns"]
     finally:
         process.close()
     return float(np.median(took_ns[RATE_HZ:])) / NS_PER_MS
 
 
 def frames_of(seconds: float) -> int:
-    """How many frames a run of so many seconds sends, the warm-up among them."""
+    """Return the number of frames of a run of `seconds`, including the warm-up."""
     return WARM_UP_FRAMES + max(2, round(seconds * RATE_HZ))

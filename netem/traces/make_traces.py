@@ -1,4 +1,4 @@
-"""Makes the two traces beside it by formula, with nothing measured in them: python netem/traces/make_traces.py."""
+"""Write the two traces in this folder, which are synthetic, not measured: python netem/traces/make_traces.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ OPPORTUNITY_BITS = 1500 * 8
 
 
 def fading() -> str:
-    """Give a capacity that goes up and down like a cosine, in Mahimahi's format: an opportunity for 1500 bytes."""
+    """Return a capacity that varies like a cosine, in Mahimahi's format with opportunities of 1500 bytes."""
     lines, bits = [], 0.0
     for millisecond in range(1, PERIOD_MS + 1):
         share = (1 + math.cos(2 * math.pi * millisecond / PERIOD_MS)) / 2
@@ -25,7 +25,7 @@ def fading() -> str:
 
 
 def handover() -> str:
-    """Give a delay of 20 ms that every 10 s rises to 180 ms within 0.2 s and falls back within a second, in CSV."""
+    """Return a delay of 20 ms that rises to 180 ms within 0.2 s and falls back within a second, every 10 s, in CSV."""
     points = [(0.0, 20), (6.0, 20), (6.2, 180), (7.2, 20), (10.0, 20)]
     return "time_s,delay_ms\n" + "".join(f"{time_s:g},{delay_ms}\n" for time_s, delay_ms in points)
 

@@ -1,3 +1,3 @@
-"""LAVT measures what network delay does to driving by video."""
+"""LAVT: a testbed that measures how network latency affects vision-based teleoperation."""
 
 __version__ = "0.1.0"

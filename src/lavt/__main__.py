@@ -1,4 +1,4 @@
-"""`python -m lavt` is `lavt`."""
+"""Run the `lavt` command with `python -m lavt`."""
 
 from lavt.cli.main import main
 

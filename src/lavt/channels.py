@@ -1,4 +1,4 @@
-"""One table of all channels: who sends, who listens, what carries it, and what happens to what has to wait."""
+"""The table of all channels: sender, receivers, carrier, and how messages wait."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 Carrier = Literal["local", "video", "zenoh", "probe", "clock", "netem", "record"]
-"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. probe: the UDP flow that
-compares the clocks. clock: the host's source of clock reports. netem: the host's own queues. record: nobody listens,
-it is written down."""
+"""local: between nodes of one side. video: the UDP flow of the video. zenoh: a key or a query. probe: the UDP flow of
+the clock probes. clock: the host's time source. netem: the host's queues. record: recorded only, without a receiver."""
 
 Waiting = Literal["queue", "newest"]
-"""queue: kept in order, the oldest dropped when full. newest: a new one replaces the one that waits."""
+"""queue: in order; when full, the oldest is dropped. newest: a new message replaces the waiting one."""
 
 QUEUE_LENGTH = 4096
 """More than a second of packets."""
-COMMANDS = 64
-"""A second of commands: older ones would be refused anyway."""
-PROBES = 64
-"""One that has to wait for more than a few others tells little."""
+COMMAND_QUEUE_LENGTH = 64
+"""A second of commands: older ones would be rejected anyway."""
+PROBE_QUEUE_LENGTH = 64
+"""A probe that waits for more than a few others is of little use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,43 +29,43 @@ class Channel:
     receivers: tuple[str, ...] = ()
     waiting: Waiting = "queue"
     length: int = QUEUE_LENGTH
-    """How many may wait in the queue."""
-    at_once: bool = False
-    """In real time the thread that brings it walks it through its receiver: for short chains that come often."""
+    """Capacity of the queue."""
+    inline: bool = False
+    """In real time the delivering thread runs the receiver's pipeline: for short and frequent pipelines."""
 
 
 CHANNELS: dict[str, Channel] = {
     # server, between its nodes
-    "pose": Channel("local", "actuator", ("camera",), "newest", at_once=True),
-    "frame": Channel("local", "camera", ("actuator",), at_once=True),
+    "pose": Channel("local", "actuator", ("camera",), "newest", inline=True),
+    "frame": Channel("local", "camera", ("actuator",), inline=True),
     "video_token": Channel("local", "actuator", ("camera",)),
-    "rest": Channel("local", "actuator", ("injection",)),  # in order with requests: a flood of these must not hide it
-    "server_ends": Channel("local", "operator", ("actuator",)),  # the vehicle is stopped before the server ends
+    "rest": Channel("local", "actuator", ("injection",)),  # queues with the requests: a flood of them must not hide it
+    "server_ends": Channel("local", "operator", ("actuator",)),  # stops the vehicle before a server shutdown
     # client, between its nodes
     "access_unit": Channel("local", "receiver", ("driver",)),
     "view": Channel("local", "driver", ("driver",), "newest"),
     "picture_lost": Channel("local", "driver", ("receiver",)),
-    "operator": Channel("local", "operator", ("driver",)),  # a person stops or releases the vehicle
+    "operator": Channel("local", "operator", ("driver",)),  # a person requests a stop or a release
     "path_token": Channel("local", "driver", ("receiver",)),
     "condition_in_force": Channel("local", "injection", ("driver",), "newest"),
     # across the network
-    "rtp": Channel("video", "camera", ("receiver",), at_once=True),  # RTP, sender reports, challenges: server to client
+    "rtp": Channel("video", "camera", ("receiver",), inline=True),  # RTP, sender reports, challenges: server to client
     "feedback": Channel("video", "receiver", ("camera",)),  # RTCP, hellos: client to server
-    "control": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
+    "control": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),
     "state": Channel("zenoh", "actuator", ("driver",), "newest"),
-    "session": Channel("zenoh", "driver", ("actuator",), length=COMMANDS),
+    "session": Channel("zenoh", "driver", ("actuator",), length=COMMAND_QUEUE_LENGTH),
     "session_reply": Channel("zenoh", "actuator", ("driver",)),
-    "netem": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
-    "netem_reply": Channel("zenoh", "injection", ("injection",), length=COMMANDS),
-    # the clocks: each host's own, and the client's against the server's
-    "probe_request": Channel("probe", "clock_sync", ("clock_sync",), length=PROBES),
-    "probe_reply": Channel("probe", "clock_sync", ("clock_sync",), length=PROBES),
+    "netem": Channel("zenoh", "injection", ("injection",), length=COMMAND_QUEUE_LENGTH),
+    "netem_reply": Channel("zenoh", "injection", ("injection",), length=COMMAND_QUEUE_LENGTH),
+    # clocks: the time source of each host, and probes between client and server
+    "probe_request": Channel("probe", "clock_sync", ("clock_sync",), length=PROBE_QUEUE_LENGTH),
+    "probe_reply": Channel("probe", "clock_sync", ("clock_sync",), length=PROBE_QUEUE_LENGTH),
     "clock_query": Channel("clock", "clock_sync"),
     "clock_report": Channel("local", "clock_source", ("clock_sync",)),
-    # each host and its own queues
+    # the queues of each host
     "inject": Channel("netem", "injection"),
     "injected": Channel("local", "injector", ("injection",)),
-    # written down only
+    # recorded only
     "video": Channel("record", "camera"),
     "admission": Channel("record", "actuator"),
     "wheel": Channel("record", "actuator"),

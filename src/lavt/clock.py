@@ -11,44 +11,44 @@ from lavt.domain import NS_PER_S, Now
 
 
 class Clock(Protocol):
-    """Something that tells the time of one host."""
+    """The clocks of one host."""
 
     def now(self) -> Now:
-        """Read both clocks."""
+        """Return a reading of both clocks."""
         ...
 
 
-def _nearest_ns() -> int:
-    """How near to each other two readings come on this machine."""
+def _shortest_gap_ns() -> int:
+    """Return the shortest time between two readings on this machine."""
     readings_ns = [time.monotonic_ns() for _ in range(10)]
     return min(late_ns - early_ns for early_ns, late_ns in pairwise(readings_ns))
 
 
-TOGETHER_NS = max(100_000, 3 * _nearest_ns())
-"""Two readings so close to each other are of one moment; a user-mode kernel needs more than 50 us for each."""
+SIMULTANEOUS_NS = max(100_000, 3 * _shortest_gap_ns())
+"""Readings within this time count as simultaneous; a user-mode kernel needs more than 50 us for each."""
 ATTEMPTS = 4
 
 
 class MachineClock:
-    """This machine's own clocks."""
+    """The clocks of this machine."""
 
     def now(self) -> Now:
-        """Read both clocks at one moment: again, where other work came between the readings."""
+        """Return a simultaneous reading of both clocks; repeat it if it was interrupted, up to `ATTEMPTS` times."""
         mono_ns = time.monotonic_ns()
         for _ in range(ATTEMPTS):
             wall_ns = time.time_ns()
             before_ns, mono_ns = mono_ns, time.monotonic_ns()
-            if mono_ns - before_ns <= TOGETHER_NS:
+            if mono_ns - before_ns <= SIMULTANEOUS_NS:
                 break
         return Now(mono_ns, wall_ns)
 
 
 def pause(duration_ns: int) -> None:
-    """Sleep; for the outermost loops of programs only."""
+    """Sleep for `duration_ns`; for the outermost loops of programs only."""
     if duration_ns > 0:
         time.sleep(duration_ns / NS_PER_S)
 
 
 def calendar_time(wall_ns: int) -> datetime:
-    """Say a time of the wall clock as the calendar does, in UTC and in whole seconds."""
+    """Return a wall clock time as a date and time in UTC, in whole seconds."""
     return datetime.fromtimestamp(wall_ns // NS_PER_S, UTC)

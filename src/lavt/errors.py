@@ -1,45 +1,45 @@
-"""The errors of LAVT, one tree.
+"""The exceptions of LAVT.
 
 LavtError
-├── UserError            what the user did wrong: one sentence that says what to do; exit code 2
-├── WorkError            the work failed though the input was right: exit code 1
-├── PeerError            what the peer or the network did wrong: counted and dropped, never fatal
-│   ├── BadMessage       bytes that are not a message of ours, or hold a value out of range
+├── UserError            wrong input: a sentence with the error and its remedy; exit code 2
+├── WorkError            the work failed with valid input; exit code 1
+├── PeerError            an error of the peer or the network: counted and dropped, never fatal
+│   ├── BadMessage       bytes that are not a LAVT message, or a value out of range
 │   └── BadPacket        a datagram that is not RTP, or whose payload cannot be H.264
-└── VehicleError         what the vehicle did wrong: ends the server, as nobody can drive by it
+└── VehicleError         a failure of the vehicle or its camera; ends the server
 """
 
 from __future__ import annotations
 
 
 class LavtError(Exception):
-    """Any error that LAVT raises on purpose."""
+    """The base class of all exceptions that LAVT raises."""
 
 
 class UserError(LavtError):
-    """The input was wrong; the text is one sentence that says what is wrong and what to do."""
+    """The input is wrong; the message is one sentence with the error and its remedy."""
 
 
 class WorkError(LavtError):
-    """The work could not be done though the input was right."""
+    """The work failed with valid input."""
 
 
 class PeerError(LavtError):
-    """Bytes from outside were not what they should be. Whoever parses counts it and goes on."""
+    """Bytes from the network are invalid; the caller counts the error and continues."""
 
 
 class BadMessage(PeerError):
-    """A message that cannot be one of ours."""
+    """Bytes that are not a valid LAVT message."""
 
 
 class BadPacket(PeerError):
-    """A datagram that cannot be part of a video stream."""
+    """A datagram that is not a valid part of a video stream."""
 
 
 class VehicleError(LavtError):
-    """The vehicle or its camera does not do what it should."""
+    """The vehicle or its camera failed."""
 
 
-def in_words(error: Exception) -> str:
-    """Say an error in one sentence: an unforeseen one with its kind, as its own text may say little."""
+def describe_error(error: Exception) -> str:
+    """Return an error as one sentence; an unexpected error is preceded by its type."""
     return str(error) if isinstance(error, LavtError) else f"{type(error).__name__}: {error}"

@@ -1,7 +1,7 @@
-"""What a node is: tables of hops, and no input, output or clock of its own.
+"""The interface of a node: pipelines of stages, without input, output or a clock of its own.
 
-A runtime gives a node a message with the time it arrived, calls hop after hop with each hop's own `now`, sends what
-comes out at the end, and wakes the node when it asked. The same node objects run in real and in virtual time.
+A runtime passes a message with its arrival time through the stages of a pipeline, each with its own `now`, sends the
+result of the last stage, and wakes the node when it is due. The same node objects run in real and in virtual time.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from lavt.domain import Now
 from lavt.value import value
 
 Peer = Any
-"""Opaque: whoever sent a message and may be answered (an address, a query). Only links look inside."""
+"""Opaque: the sender of a message, to which a reply can be sent (an address, a query). Only links read it."""
 
 WAKE = "wake"
-"""The channel on which a node is woken; its payload is None."""
+"""The channel of a node's wakes; its payload is None."""
 
 
 @value
 class Message:
-    """What a node gets: a payload on a channel, when it arrived on this host, and from whom."""
+    """A message to a node: channel, payload, arrival on this host, and sender."""
 
     channel: str
     payload: Any
@@ -31,9 +31,9 @@ class Message:
 
 @value
 class Send:
-    """What a node wants sent: a payload on a channel, to the channel's receivers or to one peer.
+    """A message from a node: a payload on a channel, to the channel's receivers or to one peer.
 
-    On a channel that crosses the network the payload is bytes, elsewhere an object that nobody changes.
+    On a channel that crosses the network the payload is bytes, elsewhere an object that is never modified.
     """
 
     channel: str
@@ -41,32 +41,32 @@ class Send:
     peer: Peer = None
 
 
-Hop = tuple[str, Callable[[Any, Now], Any]]
-"""A name and a function of (what the hop before returned, now).
+Stage = tuple[str, Callable[[Any, Now], Any]]
+"""A name and a function of (result of the previous stage, now).
 
-The first hop of a chain gets the `Message`. A hop that returns None ends the chain; the last one returns the list of
-`Send`s. Where a value on the way has an attribute `stamp_ns`, the chain's timeline is filed under it.
+The first stage of a pipeline gets the `Message`. A stage that returns None ends the pipeline; the last stage returns
+the list of `Send`s. If a result has an attribute `stamp_ns`, the timeline is recorded under that stamp.
 """
 
 
 class Node(Protocol):
-    """A part of the loop, driven by a runtime."""
+    """A part of the control loop, run by a runtime."""
 
     @property
     def name(self) -> str:
-        """The node's name in records and timelines."""
+        """Return the node's name in records and timelines."""
         ...
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What the node has counted; written into the record at the end."""
+        """Return the node's counts, which are recorded at the end."""
         ...
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
-        """For each channel the node listens to, its hops in order."""
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
+        """Return the pipeline of each channel that the node receives."""
         ...
 
     def next_wake_ns(self) -> int | None:
-        """When the node wants its `WAKE` chain called, on its host's monotonic clock; None: not at all."""
+        """Return when the `WAKE` pipeline is due, on the host's monotonic clock; None: never."""
         ...

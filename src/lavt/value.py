@@ -1,4 +1,4 @@
-"""Classes of plain values that nobody changes, made hundreds of times for each second of a drive."""
+"""Immutable value classes that are cheap to construct; hundreds are made for each second of a drive."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Value = TypeVar("Value")
 
 @dataclass_transform(frozen_default=True)
 def value(kind: type[Value]) -> type[Value]:
-    """Make a class a dataclass with slots whose fields are set once.
+    """Make a class a dataclass with slots that is immutable for the type checker.
 
-    To the type checker it is frozen. At run time it is not: making a frozen one takes four times as long, which was a
-    tenth of all that virtual time costs without pixels (docs/speed.md).
+    At run time it is not frozen: construction of frozen instances takes four times as long, which was a tenth of the
+    run time of virtual time without pixels (docs/speed.md).
     """
     return dataclass(slots=True, unsafe_hash=True)(kind)

@@ -25,7 +25,7 @@ from lavt.assembly.fidelity import FIDELITIES
 from lavt.assembly.injection import injection_client
 from lavt.assembly.nodes import build_controller, build_server, check_names
 from lavt.assembly.simulators import car_of
-from lavt.assembly.vehicles import build_plant, build_unpictured
+from lavt.assembly.vehicles import build_geometry_setup, build_vehicle_setup
 from lavt.clock import MachineClock
 from lavt.config import (
     CameraConfig,
@@ -39,7 +39,7 @@ from lavt.config import (
 from lavt.domain import Lane, Now
 from lavt.errors import UserError
 from lavt.node import WAKE, Message
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.transport.clock_sync.persistent_process import Shell
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 from lavt.vehicle.video_device import VideoDevice
@@ -47,19 +47,19 @@ from lavt.vehicle.video_device import VideoDevice
 
 @given(st.integers(0, 2**63 - 1), st.text(max_size=10), st.integers(0, 10_000))
 def test_run_seed(seed: int, route: str, repetition: int) -> None:
-    """The seed of a run is one that a config can hold, and the same whenever it is asked for."""
+    """The seed of a run is reproducible and valid in a config."""
     assert 0 <= run_seed(seed, route, repetition) < 2**63
     assert run_seed(seed, route, repetition) == run_seed(seed, route, repetition)
 
 
 def test_run_seeds_differ() -> None:
-    """Other seeds, routes and repetitions give other seeds of runs."""
+    """Different seeds, routes and repetitions give different seeds of runs."""
     seeds = {run_seed(seed, route, again) for seed in range(5) for route in ("a", "b", "a 1") for again in range(50)}
     assert len(seeds) == 5 * 3 * 50
 
 
 def test_seeded_entropy() -> None:
-    """Seeded entropy repeats with its seed and name, and gives numbers and tokens of the asked length."""
+    """Seeded entropy is reproducible by seed and name, and returns numbers and tokens of the requested length."""
     one, same, other = (SeededEntropy(seed, name) for seed, name in ((1, "server"), (1, "server"), (1, "client")))
     values = [one.number(64), one.number(32), one.token(16)]
     assert values == [same.number(64), same.number(32), same.token(16)]
@@ -76,7 +76,7 @@ def test_machine_entropy() -> None:
 
 
 def test_camera_model() -> None:
-    """Degrees of the config are radians in the geometry."""
+    """Angles in degrees in the config become radians in the geometry."""
     model = camera_model(CameraConfig(field_of_view_deg=60.0, pitch_deg=-3.0, x_m=1.0, z_m=2.0))
     assert (model.width_px, model.height_px, model.x_m, model.z_m) == (640, 480, 1.0, 2.0)
     assert model.field_of_view_rad == pytest.approx(math.pi / 3)
@@ -85,7 +85,7 @@ def test_camera_model() -> None:
 
 @given(st.text(max_size=20))
 def test_any_address(text: str) -> None:
-    """No text raises anything but UserError when it is read as an address."""
+    """Parsing any text as an address raises only UserError."""
     with suppress(UserError):
         host, port = parse_address("video.send_to", text)
         assert host
@@ -93,53 +93,60 @@ def test_any_address(text: str) -> None:
 
 
 def test_addresses() -> None:
-    """An address is host:port."""
+    """An address has the form host:port, and any other text is rejected."""
     assert parse_address("key", "127.0.0.1:5600") == ("127.0.0.1", 5600)
     assert parse_address("key", "desk.example:0") == ("desk.example", 0)
     for bad in ("5600", ":5600", "desk:", "desk:65536", "desk:-1", "desk:²", "desk:1 ", "desk:" + "9" * 5000):
-        with pytest.raises(UserError, match="write it as host:port"):
+        with pytest.raises(UserError, match="host:port"):
             parse_address("key", bad)
 
 
-def test_the_car_is_the_named_one_with_the_configured_lags() -> None:
-    """What the config gives replaces the car's own dead times and lags, and nothing else."""
+def test_configured_lags_replace_those_of_the_car() -> None:
+    """Configured dead times and lags replace the car's own, and other parameters stay unchanged."""
     assert car_of(VehicleConfig()) == LINCOLN_MKZ
-    given = VehicleConfig(
-        steering_dead_time_ms=240.0, steering_lag_ms=270.0, pedal_dead_time_ms=100.0, throttle_lag_ms=0.0,
+    config = VehicleConfig(
+        steering_dead_time_ms=240.0,
+        steering_lag_ms=270.0,
+        pedal_dead_time_ms=100.0,
+        throttle_lag_ms=0.0,
         brake_lag_ms=50.0,
-    )  # fmt: skip
-    assert car_of(given) == replace(
-        LINCOLN_MKZ, steering_dead_time_s=0.24, steering_lag_s=0.27, pedal_dead_time_s=0.1, throttle_lag_s=0.0,
+    )
+    assert car_of(config) == replace(
+        LINCOLN_MKZ,
+        steering_dead_time_s=0.24,
+        steering_lag_s=0.27,
+        pedal_dead_time_s=0.1,
+        throttle_lag_s=0.0,
         brake_lag_s=0.05,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "controller", "said"),
+    ("vehicle", "controller", "reason"),
     [
-        ({"kind": "boat"}, {}, "'boat': the known kinds are simulator"),
-        ({"route": "z_key"}, {}, "'z_key': name one.*a_key"),
-        ({"route": "../a_key"}, {}, "no road"),
-        ({"route": "nowhere.yaml"}, {}, "nowhere.yaml cannot be read"),
-        ({"car": "boat"}, {}, "no car 'boat': the known ones are lincoln_mkz"),
-        ({}, {"kind": "wizard"}, "'wizard'; choose one of lane_keeper"),
-        ({}, {"preset": "magic"}, "'magic'; choose one of designed, paper_calibrated"),
+        ({"kind": "boat"}, {}, "'boat'.*simulator"),
+        ({"route": "z_key"}, {}, "'z_key'.*a_key"),
+        ({"route": "../a_key"}, {}, r"'\.\./a_key'"),
+        ({"route": "nowhere.yaml"}, {}, r"nowhere\.yaml"),
+        ({"car": "boat"}, {}, "'boat'.*lincoln_mkz"),
+        ({}, {"kind": "wizard"}, "'wizard'.*lane_keeper"),
+        ({}, {"preset": "magic"}, "'magic'.*designed, paper_calibrated"),
     ],
 )
-def test_unknown_names(vehicle: dict[str, str], controller: dict[str, str], said: str) -> None:
-    """A vehicle, route, controller or preset that does not exist is refused with the names of those that do."""
-    with pytest.raises(UserError, match=said):
+def test_unknown_names(vehicle: dict[str, str], controller: dict[str, str], reason: str) -> None:
+    """An unknown vehicle, route, car, controller or preset is rejected, and the error lists the known names."""
+    with pytest.raises(UserError, match=reason):
         check_names(VehicleConfig(**vehicle), ControllerConfig(**controller))  # type: ignore[arg-type]
 
 
 def test_unknown_vehicle() -> None:
-    """A server of a vehicle that does not exist is not built."""
-    with pytest.raises(UserError, match="the known kinds are simulator"):
-        build_plant(ServerConfig(vehicle=VehicleConfig(kind="boat")))
+    """An unknown kind of vehicle is rejected when the server is built."""
+    with pytest.raises(UserError, match=r"'boat'.*simulator"):
+        build_vehicle_setup(ServerConfig(vehicle=VehicleConfig(kind="boat")))
 
 
-def test_settings_of_the_config_replace_those_of_the_preset() -> None:
-    """A lookahead, limit or speed in the config changes what is driven, and results name what was changed."""
+def test_configured_settings_replace_those_of_the_preset() -> None:
+    """A configured lookahead, limit or speed changes the commands, and results list the changed settings."""
     changed = ControllerConfig(preset="designed", lookahead_s=2.0, speed_mps=5.0)
     lane = Lane((0.5, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0)
     far, near = (build_controller(config).decide(lane, 8.0, 0) for config in (changed, ControllerConfig()))
@@ -151,63 +158,68 @@ def test_settings_of_the_config_replace_those_of_the_preset() -> None:
     assert ControllerConfig().settings == "designed"
 
 
-def test_the_vehicle_is_looked_at_before_each_frame_when_it_catches_up() -> None:
-    """On demand, the simulator is woken for frames and its state only; a vehicle that may lose something is not."""
+def test_lazy_physics_advances_for_frames_and_states_only() -> None:
+    """With lazy physics the simulator advances for frames and states only; a vehicle that cannot catch up does not."""
     config = ServerConfig(camera=ServerCameraConfig(width_px=128, height_px=128))
-    every_step, on_demand, careful = (
+    every_step, lazy, without_catching_up = (
         build_server(
-            config, lambda: Now(10**12, 10**18), SeededEntropy(1, "server"), host="", video_port=1,
-            fidelity=replace(FIDELITIES["geometry"](), plant=plant), lives_on_demand=requested,
+            config,
+            lambda: Now(10**12, 10**18),
+            SeededEntropy(1, "server"),
+            host="",
+            video_port=1,
+            fidelity=replace(FIDELITIES["geometry"](), vehicle_setup=build),
+            lazy_physics=is_lazy,
         ).actuator
-        for plant, requested in (
-            (build_unpictured, False),
-            (build_unpictured, True),
-            (lambda config: replace(build_unpictured(config), catches_up=False), True),
+        for build, is_lazy in (
+            (build_geometry_setup, False),
+            (build_geometry_setup, True),
+            (lambda config: replace(build_geometry_setup(config), catches_up=False), True),
         )
-    )  # fmt: skip
-    woken = []
-    for actuator in (every_step, on_demand, careful):
+    )
+    wake_counts = []
+    for actuator in (every_step, lazy, without_catching_up):
         wakes = 0
         assert actuator is not None
         while (wake_ns := actuator.next_wake_ns()) < 10**12 + 10**9:
             now = Now(max(wake_ns, 10**12), 10**18)
-            walk("actuator", actuator.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
+            run_stages("actuator", actuator.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
             wakes += 1
-        woken.append(wakes)
-    assert woken[0] == woken[2] > 240
-    assert woken[1] <= 82
+        wake_counts.append(wakes)
+    assert wake_counts[0] == wake_counts[2] > 240
+    assert wake_counts[1] <= 82
 
 
-def test_a_condition_that_cannot_be_requested_for_is_rejected_at_the_start() -> None:
-    """A client needs an interface for what it must delay itself, and a condition that fits into a request."""
+def test_a_condition_that_cannot_be_injected_is_rejected_at_the_start() -> None:
+    """A client without an interface rejects a condition that delays control, and any client an unknown condition."""
     with pytest.raises(UserError, match=r"injection\.interface"):
         injection_client(ClientInjectionConfig(condition="L4"), "alice", 7, 0)
-    with pytest.raises(UserError, match="there is no condition"):
+    with pytest.raises(UserError, match="'L9'"):
         injection_client(ClientInjectionConfig(condition="L9", interface="eth0"), "alice", 7, 0)
     injection_client(ClientInjectionConfig(condition="L2"), "alice", 7, 0)
 
 
-def nobody(command: Sequence[str], _timeout_s: float) -> None:
-    raise AssertionError(f"nobody should have asked {command}")
+def fail(command: Sequence[str], _timeout_s: float) -> None:
+    raise AssertionError(f"unexpected command {command}")
 
 
-def test_an_external_source_of_time_says_what_the_config_says() -> None:
-    """Correction and bound of an external source are those of the config, in seconds."""
-    report = clock_source(ClockConfig(source="external", correction_ms=-2.5, bound_ms=0.5), MachineClock(), nobody)()
+def test_an_external_time_source_reports_the_configured_values() -> None:
+    """The correction and the bound of an external time source are those of the config, in seconds."""
+    report = clock_source(ClockConfig(source="external", correction_ms=-2.5, bound_ms=0.5), MachineClock(), fail)()
     assert report is not None
     assert (report.source, report.correction_s, report.bound_s) == ("external", -0.0025, 0.0005)
 
 
-def test_a_clock_may_be_left_to_the_probe() -> None:
-    """With source probe nobody is asked, and the report knows no correction."""
-    report = clock_source(ClockConfig(source="probe"), MachineClock(), nobody)()
+def test_the_probe_as_the_only_source() -> None:
+    """With source probe no command is run, and the report has no correction."""
+    report = clock_source(ClockConfig(source="probe"), MachineClock(), fail)()
     assert report is not None
     assert (report.source, report.correction_s, report.bound_s) == ("probe", None, None)
 
 
 @pytest.mark.parametrize("source", ["chrony", "ptp"])
 def test_a_source_that_is_not_installed(source: Literal["chrony", "ptp"], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A source by name is asked by its own program; without it the report says that it is not installed."""
+    """Without the program of a time source, the report says that it is not installed."""
     monkeypatch.setenv("PATH", "")
     with closing(Shell()) as shell:
         report = clock_source(ClockConfig(source=source), MachineClock(), shell.run)()
@@ -222,8 +234,8 @@ def device_config(device: str | int, **camera: Any) -> ServerConfig:
     )
 
 
-def test_a_camera_that_is_plugged_in_is_built(tmp_path: Path) -> None:
-    """With source device the configured device is opened, with the configured geometry; without one there is none."""
+def test_camera_device(tmp_path: Path) -> None:
+    """With source device the configured device is opened with the configured geometry; by default there is none."""
     assert build_camera(ServerConfig()) is None
     camera = build_camera(device_config(str(write_video(tmp_path / "video.avi", rate_hz=30.0)), z_m=2.5))
     assert isinstance(camera, VideoDevice)
@@ -231,16 +243,16 @@ def test_a_camera_that_is_plugged_in_is_built(tmp_path: Path) -> None:
         assert (camera.model.width_px, camera.model.z_m, camera.rate_hz, camera.phase_ns) == (320, 2.5, 30.0, 0)
 
 
-def test_a_camera_by_its_number() -> None:
-    """A number is a V4L2 device's."""
-    with pytest.raises(UserError, match=r"^/dev/video97 cannot be opened as a camera"):
+def test_camera_device_by_number() -> None:
+    """A number selects a V4L2 device."""
+    with pytest.raises(UserError, match=r"^/dev/video97 "):
         build_camera(device_config(97))
 
 
 def test_unknown_camera() -> None:
-    """A source of pictures that does not exist is refused with those that do."""
+    """An unknown camera source is rejected, and the error lists the known sources."""
     config = ServerConfig(camera=ServerCameraConfig(source="webcam"))
-    with pytest.raises(UserError, match="no camera 'webcam': the known sources are simulated, device"):
+    with pytest.raises(UserError, match=r"'webcam'.*simulated, device"):
         build_camera(config)
 
 
@@ -249,7 +261,7 @@ def noise_camera(config: ServerConfig) -> NoiseCamera:
 
 
 def test_a_package_adds_a_camera_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera registered in the group `lavt.cameras` is found by its name and made of the server's config."""
+    """A camera registered in the group `lavt.cameras` is found by its name and built from the server's config."""
     entry = EntryPoint("noise", f"{__name__}:noise_camera", cameras.CUSTOM_CAMERAS)
     monkeypatch.setattr(cameras, "entry_points", lambda group: [entry] if group == "lavt.cameras" else [])
     camera = build_camera(ServerConfig(camera=ServerCameraConfig(source="noise", width_px=256)))
@@ -257,14 +269,14 @@ def test_a_package_adds_a_camera_by_entry_point(monkeypatch: pytest.MonkeyPatch)
     assert camera.model.width_px == 256
 
 
-def test_the_simulator_has_a_camera_of_its_own() -> None:
-    """No camera sees the simulator's road: with one that is plugged in it is not built."""
-    with pytest.raises(UserError, match=r"'simulator' draws its own pictures.*leave out camera.source"):
-        build_plant(device_config("/dev/video0"))
+def test_the_simulator_rejects_a_camera_device() -> None:
+    """The simulator renders its own pictures, so a camera device is rejected."""
+    with pytest.raises(UserError, match=r"'simulator'.*camera\.source"):
+        build_vehicle_setup(device_config("/dev/video0"))
 
 
-def test_a_servers_config_tells_the_cameras_geometry(tmp_path: Path) -> None:
-    """`lavt perception show --camera` takes a server's config, whatever its pictures come from."""
+def test_a_server_config_contains_the_camera_geometry(tmp_path: Path) -> None:
+    """The camera geometry is read from a server config with any camera source."""
     path = tmp_path / "server.yaml"
     path.write_text("vehicle_id: v-1\ncamera: {source: device, device: /dev/video0, format: MJPG, width_px: 800}\n")
     assert camera_of_file(path).width_px == 800
@@ -272,6 +284,6 @@ def test_a_servers_config_tells_the_cameras_geometry(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("pixel_format", ["MJP", "MJPEG", "MJ\nP"])
 def test_a_pixel_format_has_four_characters(pixel_format: str) -> None:
-    """V4L2 names formats by four characters: anything else is refused."""
+    """A V4L2 pixel format has four printable characters; anything else is rejected."""
     with pytest.raises(ValidationError):
         ServerCameraConfig(format=pixel_format)

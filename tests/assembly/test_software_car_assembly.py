@@ -1,9 +1,9 @@
-"""Software cars made of a server's config."""
+"""The construction of software cars from a server's config."""
 
 from __future__ import annotations
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, Asked, Hand1, Hand2
+from tests.vehicle.software_car.rig import START_NS, CommandValues, Sender1, Sender2
 
 from lavt.assembly.dbw import load_profile
 from lavt.assembly.simulators import simulator_of
@@ -13,7 +13,7 @@ from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.car import SoftwareCar
 
 
-def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
+def build(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
     return build_software_car(config or ServerConfig(), load_profile(profile), load_road("a_key"), START_NS)
 
 
@@ -28,25 +28,29 @@ def built(profile: str, config: ServerConfig | None = None) -> SoftwareCar:
 )
 def test_the_kit_is_the_profiles(profile: str, accepted: str) -> None:
     """The kit obeys the commands of the generation and set that the profile is for, and no others."""
-    hands: dict[str, Hand1 | Hand2] = {"generation 1": Hand1(), "remote": Hand2(), "user": Hand2(first=0x210)}
-    for name, hand in hands.items():
-        car = built(profile)
-        for frame in hand.commands(Asked(brake=0.5)):
+    senders: dict[str, Sender1 | Sender2] = {
+        "generation 1": Sender1(),
+        "remote": Sender2(),
+        "user": Sender2(first=0x210),
+    }
+    for name, sender in senders.items():
+        car = build(profile)
+        for frame in sender.commands(CommandValues(brake=0.5)):
             car.receive(frame, START_NS)
         assert (car.kit.state.actuators["brake"].order is not None) == (name == accepted)
 
 
-def test_the_car_is_the_servers() -> None:
-    """The car begins where a simulator of the same config begins, with its seed and its lags."""
+def test_the_car_matches_the_config() -> None:
+    """The car starts where a simulator of the same config starts, with its seed and its lags."""
     config = ServerConfig(seed=7, vehicle=VehicleConfig(steering_lag_ms=250.0))
-    car, simulator = built("dataspeed_gen2", config), simulator_of(config, load_road("a_key"), START_NS)
+    car, simulator = build("dataspeed_gen2", config), simulator_of(config, load_road("a_key"), START_NS)
     assert car.simulator.ground_truth() == simulator.ground_truth()
-    assert car.simulator.ground_truth() != built("dataspeed_gen2").simulator.ground_truth()
+    assert car.simulator.ground_truth() != build("dataspeed_gen2").simulator.ground_truth()
     assert car.simulator._parameters.steering_lag_s == 0.25
 
 
-def test_a_config_with_options_of_a_bus_can_be_compared() -> None:
-    """Configs of equal options are equal and have one hash, as whoever remembers by them needs."""
+def test_a_config_with_bus_options_is_hashable() -> None:
+    """Configs with equal bus options are equal and have equal hashes, so that they can be keys of a cache."""
     one, same, other = (VehicleConfig(dbw=DbwConfig(options={"port": port})) for port in (1, 1, 2))
     assert hash(one) == hash(same)
     assert len({one, same, other}) == 2

@@ -1,4 +1,4 @@
-"""`lavt` in the test's own process."""
+"""Fixtures that run `lavt` in the test's own process."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def run(
     own_switch_interval: None,  # noqa: ARG001 (commands with a loop change it)
 ) -> Run:
     """Return a function that runs `lavt` in this process, from an empty working directory."""
-    monkeypatch.setattr(console, "keep_stdout_for_results", lambda: None)  # it would take pytest's output away
-    monkeypatch.setattr(process_priority, "take", lambda *_: None)  # it would be that of all tests
+    monkeypatch.setattr(console, "reserve_stdout", lambda: None)  # it would redirect pytest's output
+    monkeypatch.setattr(process_priority, "raise_priority", lambda *_: None)  # affects all tests
     monkeypatch.chdir(tmp_path)
 
     def run_here(*arguments: str) -> CommandResult:
         monkeypatch.setattr(sys, "argv", ["lavt", *arguments])
         with pytest.raises(SystemExit) as ended:
             main()
-        said = capsys.readouterr()
+        printed = capsys.readouterr()
         code = ended.value.code
-        return CommandResult(code if isinstance(code, int) else 0, said.out, said.err)
+        return CommandResult(code if isinstance(code, int) else 0, printed.out, printed.err)
 
     return run_here

@@ -1,4 +1,4 @@
-"""`lavt boundary` as a user types it."""
+"""`lavt boundary` prints its results and writes them to files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SMALL = [
 ]
 
 
-def test_it_writes_what_it_found(run: Run, tmp_path: Path) -> None:
-    """One JSON object on standard output, the same in boundary.json, a row for each seed in CSV, and two pictures."""
+def test_results_are_printed_and_written(run: Run, tmp_path: Path) -> None:
+    """The results are printed as JSON and written as JSON, as CSV with a row per seed, and as two figures."""
     out = tmp_path / "out"
     changes = [part for each in SMALL for part in ("--set", each)]
-    code, printed, said = run("boundary", BOUNDARY, *changes, "--out", str(out), "--jobs", "1", "--json")
+    code, printed, messages = run("boundary", BOUNDARY, *changes, "--out", str(out), "--jobs", "1", "--json")
     assert code == 0
     found = json.loads(printed)
     assert found == json.loads((out / "boundary.json").read_text())
@@ -34,10 +34,20 @@ def test_it_writes_what_it_found(run: Run, tmp_path: Path) -> None:
         (row,) = csv.DictReader(file)
     (searched,) = found["runs"]
     assert list(row) == [
-        "route", "preset", "seed", "repetition", "onset_ms", "departure_ms", "completion_ms", "theory_ms",
-    ]  # fmt: skip
+        "route",
+        "preset",
+        "seed",
+        "repetition",
+        "onset_ms",
+        "departure_ms",
+        "completion_ms",
+        "theory_ms",
+    ]
     assert float(row["onset_ms"]) == searched["onset_ms"]
-    assert sorted(path.name for path in out.iterdir()) == [
-        "boundary.csv", "boundary.json", "boundary.png", "boundary.svg",
-    ]  # fmt: skip
-    assert "a_key paper_calibrated 00: onset " in said
+    assert {path.name for path in out.iterdir()} == {
+        "boundary.csv",
+        "boundary.json",
+        "boundary.png",
+        "boundary.svg",
+    }
+    assert "a_key paper_calibrated 00: onset " in messages

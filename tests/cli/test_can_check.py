@@ -1,4 +1,4 @@
-"""`lavt can check`: whether a profile and its DBC agree, and what is unverified."""
+"""`lavt can check` reports mismatches between a profile and its DBC, and unverified signals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def run(run: Run) -> Run:
 
 
 def edited(folder: Path, name: str, edit: Edit = lambda _: None, bits: tuple[str, str] = ("", "")) -> str:
-    """A copy of a shipped profile with something changed in it, or in its DBC; returns its path."""
+    """Write a copy of a shipped profile with a change in the profile or its DBC; return its path."""
     source = shipped_profiles()[name]
     profile = yaml.safe_load(source.read_text())
     edit(profile)
@@ -39,40 +39,40 @@ def edited(folder: Path, name: str, edit: Edit = lambda _: None, bits: tuple[str
 
 @pytest.mark.parametrize("name", [*PROFILES, "dataspeed_gen2:user"])
 def test_shipped(run: Run, name: str) -> None:
-    """Each profile that comes with LAVT agrees with its DBC."""
+    """Each shipped profile matches its DBC."""
     code, out, err = run(name)
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith(f"{name} and {name.partition(':')[0]}.dbc ")
 
 
 def test_unverified(run: Run) -> None:
-    """Unverified signals are listed, are no disagreement, and keep a profile from arming on a real bus."""
+    """Unverified signals are listed, are not mismatches, and inhibit arming on a real bus."""
     code, out, _ = run("dataspeed_gen2", "--json")
-    told = json.loads(out)
+    printed = json.loads(out)
     assert code == 0
-    assert told["agree"]
-    assert "RemoteSteerCmd.CMD_ANGLE" in told["unverified"]
-    assert "RemoteSteerCmd.CRC" not in told["unverified"]
-    assert told["may_arm_on_a_real_bus"] is False
-    assert "DBC" in told["hindrances_on_a_real_bus"][0]
+    assert printed["agree"]
+    assert "RemoteSteerCmd.CMD_ANGLE" in printed["unverified"]
+    assert "RemoteSteerCmd.CRC" not in printed["unverified"]
+    assert printed["may_arm_on_a_real_bus"] is False
+    assert "DBC" in printed["real_bus_inhibit_reasons"][0]
     _, out, _ = run("dataspeed_gen2")
     assert "  RemoteSteerCmd.CMD_ANGLE\n" in out
     assert "may not arm" in out.splitlines()[-1]
 
 
-def test_sign_unknown(run: Run, tmp_path: Path) -> None:
-    """A verified profile may arm on a real bus once the sign of its steering is known."""
+def test_unknown_steering_sign(run: Run, tmp_path: Path) -> None:
+    """A verified profile may arm on a real bus only if the sign of its steering is known."""
     _, out, _ = run("dataspeed_gen1")
     assert "may not arm" in out.splitlines()[-1]
-    assert "sign of the steering" in out.splitlines()[-1]
+    assert "steering_sign" in out.splitlines()[-1]
     code, out, _ = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["vehicle"].update(steering_sign=1)))
     assert code == 0
     assert "may arm" in out.splitlines()[-1]
-    assert "`lavt can prove`" in out.splitlines()[-1]
+    assert "`lavt can test-watchdog`" in out.splitlines()[-1]
 
 
 def test_vendors_dbc(run: Run, tmp_path: Path) -> None:
-    """With the vendor's DBC, which has no marks, nothing is unverified."""
+    """With the vendor's DBC, which marks no signal as unverified, all signals are verified."""
     vendors = tmp_path / "vendor.dbc"
     vendors.write_text(
         "\n".join(
@@ -90,119 +90,121 @@ def test_vendors_dbc(run: Run, tmp_path: Path) -> None:
         "disagreements": [],
         "unverified": [],
         "may_arm_on_a_real_bus": True,
-        "hindrances_on_a_real_bus": [],
+        "real_bus_inhibit_reasons": [],
     }
 
 
 def steering(**changes: Any) -> Edit:
+    """Return an edit of the steering command."""
     return lambda profile: profile["sent"]["steering"].update(changes)
 
 
 def reported(part: str, **changes: Any) -> Edit:
+    """Return an edit of one report."""
     return lambda profile: profile["reports"][part].update(changes)
 
 
 def same(_: dict[str, Any]) -> None:
-    """Nothing is changed in the profile."""
+    """Change nothing in the profile."""
 
 
-AS_IT_IS = ("", "")
-DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
+UNCHANGED = ("", "")
+MISMATCHES: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
     (
         "dataspeed_gen1",
         steering(message="SteerCmd"),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering",
         ("SteerCmd", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(value="SCMD_ANGEL"),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.value",
         ("SCMD_ANGEL", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen1",
         steering(enable="SVEL", rate=""),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.enable",
         ("SVEL", "SteeringCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(count="RES2"),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.count",
         ("RES2", "SteeringCmd"),
     ),
     (
         "dataspeed_gen2",
         steering(checksum="RC", count=""),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.checksum",
         ("RC", "RemoteSteerCmd"),
     ),
     (
         "dataspeed_gen1",
         steering(clear="EN"),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering",
         ("EN", "enable", "clear"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["limits"].update(steering_wheel_deg=551.0),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.value",
         ("551", "SCMD_ANGLE", "-550", "550"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["sent"]["gears"].update(drive=3),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.gear.value",
         ("drive is 3", "GCMD", "NEUTRAL"),
     ),
     (
         "dataspeed_gen1",
         lambda it: it["sent"]["gears"].update(drive=8),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.gear.value",
         ("drive is 8", "GCMD", "7"),
     ),
     (
         "dataspeed_gen2",
         lambda it: it["sent"]["system"].update(enable=2),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.system.value",
         ("enable is 2", "CMD", "DISABLE"),
     ),
     (
         "dataspeed_gen2",
         reported("remote", needs={"STATE": [9]}),
-        AS_IT_IS,
+        UNCHANGED,
         "reports.remote.needs.STATE",
         ("9", "STATE"),
     ),
     (
         "dataspeed_gen2",
         reported("system", trip={"STATE=6": "tripped"}),
-        AS_IT_IS,
+        UNCHANGED,
         "reports.system.trip.STATE=6",
         ("6", "STATE"),
     ),
     (
         "dataspeed_gen2",
         reported("steering", timeout_ms=101),
-        AS_IT_IS,
+        UNCHANGED,
         "reports.steering.timeout_ms",
         ("101 ms", "100 ms"),
     ),
     (
         "dataspeed_gen2",
         reported("gear", timeout_ms=199),
-        AS_IT_IS,
+        UNCHANGED,
         "reports.gear.timeout_ms",
         ("199 ms", "GearReport1", "100 ms"),
     ),
@@ -216,7 +218,7 @@ DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
     (
         "dataspeed_gen1",
         lambda it: it["sent"].update(clearing_bytes=2),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.clear",
         ("CLEAR", "2 bytes", "sent.clearing_bytes"),
     ),
@@ -230,14 +232,14 @@ DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
     (
         "dataspeed_gen1",
         steering(rate="SCMD_TORQUE"),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering.rate",
         ("SCMD_TORQUE", "SCMD_ANGLE"),
     ),
     (
         "dataspeed_gen2",
         lambda it: it.update(commands=None),
-        AS_IT_IS,
+        UNCHANGED,
         "sent.steering",
         ("no message",),
     ),
@@ -245,37 +247,37 @@ DISAGREEMENTS: list[tuple[str, Edit, tuple[str, str], str, tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(
-    ("planted", "key", "names"), [pytest.param(each[:3], *each[3:], id=each[3]) for each in DISAGREEMENTS]
+    ("planted", "key", "names"), [pytest.param(each[:3], *each[3:], id=each[3]) for each in MISMATCHES]
 )
-def test_disagreement(
+def test_mismatch(
     run: Run, tmp_path: Path, planted: tuple[str, Edit, tuple[str, str]], key: str, names: tuple[str, ...]
 ) -> None:
-    """Each disagreement is a sentence that begins with the profile's key, and names what disagrees; the code is 2."""
+    """Each mismatch has a sentence that begins with the profile's key and names the signals; the exit code is 2."""
     code, out, err = run(edited(tmp_path, *planted))
     assert (code, out) == (2, "")
     sentences = [line for line in err.splitlines() if line.startswith(f"{key}: ")]
     assert any(all(name in sentence for name in names) for sentence in sentences), err
 
 
-def test_all_of_them(run: Run, tmp_path: Path) -> None:
-    """All disagreements are said, and how many they are."""
+def test_all_mismatches(run: Run, tmp_path: Path) -> None:
+    """All mismatches are listed and counted."""
     path = edited(tmp_path, "dataspeed_gen1", lambda it: (steering(count="A")(it), reported("gear", message="B")(it)))
     code, out, err = run(path, "--json")
     assert code == 2
     assert [line.partition(": ")[0] for line in err.splitlines()[:2]] == ["sent.steering.count", "reports.gear"]
-    assert " 2 times" in err.splitlines()[2]
+    assert " 2 " in err.splitlines()[2]
     assert json.loads(out)["disagreements"] == err.splitlines()[:2]
 
 
-def test_of_the_reader(run: Run, tmp_path: Path) -> None:
-    """What is found only when the profile is read for driving is a disagreement as well."""
+def test_mismatch_found_by_loading(run: Run, tmp_path: Path) -> None:
+    """An error that only loading the profile for driving finds is a mismatch, too."""
     code, _, err = run(edited(tmp_path, "dataspeed_gen1", lambda it: it["sent"]["brake"].update(value="PCMD_TORQUE")))
     assert code == 2
     assert "PCMD_TORQUE of BrakeCmd" in err
 
 
 def test_bad_input(run: Run, tmp_path: Path) -> None:
-    """A profile that is none, and a DBC that is missing, are said in one sentence."""
+    """An unknown profile, a missing DBC or an unknown set of commands is rejected in one sentence."""
     shutil.copy(shipped_profiles()["dataspeed_gen1"], tmp_path / "alone.yaml")
     for arguments, reason in (
         (["nosuch"], "'nosuch'"),

@@ -1,4 +1,4 @@
-"""`lavt can monitor`: a bus, or its log, in words or as JSON."""
+"""`lavt can monitor` decodes a bus or a log, as text or JSON."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOG = """(1000.000000) can0 065#640000007D000001
 (1001.000000) can0 065#C80000007D000001
 (1001.250000) can0 555#00
 """
-"""Steering wheel at 10 and 20 degrees, 1.25 km/h; gear DRIVE; and a stranger."""
+"""Steering wheel at 10 and 20 degrees, 1.25 km/h; gear DRIVE; and an unknown message."""
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def log(tmp_path: Path) -> Path:
 
 @contextmanager
 def sending(message: can.Message) -> Iterator[None]:
-    """Somebody who sends a message again and again on the virtual bus `monitored`."""
+    """Send a message every 10 ms on the virtual bus `monitored`."""
     ended = threading.Event()
 
     def send() -> None:
@@ -56,8 +56,8 @@ def sending(message: can.Message) -> Iterator[None]:
         sender.join()
 
 
-def test_log_in_words(run: Run, log: Path) -> None:
-    """A log is told second by second and in all: what was said, what changed, what is wrong, who is unknown."""
+def test_log_as_text(run: Run, log: Path) -> None:
+    """A log is printed second by second and as a summary: values, changes, errors and unknown messages."""
     code, out, _ = run("monitor", "dataspeed_gen1", "--log", str(log))
     assert code == 0
     lines = out.splitlines()
@@ -70,7 +70,7 @@ def test_log_in_words(run: Run, log: Path) -> None:
 
 
 def test_log_as_json(run: Run, log: Path) -> None:
-    """Programs get a line of JSON for each second and one for the whole, every signal with unit and name."""
+    """As JSON, a log has one line per second and a summary, with the unit and name of each signal."""
     code, out, _ = run("monitor", "dataspeed_gen1", "--log", str(log), "--json")
     second, summary = map(json.loads, out.splitlines())
     assert code == 0
@@ -82,8 +82,8 @@ def test_log_as_json(run: Run, log: Path) -> None:
 
 
 def test_bus(run: Run, tmp_path: Path) -> None:
-    """What is on a bus is told, and written as `candump -L` would, so that it can be told again."""
-    written = tmp_path / "heard.log"
+    """Frames on a bus are printed, and written to a log that can be read again."""
+    written = tmp_path / "received.log"
     with sending(can.Message(arbitration_id=0x067, data=b"\x01\x80", is_extended_id=False)):
         bus = ("--interface", "virtual", "--channel", "monitored")
         code, out, _ = run("monitor", "dataspeed_gen1", *bus, "--seconds", "1", "--json", "--write", str(written))
@@ -96,7 +96,7 @@ def test_bus(run: Run, tmp_path: Path) -> None:
 
 
 def test_silent_bus(run: Run) -> None:
-    """On a bus that nothing comes from, the reports that are missing are named, and the work has failed."""
+    """On a silent bus the missing reports are named, and the exit code is 1."""
     ended = run("monitor", "--interface", "virtual", "--channel", "silent", "--seconds", "1")
     assert ended.code == 1
     assert "SteerReport1 0x100  0 times, 0.0 of 100 per s  WRONG: " in ended.out
@@ -104,7 +104,7 @@ def test_silent_bus(run: Run) -> None:
 
 
 def test_any_dbc(run: Run, log: Path, tmp_path: Path) -> None:
-    """A DBC file alone will do."""
+    """A DBC file without a profile is enough to decode a bus."""
     dbc = tmp_path / "mine.dbc"
     dbc.write_text('VERSION ""\nBS_:\nBU_: A\nBO_ 1365 Stranger: 1 A\n SG_ FLAG : 0|8@1+ (2,0) [0|0] "m" A\n')
     code, out, _ = run("monitor", str(dbc), "--log", str(log))
@@ -126,12 +126,12 @@ REJECTED = [
 
 @pytest.mark.parametrize(("arguments", "reason"), REJECTED)
 def test_rejected(run: Run, arguments: list[str], reason: str) -> None:
-    """What was asked wrongly is said in one sentence."""
+    """Invalid input is rejected in one sentence."""
     assert reason in run("monitor", *arguments).rejected()
 
 
 def test_find_dbw(tmp_path: Path) -> None:
-    """A server's config names the bus of its vehicle by wire; a profile's name or file names itself."""
+    """A target is a server config with a by-wire vehicle, or the name or file of a profile."""
     config = tmp_path / "server.yaml"
     config.write_text("vehicle:\n  kind: dbw\n  dbw: {profile: dataspeed_gen1, channel: vcan3}\n")
     assert find_dbw(str(config)) == DbwConfig(profile="dataspeed_gen1", channel="vcan3")

@@ -20,15 +20,17 @@ from lavt.transport.udp_link import UdpLink
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """A server that answers probes, and says that its clock needs no correction."""
+    """Run a server that answers probes and whose clock needs no correction; return its port."""
     clock = MachineClock()
     node = ClockSyncNode(0)
-    node.chains["clock_report"][0][1](
+    node.pipelines["clock_report"][0][1](
         Message("clock_report", ClockReport(0, 0, "here", "chrony", 0.0, 0.0001), clock.now()), clock.now()
     )
 
     def answer(_channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        for send in node.chains["probe_request"][0][1](Message("probe_request", payload, arrived, peer), clock.now()):
+        for send in node.pipelines["probe_request"][0][1](
+            Message("probe_request", payload, arrived, peer), clock.now()
+        ):
             link.send(send)
 
     link = UdpLink(clock, "probe_request", answer, bind=("127.0.0.1", 0), name="probe")
@@ -38,17 +40,17 @@ def port() -> Iterator[int]:
 
 
 def test_a_server_is_probed(port: int, run: Run) -> None:
-    """Against a server on this machine Delta is 0 within the bound, half of the shortest round trip."""
+    """For a server on this machine Delta is 0 within the bound, which is half of the shortest round trip."""
     code, out, _ = run("clock", "--server", "localhost", "--port", str(port), "--seconds", "0.5", "--json")
-    said = json.loads(out)
-    assert abs(said["probe"]["ms"]) <= said["probe"]["bound_ms"] == said["round_trip_ms"] / 2
-    assert code == (0 if said["good"] else 1)
+    result = json.loads(out)
+    assert abs(result["probe"]["ms"]) <= result["probe"]["bound_ms"] == result["round_trip_ms"] / 2
+    assert code == (0 if result["good"] else 1)
 
 
-def test_the_source_is_requested_before_and_after_the_probing(
+def test_the_source_is_read_before_and_after_the_probing(
     port: int, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What chrony says last counts, and by how much it differs from what it said first is in the bound."""
+    """The correction after the probing counts, and its change during the probing is added to the bound."""
     (tmp_path / "chronyc").write_text(
         "#!/bin/sh\n"
         "correction=0.0\n"
@@ -62,24 +64,24 @@ def test_the_source_is_requested_before_and_after_the_probing(
     )
     (tmp_path / "chronyc").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    said = json.loads(run("clock", "--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json").out)
-    assert said["clock"]["correction_s"] == 0.001
-    assert said["sources"] == pytest.approx({"ms": 1.0, "bound_ms": 0.1 + 0.05 + 0.1 + 1.0})
+    result = json.loads(run("clock", "--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json").out)
+    assert result["clock"]["correction_s"] == 0.001
+    assert result["sources"] == pytest.approx({"ms": 1.0, "bound_ms": 0.1 + 0.05 + 0.1 + 1.0})
 
 
 def test_an_external_source_is_given_by_options(port: int, run: Run) -> None:
-    """With --source external correction and bound are the given ones, and count with the server's."""
+    """With --source external, the given correction and bound are used, and the server's bound is added."""
     external = ("--source", "external", "--correction-ms", "0.05", "--bound-ms", "0.1")
     probing = ("--server", "localhost", "--port", str(port), "--seconds", "0.1", "--json")
     code, out, _ = run("clock", *probing, *external)
-    said = json.loads(out)
-    assert said["clock"]["source"] == "external"
-    assert said["sources"] == pytest.approx({"ms": 0.05, "bound_ms": 0.1 + 0.1})
-    assert (code, said["good"]) == (0, True)
+    result = json.loads(out)
+    assert result["clock"]["source"] == "external"
+    assert result["sources"] == pytest.approx({"ms": 0.05, "bound_ms": 0.1 + 0.1})
+    assert (code, result["good"]) == (0, True)
 
 
-def test_nobody_answers(run: Run) -> None:
-    """Where no server answers the command says so, with what to look for, and ends with 1."""
+def test_no_server_answers(run: Run) -> None:
+    """If no server answers, the command says what to check and exits with 1."""
     ended = run("clock", "--server", "127.0.0.1", "--port", "1", "--seconds", "0.1")
     assert (ended.code, ended.out) == (1, "")
     assert "127.0.0.1:1" in ended.sentence()
@@ -87,7 +89,7 @@ def test_nobody_answers(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "reason"),
     [
         (("--server", "a" * 64), "--server"),
         (("--server", "localhost", "--port", "0"), "--port"),
@@ -100,15 +102,15 @@ def test_nobody_answers(run: Run) -> None:
         (("--bound-ms", "1"), "correction_ms and bound_ms"),
     ],
 )
-def test_wrong_input(arguments: tuple[str, ...], said: str, run: Run) -> None:
-    """A host that nobody knows, and numbers out of range, are refused with exit code 2 and without a traceback."""
+def test_bad_input(arguments: tuple[str, ...], reason: str, run: Run) -> None:
+    """Unknown hosts, numbers out of range and contradictory options are rejected with exit code 2."""
     code, out, err = run("clock", *arguments)
     assert (code, out) == (2, "")
-    assert said in err
+    assert reason in err
 
 
 def test_a_machine_without_chrony(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where chronyc is not installed the command says so and what to do, and ends with 1."""
+    """Without chronyc the command says what to install and exits with 1."""
     monkeypatch.setenv("PATH", "")
     code, out, err = run("clock")
     assert (code, err) == (1, "")

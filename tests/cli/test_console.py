@@ -11,22 +11,22 @@ from lavt.errors import WorkError
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_what_runs_until_told_is_told_by_each_signal_that_ends(number: signal.Signals) -> None:
-    """Ctrl-C, SIGTERM and a closed terminal each set the event, and afterwards mean what they meant before."""
-    heard = list[int]()
-    before = signal.signal(number, lambda *_: heard.append(number))
+def test_each_termination_signal_sets_the_stop_event(number: signal.Signals) -> None:
+    """Ctrl-C, SIGTERM and a closed terminal set the stop event; afterwards the former handlers are restored."""
+    received = list[int]()
+    before = signal.signal(number, lambda *_: received.append(number))
     try:
-        with console.until_told() as told:
-            assert not told.is_set()
+        with console.stop_on_signals() as stop:
+            assert not stop.is_set()
             signal.raise_signal(number)
-            assert (told.is_set(), heard) == (True, [])
+            assert (stop.is_set(), received) == (True, [])
         signal.raise_signal(number)
-        assert heard == [number]
+        assert received == [number]
     finally:
         signal.signal(number, before)
 
 
-TOLD_AT_EVERY_LINE = """
+SIGNAL_AT_EVERY_LINE = """
 import signal, sys
 from lavt.cli import console
 
@@ -34,38 +34,38 @@ def again(frame, event, argument):
     signal.raise_signal(signal.SIGTERM)
     return again
 
-with console.until_told() as told:
-    for use in (told.set, told.is_set, told.clear, lambda: told.wait(0.01), told.clear, lambda: told.wait(0.01)):
+with console.stop_on_signals() as stop:
+    for use in (stop.set, stop.is_set, stop.clear, lambda: stop.wait(0.01), stop.clear, lambda: stop.wait(0.01)):
         sys.settrace(again)
         use()
         sys.settrace(None)
-    assert told.is_set() and told.wait(0.01) and told.wait()
-    told.clear()
-    assert not told.is_set() and not told.wait(0.01)
+    assert stop.is_set() and stop.wait(0.01) and stop.wait()
+    stop.clear()
+    assert not stop.is_set() and not stop.wait(0.01)
 """
 
 
-def test_a_signal_that_interrupts_the_handler_of_another_is_no_deadlock() -> None:
-    """However many signals come, and at whichever line of what they set, the program goes on, and has been told."""
-    subprocess.run([sys.executable, "-c", TOLD_AT_EVERY_LINE], check=True, timeout=60)
+def test_nested_signals_do_not_deadlock() -> None:
+    """Signals that interrupt any line of the stop event's methods do not block the program, and set the event."""
+    subprocess.run([sys.executable, "-c", SIGNAL_AT_EVERY_LINE], check=True, timeout=60)
 
 
 @pytest.mark.usefixtures("hangup_ends")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_long_work_ends_with_a_sentence(number: signal.Signals) -> None:
-    """SIGTERM and a closed terminal end long work as Ctrl-C does, and afterwards mean what they meant before."""
+def test_a_signal_interrupts_long_work(number: signal.Signals) -> None:
+    """SIGTERM and a closed terminal end long work as Ctrl-C does; afterwards the former handlers are restored."""
     before = signal.getsignal(number)
-    with pytest.raises(WorkError, match="what was finished is kept"), console.interruptible():
+    with pytest.raises(WorkError, match="stopped"), console.interruptible():
         signal.raise_signal(number)
     assert signal.getsignal(number) == before
 
 
-def test_a_closed_terminal_that_is_ignored_stays_ignored() -> None:
-    """Under nohup, long work and a program that runs until told go on when their terminal is closed."""
+def test_an_ignored_hangup_stays_ignored() -> None:
+    """Under nohup, a closed terminal ends neither long work nor a program that runs until it is stopped."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with console.until_told() as told, console.interruptible():
+        with console.stop_on_signals() as stop, console.interruptible():
             signal.raise_signal(signal.SIGHUP)
-            assert not told.is_set()
+            assert not stop.is_set()
     finally:
         signal.signal(signal.SIGHUP, before)

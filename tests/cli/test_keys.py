@@ -26,8 +26,8 @@ def run(run: Run) -> Run:
 
 
 @pytest.fixture
-def made(run: Run) -> Path:
-    """Give a directory with the keys of one of each role."""
+def directory(run: Run) -> Path:
+    """Return a directory with the keys of one name of each role."""
     names = [word for role in ("vehicle", "operator", "monitor", "cloud") for word in (f"--{role}", f"{role}-1")]
     code, _, err = run("keys", *names, "--host", "192.0.2.7", "--host", "car.example.org", "--days", "30")
     assert (code, err) == (0, "")
@@ -47,24 +47,24 @@ def usages(directory: Path, name: str) -> set[x509.ObjectIdentifier]:
     return set(certificate(directory, name).extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
 
 
-def test_layout(made: Path) -> None:
-    """Each name has a certificate with its key and a pair for signatures; only the owner can read what is private."""
+def test_layout(directory: Path) -> None:
+    """Each name has a certificate with its key and a signing pair, and only the owner can read private files."""
     names = [f"{role}-1" for role in ("vehicle", "operator", "monitor", "cloud")]
     expected = {name + ending for name in names for ending in ENDINGS} | {"authority.key", "authority.pem"}
-    assert {path.name for path in made.iterdir()} == expected
-    assert stat.S_IMODE(made.stat().st_mode) == 0o700
-    assert {stat.S_IMODE(path.stat().st_mode) for path in made.glob("*.key")} == {0o600}
+    assert {path.name for path in directory.iterdir()} == expected
+    assert stat.S_IMODE(directory.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(path.stat().st_mode) for path in directory.glob("*.key")} == {0o600}
 
 
-def test_certificates(made: Path) -> None:
-    """A certificate is of the name, signed by the authority, and its key is the one beside it."""
-    authority = certificate(made, "authority")
+def test_certificates(directory: Path) -> None:
+    """A certificate has the name and the key of its files and is signed by the authority."""
+    authority = certificate(directory, "authority")
     for name in ("vehicle-1", "operator-1", "monitor-1", "cloud-1"):
-        found = certificate(made, name)
+        found = certificate(directory, name)
         found.verify_directly_issued_by(authority)
         (common_name,) = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
         assert common_name.value == name
-        key = serialization.load_pem_private_key((made / f"{name}.key").read_bytes(), None)
+        key = serialization.load_pem_private_key((directory / f"{name}.key").read_bytes(), None)
         assert isinstance(key, ec.EllipticCurvePrivateKey)
         assert key.curve.name == "secp256r1"
         assert key.public_key() == found.public_key()
@@ -72,22 +72,22 @@ def test_certificates(made: Path) -> None:
         assert (found.not_valid_after_utc - found.not_valid_before_utc).days == 31
 
 
-def test_who_may_be_dialled(made: Path) -> None:
-    """Vehicle and cloud may be servers, at the hosts named and the loopback; operator and monitor only dial."""
+def test_server_certificates(directory: Path) -> None:
+    """Vehicle and cloud may be TLS servers at the given hosts and the loopback; operator and monitor may not."""
     for name in ("vehicle-1", "cloud-1"):
-        assert hosts(made, name) == {name, "127.0.0.1", "localhost", "192.0.2.7", "car.example.org"}
-        assert usages(made, name) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+        assert hosts(directory, name) == {name, "127.0.0.1", "localhost", "192.0.2.7", "car.example.org"}
+        assert usages(directory, name) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
     for name in ("operator-1", "monitor-1"):
-        assert hosts(made, name) == {name}
-        assert usages(made, name) == {ExtendedKeyUsageOID.CLIENT_AUTH}
+        assert hosts(directory, name) == {name}
+        assert usages(directory, name) == {ExtendedKeyUsageOID.CLIENT_AUTH}
 
 
-def test_signing_pairs(made: Path) -> None:
-    """What a name's private signing key signs its public one confirms, and no two names have the same."""
+def test_signing_pairs(directory: Path) -> None:
+    """A name's public signing key verifies the signatures of its private one, and no two names have the same pair."""
     publics = set()
     for name in ("vehicle-1", "operator-1"):
-        key = serialization.load_pem_private_key((made / f"{name}.sign.key").read_bytes(), None)
-        public = serialization.load_pem_public_key((made / f"{name}.sign.pub").read_bytes())
+        key = serialization.load_pem_private_key((directory / f"{name}.sign.key").read_bytes(), None)
+        public = serialization.load_pem_public_key((directory / f"{name}.sign.pub").read_bytes())
         assert isinstance(key, ed25519.Ed25519PrivateKey)
         assert isinstance(public, ed25519.Ed25519PublicKey)
         public.verify(key.sign(b"command"), b"command")
@@ -95,8 +95,8 @@ def test_signing_pairs(made: Path) -> None:
     assert len(publics) == 2
 
 
-def test_what_is_copied(run: Run) -> None:
-    """The output says until when all holds, that it is for tests, and what each machine gets: no key of another."""
+def test_instructions(run: Run) -> None:
+    """The output has the expiry date and lists the files for each machine, without private keys of other machines."""
     code, out, _ = run("keys", "--vehicle", "car", "--operator", "ann", "--operator", "bob", "--cloud", "sky")
     assert code == 0
     lines = out.splitlines()
@@ -115,36 +115,37 @@ def test_what_is_copied(run: Run) -> None:
     }
 
 
-def test_adding_names(run: Run, made: Path) -> None:
-    """Run again with another name, it adds it under the same authority, changes no other file, and tells all."""
-    before = {path: path.read_bytes() for path in made.iterdir()}
+def test_adding_names(run: Run, directory: Path) -> None:
+    """A second run adds a name under the same authority, changes no other file, and lists all names."""
+    before = {path: path.read_bytes() for path in directory.iterdir()}
     code, out, _ = run("keys", "--operator", "operator-2", "--days", "3000")
     assert code == 0
     assert "operator-1.sign.pub operator-2.sign.pub" in out
-    certificate(made, "operator-2").verify_directly_issued_by(certificate(made, "authority"))
-    assert certificate(made, "operator-2").not_valid_after_utc == certificate(made, "authority").not_valid_after_utc
+    added, authority = certificate(directory, "operator-2"), certificate(directory, "authority")
+    added.verify_directly_issued_by(authority)
+    assert added.not_valid_after_utc == authority.not_valid_after_utc
     assert {path: path.read_bytes() for path in before} == before
-    assert len(list(made.iterdir())) == len(before) + len(ENDINGS)
+    assert len(list(directory.iterdir())) == len(before) + len(ENDINGS)
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "keys for nobody"),
-        (["--vehicle", "a/b"], "nobody can be called 'a/b'"),
-        (["--operator", "**"], r"nobody can be called '\*\*'"),
-        (["--operator", "authority"], "nobody can be called 'authority'"),
-        (["--vehicle", "one", "--operator", "one"], "'one' is there twice"),
-        (["--vehicle", "one", "--host", "192.0.2.7:7448"], "leave out port and protocol"),
-        (["--vehicle", "one", "--host", "tcp/192.0.2.7"], "leave out port and protocol"),
-        (["--vehicle", "one", "--host", "straße.example"], "neither an address nor a host name"),
-        (["--operator", "one", "--host", "192.0.2.7"], "name one with --vehicle or --cloud"),
-        (["--vehicle", "one", "--days", "0"], "choose 1 to 3650"),
-        (["--vehicle", "one", "--days", "100000"], "choose 1 to 3650"),
+        ([], "no names"),
+        (["--vehicle", "a/b"], "'a/b' is not a valid name"),
+        (["--operator", "**"], r"'\*\*' is not a valid name"),
+        (["--operator", "authority"], "'authority' is not a valid name"),
+        (["--vehicle", "one", "--operator", "one"], "'one'.*twice"),
+        (["--vehicle", "one", "--host", "192.0.2.7:7448"], "--host '192.0.2.7:7448'"),
+        (["--vehicle", "one", "--host", "tcp/192.0.2.7"], "--host 'tcp/192.0.2.7'"),
+        (["--vehicle", "one", "--host", "straße.example"], "--host 'straße.example'"),
+        (["--operator", "one", "--host", "192.0.2.7"], "--vehicle or --cloud"),
+        (["--vehicle", "one", "--days", "0"], "1 to 3650"),
+        (["--vehicle", "one", "--days", "100000"], "1 to 3650"),
     ],
 )
 def test_bad_input(run: Run, arguments: list[str], sentence: str) -> None:
-    """What nothing can be made of is said in one sentence, with exit code 2, and nothing is made."""
+    """Invalid input is rejected in one sentence with exit code 2, and no file is created."""
     code, out, err = run("keys", *arguments)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("lavt: ")
@@ -152,32 +153,32 @@ def test_bad_input(run: Run, arguments: list[str], sentence: str) -> None:
     assert re.search(sentence, err)
 
 
-def test_nothing_is_overwritten(run: Run, made: Path) -> None:
-    """A name that is there already is refused, and nothing of the same command is made."""
-    before = {path: path.read_bytes() for path in made.iterdir()}
+def test_nothing_is_overwritten(run: Run, directory: Path) -> None:
+    """An existing name is rejected, and the command creates no file."""
+    before = {path: path.read_bytes() for path in directory.iterdir()}
     code, _, err = run("keys", "--operator", "operator-2", "--vehicle", "vehicle-1")
     assert code == 2
-    assert "keys/vehicle-1.key exists and is not overwritten" in err
-    assert {path: path.read_bytes() for path in made.iterdir()} == before
+    assert "keys/vehicle-1.key" in err
+    assert {path: path.read_bytes() for path in directory.iterdir()} == before
 
 
-def test_damaged_authority(run: Run, made: Path) -> None:
-    """Half an authority, another's key and what is no certificate are said, and nothing is signed."""
-    key = (made / "authority.key").read_bytes()
-    (made / "authority.key").unlink()
+def test_damaged_authority(run: Run, directory: Path) -> None:
+    """A missing or foreign key and an unreadable certificate are reported, and nothing is signed."""
+    key = (directory / "authority.key").read_bytes()
+    (directory / "authority.key").unlink()
     assert "keys/authority.key" in run("keys", "--operator", "two").rejected()
-    shutil.copy(made / "vehicle-1.key", made / "authority.key")
+    shutil.copy(directory / "vehicle-1.key", directory / "authority.key")
     assert "certificate" in run("keys", "--operator", "two").rejected()
-    (made / "authority.key").write_bytes(b"nonsense")
+    (directory / "authority.key").write_bytes(b"nonsense")
     assert "PEM" in run("keys", "--operator", "two").rejected()
-    (made / "authority.key").write_bytes(key)
-    (made / "authority.pem").write_bytes(b"nonsense")
-    assert "no certificate in PEM" in run("keys", "--operator", "two").rejected()
-    assert not list(made.glob("two*"))
+    (directory / "authority.key").write_bytes(key)
+    (directory / "authority.pem").write_bytes(b"nonsense")
+    assert "PEM" in run("keys", "--operator", "two").rejected()
+    assert not list(directory.glob("two*"))
 
 
-def test_others_may_not_look(run: Run) -> None:
-    """A directory that others may look into, or a file in its place, is refused."""
+def test_directory_of_others(run: Run) -> None:
+    """A directory that other users can read, or a file in its place, is rejected."""
     Path("open").mkdir(mode=0o755)
     Path("file").touch()
     assert "chmod 700 open" in run("open", "--vehicle", "one").rejected()
@@ -185,7 +186,7 @@ def test_others_may_not_look(run: Run) -> None:
 
 
 def test_without_the_library(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without cryptography a sentence says what to install."""
+    """Without cryptography the error says what to install."""
     monkeypatch.delitem(sys.modules, "lavt.transport.security.certificates", raising=False)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     import lavt.transport.security

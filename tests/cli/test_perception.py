@@ -39,7 +39,7 @@ Show = Callable[..., None]
 
 @pytest.fixture
 def show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Show:
-    """Give a function that runs the command in a directory that has a calibration and a picture."""
+    """Return a function that runs `lavt perception show` in a directory with a calibration and a picture."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OPENCV_FFMPEG_LOGLEVEL", "-8")  # the command sets it for its process
     Path("camera.yaml").write_text(CALIBRATION)
@@ -51,8 +51,8 @@ def show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Show:
     return show_here
 
 
-def test_a_pictures_steps_are_drawn(show: Show) -> None:
-    """A picture and a calibration give one picture of twelve labelled steps."""
+def test_the_steps_of_a_picture_are_drawn(show: Show) -> None:
+    """For a picture, the output is one picture with twelve labelled steps."""
     show("road.png")
     steps = cv2.imread("road-steps.png")
     assert steps is not None
@@ -61,15 +61,15 @@ def test_a_pictures_steps_are_drawn(show: Show) -> None:
 
 
 @pytest.mark.parametrize("name", ["demo.yaml", "client.yaml", "sweep.yaml"])
-def test_a_configs_camera_is_a_calibration_too(show: Show, name: str) -> None:
-    """The camera of a config file, also where it is left to its defaults, can be looked through."""
+def test_a_config_is_a_calibration(show: Show, name: str) -> None:
+    """The camera of a config file, even with default values, can be used as a calibration."""
     show("road.png", "--out", "steps.jpg", camera=str(shipped(f"configs/{name}")))
     assert Path("steps.jpg").is_file()
     assert camera_of_file(shipped(f"configs/{name}")) == calibrated(CameraModel())
 
 
-def test_a_videos_steps_are_a_video(show: Show) -> None:
-    """A video gives a video with as many pictures."""
+def test_the_steps_of_a_video_are_a_video(show: Show) -> None:
+    """For a video, the output is a video with the same number of pictures."""
     write_video(Path("road.mp4"), [ROAD] * 3, 30.0)
     show("road.mp4", "--out", "steps.mp4")
     video = cv2.VideoCapture("steps.mp4")
@@ -77,13 +77,13 @@ def test_a_videos_steps_are_a_video(show: Show) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "calibration", "options", "says"),
+    ("source", "calibration", "options", "reason"),
     [
         ("nothing.png", CALIBRATION, (), "nothing.png"),
-        (".", CALIBRATION, (), ". is not there"),
+        (".", CALIBRATION, (), ". does not exist"),
         ("camera.yaml", CALIBRATION, (), "camera.yaml"),
         ("empty.mp4", CALIBRATION, (), "empty.mp4"),
-        ("record.mcap", CALIBRATION, (), "holds no picture"),
+        ("record.mcap", CALIBRATION, (), "has no picture"),
         ("small.png", CALIBRATION, (), "320 x 240"),
         ("road.png", CALIBRATION + "fx: 3.0\n", (), "did you mean 'fx_px'"),
         ("road.png", CALIBRATION + "pich_deg: 3.0\n", (), "did you mean 'pitch_deg'"),
@@ -102,17 +102,15 @@ def test_a_videos_steps_are_a_video(show: Show) -> None:
         ("road.png", CALIBRATION, ("--out", "nowhere/steps.png"), "nowhere"),
     ],
 )
-def test_what_cannot_be_shown_is_told(
-    show: Show, source: str, calibration: str, options: tuple[str, ...], says: str
-) -> None:
-    """Files, calibrations and outputs that cannot be used are refused with a sentence that says what to do."""
+def test_bad_input(show: Show, source: str, calibration: str, options: tuple[str, ...], reason: str) -> None:
+    """Unusable sources, calibrations and outputs are rejected with the reason, and nothing is written."""
     Path("camera.yaml").write_text(calibration)
     Path("empty.mp4").touch()
     Path("record.mcap").touch()
     cv2.imwrite("small.png", ROAD[::2, ::2])
     with pytest.raises(UserError) as rejected:
         show(source, *options)
-    assert says in str(rejected.value)
+    assert reason in str(rejected.value)
     assert "Value error" not in str(rejected.value)
     assert not list(Path().glob("*steps*"))
     kept = cv2.imread("road.png")
@@ -121,23 +119,23 @@ def test_what_cannot_be_shown_is_told(
 
 
 def test_a_client_drives_by_a_calibrated_camera(show: Show) -> None:  # noqa: ARG001 (its directory)
-    """The client takes its camera from the file that `camera.calibration` names."""
+    """The client uses the calibration file that `camera.calibration` names."""
     config = parse_config(ClientConfig, {"camera": {"calibration": "camera.yaml"}}, "test")
     nodes = build_client(config, MachineClock().now, MachineEntropy())
     detector = nodes.driver._detector
     assert isinstance(detector, LaneDetector)
-    assert isinstance(detector.view.region_from_grid, tuple)
+    assert isinstance(detector.bird_eye.region_from_grid, tuple)
 
 
 @pytest.mark.parametrize(
-    ("camera", "says"),
+    ("camera", "reason"),
     [
         ({"calibration": "camera.yaml", "pitch_deg": 3.0}, "leave out camera.pitch_deg"),
         ({"calibration": "camera.yaml", "width_px": 320}, "camera.width_px is 320"),
         ({"calibration": "none.yaml"}, "none.yaml"),
     ],
 )
-def test_a_calibration_that_is_contradicted_is_rejected(show: Show, camera: dict[str, object], says: str) -> None:  # noqa: ARG001
-    """What the config says beside its calibration must not say something else."""
-    with pytest.raises(UserError, match=says):
+def test_a_contradicted_calibration_is_rejected(show: Show, camera: dict[str, object], reason: str) -> None:  # noqa: ARG001
+    """Config values that contradict the calibration file are rejected."""
+    with pytest.raises(UserError, match=reason):
         build_client(parse_config(ClientConfig, {"camera": camera}, "test"), MachineClock().now, MachineEntropy())

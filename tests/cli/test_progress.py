@@ -5,15 +5,15 @@ import sys
 import pytest
 from tests.support.clocks import ManualClock
 
-from lavt.cli.progress import left_words, progress
+from lavt.cli.progress import format_time_left, progress
 from lavt.domain import NS_PER_S
 
 
-def test_each_line_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> None:
-    """Where no terminal is, each piece that is done is a line with the number done and the time left at this pace."""
-    with progress("driving", 5, clock=ManualClock(step_ns=30 * NS_PER_S)) as tell:
-        tell("one: completed")
-        tell("two: collision")
+def test_each_line_has_the_time_left(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a terminal, each finished run is a line with the number of finished runs and the estimated time left."""
+    with progress("driving", 5, clock=ManualClock(step_ns=30 * NS_PER_S)) as report_done:
+        report_done("one: completed")
+        report_done("two: collision")
     assert capsys.readouterr().err.splitlines() == [
         "driving: 5 runs",
         "1 of 5, 2 min left: one: completed",
@@ -21,23 +21,21 @@ def test_each_line_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> 
     ]
 
 
-def test_on_a_terminal_titles_and_lines_are_shown_as_they_are(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A directory with braces and a reason with brackets are no formats and no markup."""
+def test_titles_and_lines_are_no_markup(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a terminal, braces and brackets in titles and lines are printed unchanged."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")
-    with progress("sweep into out/{x}[b]", 1) as tell:
-        tell("one failed: no space left [/tmp/x]")
-    said = capsys.readouterr().err
-    assert "sweep into out/{x}[b]" in said
-    assert "one failed: no space left [/tmp/x]" in said
+    with progress("sweep into out/{x}[b]", 1) as report_done:
+        report_done("one failed: no space left [/tmp/x]")
+    printed = capsys.readouterr().err
+    assert "sweep into out/{x}[b]" in printed
+    assert "one failed: no space left [/tmp/x]" in printed
 
 
 @pytest.mark.parametrize(
-    ("left_s", "words"), [(0, "0 s left"), (59.4, "59 s left"), (600, "10 min left"), (7200, "2 h left")]
+    ("left_s", "text"), [(0, "0 s left"), (59.4, "59 s left"), (600, "10 min left"), (7200, "2 h left")]
 )
-def test_the_time_left_is_said_in_round_figures(left_s: float, words: str) -> None:
-    """Seconds below a minute, minutes below two hours, then hours."""
-    assert left_words(left_s) == words
+def test_the_time_left_is_rounded(left_s: float, text: str) -> None:
+    """The time left is in seconds below a minute, in minutes below two hours, and then in hours."""
+    assert format_time_left(left_s) == text

@@ -13,7 +13,7 @@ import pytest
 
 from lavt.config_file import shipped
 from lavt.transport.clock_sync.probe import encode_request
-from lavt.transport.rendezvous.forwarder import wrap, write_registration
+from lavt.transport.rendezvous.forwarder import encode_registration, wrap
 
 HERE = "127.0.0.1"
 ENDS_S = 30.0
@@ -21,12 +21,14 @@ ENDS_S = 30.0
 
 @contextmanager
 def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
-    """Run the command at ports of its own."""
+    """Run the command on free ports."""
     changes = [word for change in (f"bind={HERE}", "video_port=0", "probe_port=0") for word in ("--set", change)]
     process = subprocess.Popen(
         [sys.executable, "-m", "lavt", "rendezvous", str(shipped("configs/rendezvous.yaml")), *changes, *options],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         yield process
     finally:
@@ -36,40 +38,40 @@ def rendezvous(*options: str) -> Iterator[subprocess.Popen[str]]:
 
 @pytest.fixture
 def vehicle() -> Iterator[socket.socket]:
-    """The vehicle's socket, which a client's stands in for, too."""
+    """Open the vehicle's socket."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind((HERE, 0))
         opened.settimeout(ENDS_S)
         yield opened
 
 
-def test_says_where_it_is_and_where_the_vehicle_is(vehicle: socket.socket) -> None:
-    """Its ports come first, then from where the vehicle registers, flow by flow; Ctrl-C ends it with 0."""
+def test_output_as_text(vehicle: socket.socket) -> None:
+    """The command prints its ports, then the vehicle's address for each flow, and exits with code 0 on Ctrl-C."""
     with rendezvous() as process:
         assert process.stdout is not None
         first = re.search(r"video at port (\d+)", process.stdout.readline())
         assert first is not None
-        vehicle.sendto(write_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
+        vehicle.sendto(encode_registration("vehicle-1", "video", 1, None), (HERE, int(first[1])))
         assert f"{HERE}:{vehicle.getsockname()[1]}" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=ENDS_S)
     assert (process.returncode, out, err) == (0, "", "")
 
 
-def test_what_it_says_to_programs(vehicle: socket.socket) -> None:
-    """As JSON: ports, where the vehicle is, and in the end what became of each flow's datagrams."""
+def test_output_as_json(vehicle: socket.socket) -> None:
+    """As JSON, the command prints its ports, the vehicle's address, and finally the counts of each flow."""
     with rendezvous("--json") as process, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind((HERE, 0))
         client.settimeout(ENDS_S)
         assert process.stdout is not None
         ports = json.loads(process.stdout.readline())["ready"]
-        there = (HERE, ports["probe_port"])
-        vehicle.sendto(write_registration("vehicle-1", "probe", 1, None), there)
-        at = {"flow": "probe", "vehicle_at": list(vehicle.getsockname())}
-        assert json.loads(process.stdout.readline()) == at
-        client.sendto(encode_request(1, 2), there)
+        address = (HERE, ports["probe_port"])
+        vehicle.sendto(encode_registration("vehicle-1", "probe", 1, None), address)
+        expected = {"flow": "probe", "vehicle_at": list(vehicle.getsockname())}
+        assert json.loads(process.stdout.readline()) == expected
+        client.sendto(encode_request(1, 2), address)
         assert vehicle.recv(100) == wrap(client.getsockname(), encode_request(1, 2))
-        vehicle.sendto(wrap(client.getsockname(), b"reply"), there)
+        vehicle.sendto(wrap(client.getsockname(), b"reply"), address)
         assert client.recv(100) == b"reply"
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=ENDS_S)

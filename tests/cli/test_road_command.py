@@ -26,19 +26,19 @@ def bend(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_road_of_ones_own_is_drawn_into_a_picture(run: Run, bend: Path, tmp_path: Path) -> None:
-    """`lavt road draw FILE --out PNG` says where the picture is, and it is a picture with asphalt and grass in it."""
+def test_a_custom_road_is_drawn(run: Run, bend: Path, tmp_path: Path) -> None:
+    """`lavt road draw FILE --out PNG` writes a picture with asphalt and grass, and prints its path."""
     out = tmp_path / "new" / "bend.png"
-    code, said, _ = run("road", "draw", str(bend), "--out", str(out))
-    assert (code, str(out) in said) == (0, True)
+    code, printed, _ = run("road", "draw", str(bend), "--out", str(out))
+    assert (code, str(out) in printed) == (0, True)
     picture = cv2.imread(str(out))
     assert picture is not None
     for colour in ((0x96, 0x90, 0x8D), (0xD5, 0xE8, 0xDF)):
         assert (np.abs(picture.astype(int) - colour).max(axis=-1) < 3).sum() > 1000
 
 
-def test_a_drawing_shows_the_road_to_scale_its_curvature_and_what_the_driver_sees() -> None:
-    """Above all has equal axes and holds every station of the route; the views are the camera's pictures."""
+def test_a_drawing_has_a_map_the_curvature_and_views() -> None:
+    """The map is to scale with all stations, the curvature is the road's, and the views are camera pictures."""
     road = load_road("a_key")
     figure = draw_road(road, model=CameraModel(), scenery="none")
     above, detail, curvature, *views = figure.axes
@@ -52,14 +52,14 @@ def test_a_drawing_shows_the_road_to_scale_its_curvature_and_what_the_driver_see
     assert [axes.images[0].get_size() for axes in views] == [(480, 640)] * VIEWS
 
 
-@pytest.mark.parametrize(("arguments", "said"), [(["nowhere"], "'nowhere'"), (["a_key", "--out", "x.jpg"], ".png")])
-def test_what_cannot_be_drawn_is_rejected(run: Run, arguments: list[str], said: str) -> None:
-    """A road that does not exist and a picture that is no PNG are the user's errors."""
-    assert said in run("road", "draw", *arguments).rejected()
+@pytest.mark.parametrize(("arguments", "reason"), [(["nowhere"], "'nowhere'"), (["a_key", "--out", "x.jpg"], ".png")])
+def test_bad_input(run: Run, arguments: list[str], reason: str) -> None:
+    """An unknown road, or an output file that is not a PNG, is rejected."""
+    assert reason in run("road", "draw", *arguments).rejected()
 
 
-def test_a_run_takes_the_path_of_a_road(bend: Path) -> None:
-    """`vehicle.route` may be a path; a file that is not a road is refused before anything is driven."""
+def test_a_run_accepts_the_path_of_a_road(bend: Path) -> None:
+    """`vehicle.route` may be a path, and a file that is not a road is rejected before the run starts."""
     planned = plan_run(RunConfig(vehicle=VehicleConfig(route=str(bend))))
     assert planned.identity["route"] == str(bend)
     bend.write_text("title: x")

@@ -18,7 +18,7 @@ ENDS_S = 5.0
 
 @pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="needs the number of tgkill")
 def test_signal_to_another_thread(tmp_path: Path) -> None:
-    """A router ends also where the kernel gives the signal to one of Zenoh's threads, which does not wake Python's."""
+    """A router ends even if one of Zenoh's threads receives the signal, which does not wake Python's main thread."""
     with Processes(tmp_path) as processes:
         file = str(shipped("zenoh-configs/router-server.json5"))
         router = processes.start("router", "router", file, "--set", 'listen.endpoints=["tcp/127.0.0.1:0"]')

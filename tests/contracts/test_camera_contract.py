@@ -1,4 +1,4 @@
-"""What every `Camera` keeps."""
+"""The contract of every `Camera`."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ X_M, Y_M, HEADING_RAD = ROAD.start
 POSE = Pose(0, X_M, Y_M, HEADING_RAD)
 MODEL = CameraModel(320, 240)
 LONG_S = 20.0
-DRAWN: dict[str, Callable[[], Camera]] = {
+RENDERERS: dict[str, Callable[[], Camera]] = {
     "simulated": lambda: SimCamera(model=MODEL, rate_hz=30.0, phase_ns=3, road=ROAD, seed=1, scenery="none"),
     "stand-in of the node tests": lambda: NoiseCamera(MODEL),
 }
-"""Those that make a picture of what they are told."""
-each_camera = pytest.mark.parametrize("name", [*sorted(DRAWN), "device"])
+"""Cameras that render a picture of the given number, time and pose."""
+each_camera = pytest.mark.parametrize("name", [*sorted(RENDERERS), "device"])
 
 
 @pytest.fixture
 def camera(name: str, tmp_path: Path) -> Iterator[Camera]:
-    if name in DRAWN:
-        yield DRAWN[name]()
+    if name in RENDERERS:
+        yield RENDERERS[name]()
         return
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=MachineClock())
@@ -42,49 +42,49 @@ def camera(name: str, tmp_path: Path) -> Iterator[Camera]:
     device.close()
 
 
-def taken(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
-    """Give a frame, when there is one."""
+def capture(camera: Camera, number: int, at_ns: int) -> CapturedFrame:
+    """Return a frame, waiting until there is one."""
     assert not isinstance(camera, VideoDevice) or camera.wait(LONG_S)
     frame = camera.capture(number, at_ns, POSE)
     assert frame is not None
     return frame
 
 
-@pytest.mark.parametrize("name", sorted(DRAWN))
-def test_the_same_inputs_give_the_same_bytes(name: str) -> None:
-    """Two cameras made alike that draw give equal pictures for equal number, time and pose, in buffers of their own."""
-    one, other = DRAWN[name](), DRAWN[name]()
+@pytest.mark.parametrize("name", sorted(RENDERERS))
+def test_rendered_pictures_are_byte_for_byte_reproducible(name: str) -> None:
+    """Two equal rendering cameras return equal pictures for equal inputs, each in a buffer of its own."""
+    one, other = RENDERERS[name](), RENDERERS[name]()
     other.capture(1, 5, POSE)
-    first, second, again = taken(one, 7, 9), taken(other, 7, 9), taken(one, 7, 9)
+    first, second, again = capture(one, 7, 9), capture(other, 7, 9), capture(one, 7, 9)
     assert first.picture.tobytes() == second.picture.tobytes() == again.picture.tobytes()
     assert not np.shares_memory(first.picture, again.picture)
 
 
 @each_camera
-def test_pictures_are_of_the_models_size(camera: Camera) -> None:
-    """A picture is (height, width, 3) of bytes and may be written into."""
-    frame = taken(camera, 4, 99)
+def test_pictures_have_the_models_size(camera: Camera) -> None:
+    """A picture is a writable array of bytes of shape (height, width, 3)."""
+    frame = capture(camera, 4, 99)
     assert frame.picture.shape == (camera.model.height_px, camera.model.width_px, 3)
     assert frame.picture.dtype == np.uint8
     assert frame.picture.flags.writeable
 
 
 @each_camera
-def test_a_frame_carries_its_number_and_its_time_if_known(camera: Camera, name: str) -> None:
-    """A frame has the number that it was asked by; one that is drawn is of the time asked for, a file's is of none."""
-    frame = taken(camera, 4, 99)
-    assert (frame.number, frame.capture_ns) == (4, 99 if name in DRAWN else None)
+def test_a_frame_carries_its_number_and_its_capture_time_if_known(camera: Camera, name: str) -> None:
+    """A frame has the requested number; a rendered frame has the requested time, a file's frame has none."""
+    frame = capture(camera, 4, 99)
+    assert (frame.number, frame.capture_ns) == (4, 99 if name in RENDERERS else None)
 
 
 @each_camera
-def test_its_first_frame_comes_within_one_period(camera: Camera) -> None:
-    """The phase lies in one period of its rate."""
+def test_the_first_frame_comes_within_one_period(camera: Camera) -> None:
+    """The phase is less than one frame period."""
     assert 0 <= camera.phase_ns < NS_PER_S / camera.rate_hz
 
 
 @each_camera
-def test_pictures_that_follow_each_other_differ(camera: Camera) -> None:
-    """Two frames of a standing vehicle are not equal: a live camera is not taken for a frozen one."""
-    first, second = taken(camera, 1, 0), taken(camera, 2, 33)
+def test_consecutive_pictures_differ(camera: Camera) -> None:
+    """Two frames of a stationary vehicle differ, so a live camera is not taken for a frozen one."""
+    first, second = capture(camera, 1, 0), capture(camera, 2, 33)
     assert not np.array_equal(first.picture[64:], second.picture[64:])
     assert not np.shares_memory(first.picture, second.picture)

@@ -1,4 +1,4 @@
-"""What every `DriveController` keeps, with every preset."""
+"""The contract of every `DriveController`, with every preset."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def decide(controller: DriveController, seen: list[tuple[Lane, float]]) -> list[
 @settings(max_examples=40)
 @given(seen=SEEN)
 def test_decisions_are_in_range_and_repeat(kind: str, preset: str, seen: list[tuple[Lane, float]]) -> None:
-    """Whatever is seen, decisions are what a command may hold, and the same for the same inputs."""
+    """Decisions are in the range of a command, and equal for equal inputs."""
     decisions = decide(new(kind, preset), seen)
     assert decisions == decide(new(kind, preset), seen)
     for decision in decisions:
@@ -52,7 +52,7 @@ def test_decisions_are_in_range_and_repeat(kind: str, preset: str, seen: list[tu
 @every_one
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0, 8.3, 15.0])
 def test_without_a_lane_there_is_no_throttle(kind: str, preset: str, speed_mps: float) -> None:
-    """From the first picture without a lane on there is no throttle; also when none was ever seen."""
+    """Without a lane there is no throttle, also if none was ever seen."""
     for first in ([], [(Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0), speed_mps)]):
         lost = [(Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 0.0), speed_mps)] * 40
         decisions = decide(new(kind, preset), first + lost)[len(first) :]

@@ -1,4 +1,4 @@
-"""The software car and what drives it know of each other by the bus alone."""
+"""The software car and its adapter share nothing but the bus."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ import lavt.vehicle.software_car
 
 SOURCE = Path(lavt.__file__).parent.parent
 SHARED = {
-    "lavt.vehicle.can_frame",  # frames, and what they come and go by
-    "lavt.vehicle.vehicle", "lavt.domain", "lavt.errors", "lavt.value", "lavt.clock",  # the words of the design
-    "lavt.vehicle.ground_truth_wire",  # which does not go over the bus
-}  # fmt: skip
-"""All that both sides may use: nothing of it knows what the bits of a frame mean."""
+    "lavt.vehicle.can_frame",  # frames and bus ports
+    "lavt.vehicle.vehicle",
+    "lavt.domain",
+    "lavt.errors",
+    "lavt.value",
+    "lavt.clock",
+    "lavt.vehicle.ground_truth_wire",  # not sent over the bus
+}
+"""Modules that both may use: none of them contains the layout of a message."""
 
 
 def files_of(package: str) -> set[Path]:
@@ -27,7 +31,7 @@ def files_of(package: str) -> set[Path]:
 
 
 def imported(path: Path) -> set[str]:
-    """Name the modules of LAVT that a file imports itself, wherever in it."""
+    """Return LAVT's modules that a file imports itself, anywhere in it."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -43,8 +47,8 @@ def file_of(module: str) -> Path | None:
     return next((each for each in (path.with_suffix(".py"), path / "__init__.py") if each.exists()), None)
 
 
-def used(package: str) -> set[str]:
-    """Name every module of LAVT outside a package that it uses, directly or through others."""
+def dependencies(package: str) -> set[str]:
+    """Return LAVT's modules outside a package that it uses, directly or indirectly."""
     names: set[str] = set()
     waiting = list(files_of(package))
     while waiting:
@@ -54,20 +58,20 @@ def used(package: str) -> set[str]:
     return {name for name in names if not name.startswith(package)} - {"lavt.vehicle"}
 
 
-def test_they_share_frames_alone() -> None:
-    """What both the software car and the adapter use, through however many modules, are words, and no bits."""
-    car, adapter = used("lavt.vehicle.software_car"), used("lavt.vehicle.dbw")
+def test_both_share_frames_only() -> None:
+    """Modules that the software car and the adapter both use, directly or indirectly, contain no message layouts."""
+    car, adapter = dependencies("lavt.vehicle.software_car"), dependencies("lavt.vehicle.dbw")
     assert "lavt.vehicle.can_frame" in car & adapter
     assert car & adapter <= SHARED
 
 
 def test_neither_uses_the_other() -> None:
-    """Neither imports anything of the other, through however many modules."""
-    assert not [name for name in used("lavt.vehicle.software_car") if name.startswith("lavt.vehicle.dbw")]
-    assert not [name for name in used("lavt.vehicle.dbw") if name.startswith("lavt.vehicle.software_car")]
+    """Neither imports the other, directly or indirectly."""
+    assert not [name for name in dependencies("lavt.vehicle.software_car") if name.startswith("lavt.vehicle.dbw")]
+    assert not [name for name in dependencies("lavt.vehicle.dbw") if name.startswith("lavt.vehicle.software_car")]
 
 
-def test_the_car_reads_no_file_of_the_adapter() -> None:
+def test_the_car_reads_no_profile() -> None:
     """No file of the software car names the adapter's profiles or their DBC files."""
     for path in files_of("lavt.vehicle.software_car"):
         text = path.read_text(encoding="utf-8")

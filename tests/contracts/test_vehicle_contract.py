@@ -1,4 +1,4 @@
-"""What every `Vehicle` keeps."""
+"""The contract that every `Vehicle` satisfies."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.nodes.stand_ins import MONO_NS, StandingVehicle
+from tests.nodes.stand_ins import MONO_NS, FakeVehicle
 
 from lavt.assembly.by_wire import inside
 from lavt.config import DbwConfig, ServerConfig, VehicleConfig
@@ -32,13 +32,13 @@ DRIVABLE: dict[str, Callable[[], Vehicle]] = {
     "dataspeed_gen1": lambda: by_wire("dataspeed_gen1"),
     "dataspeed_gen2": lambda: by_wire("dataspeed_gen2"),
 }
-VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "stand-in of the node tests": StandingVehicle}
+VEHICLES: dict[str, Callable[[], Vehicle]] = {**DRIVABLE, "fake of the node tests": FakeVehicle}
 each_vehicle = pytest.mark.parametrize("name", sorted(VEHICLES))
 each_drivable = pytest.mark.parametrize("name", sorted(DRIVABLE))
 
 
-def live(vehicle: Vehicle, from_ns: int, actuation: Actuation, *, wanted: bool, seconds: float) -> int:
-    """Do for some time what the actuator node does: live on, engage and apply at each wake; give the time after it."""
+def run(vehicle: Vehicle, from_ns: int, actuation: Actuation, *, wanted: bool, seconds: float) -> int:
+    """Call the vehicle as the actuator node does, at each wake time, and return the end time."""
     now_ns, end_ns = from_ns, from_ns + round(seconds * NS_PER_S)
     while now_ns < end_ns:
         vehicle.advance(now_ns)
@@ -50,8 +50,8 @@ def live(vehicle: Vehicle, from_ns: int, actuation: Actuation, *, wanted: bool, 
 
 
 @each_vehicle
-def test_its_time_goes_on_and_never_ahead(name: str) -> None:
-    """A state's time never goes back, is not later than what was advanced to; wakes lie ahead, and lead on."""
+def test_time_increases_up_to_the_call(name: str) -> None:
+    """A state's time never decreases or exceeds the time advanced to, and wake times lie in the future."""
     vehicle = VEHICLES[name]()
     vehicle.advance(MONO_NS + 20 * NS_PER_MS)
     before_ns = vehicle.state().mono_ns
@@ -67,30 +67,33 @@ def test_its_time_goes_on_and_never_ahead(name: str) -> None:
 
 
 @each_vehicle
-def test_it_stands_until_commanded(name: str) -> None:
-    """Without a command it stands, and nothing happens."""
+def test_it_is_stationary_until_commanded(name: str) -> None:
+    """Without a command the vehicle is stationary and has no events."""
     vehicle = VEHICLES[name]()
     assert vehicle.advance(MONO_NS + 3 * NS_PER_S) == []
     assert vehicle.state().speed_mps == 0
 
 
 @each_vehicle
-def test_its_capabilities_are_those_of_a_car(name: str) -> None:
-    """Sizes and limits are positive and finite, and there is ground truth where it says so."""
+def test_capabilities(name: str) -> None:
+    """Sizes and limits are positive and finite, and there is ground truth exactly if the vehicle says so."""
     vehicle = VEHICLES[name]()
-    can = vehicle.capabilities
-    for value in (can.wheelbase_m, can.max_steering_rad, can.max_acceleration_mps2, can.max_braking_mps2):
+    capabilities = vehicle.capabilities
+    for value in (
+        capabilities.wheelbase_m,
+        capabilities.max_steering_rad,
+        capabilities.max_acceleration_mps2,
+        capabilities.max_braking_mps2,
+    ):
         assert 0 < value < math.inf
-    assert (vehicle.ground_truth() is not None) == can.ground_truth
+    assert (vehicle.ground_truth() is not None) == capabilities.ground_truth
 
 
 @each_vehicle
 @settings(max_examples=15)
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1), st.integers(1, 800)), max_size=6))
-def test_whatever_it_is_requested_its_state_is_finite(
-    name: str, requested: list[tuple[float, float, float, int]]
-) -> None:
-    """Any series of actuations within their ranges leaves a finite state, and the wheel within its limits."""
+def test_any_actuation_leaves_a_finite_state(name: str, requested: list[tuple[float, float, float, int]]) -> None:
+    """Any actuations within their ranges leave a finite state and a steering angle within the limits."""
     vehicle, now_ns = VEHICLES[name](), MONO_NS
     for steering_rad, throttle, brake, ms in requested:
         vehicle.apply(Actuation(steering_rad, throttle, brake), now_ns)
@@ -103,15 +106,15 @@ def test_whatever_it_is_requested_its_state_is_finite(
 
 
 @each_drivable
-def test_it_is_engaged_at_standstill_and_accepts(name: str) -> None:
-    """With the brake on it gets engaged in less than 3 s; then throttle drives it, and a left turn turns it left."""
+def test_an_engaged_vehicle_follows_commands(name: str) -> None:
+    """At standstill with the brake on the vehicle is engaged within 3 s; then it accelerates and turns as commanded."""
     vehicle = DRIVABLE[name]()
-    now_ns = live(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
+    now_ns = run(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
     assert vehicle.state().inhibit_reason == ""
-    now_ns = live(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
+    now_ns = run(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
     state = vehicle.state()
     assert (state.is_engaged, state.inhibit_reason, state.is_overridden, state.gear) == (True, "", False, "drive")
-    live(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), wanted=True, seconds=2)
+    run(vehicle, now_ns, Actuation(0.05, 0.5, 0.0), wanted=True, seconds=2)
     state = vehicle.state()
     assert 1.0 < state.speed_mps < 2.0, "1 m/s2 for 2 s, less the lags"
     assert state.steering_rad == pytest.approx(0.05, abs=0.002)
@@ -121,16 +124,16 @@ def test_it_is_engaged_at_standstill_and_accepts(name: str) -> None:
 
 
 @each_drivable
-def test_what_is_wanted_no_more_is_braked_and_holds_itself(name: str) -> None:
-    """From driving, no more wanted and braked, it comes to stand and stays there."""
+def test_a_disengaged_vehicle_stays_stationary(name: str) -> None:
+    """A vehicle that is disengaged while driving, and braked, becomes stationary and stays so."""
     vehicle = DRIVABLE[name]()
-    now_ns = live(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
-    now_ns = live(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
-    now_ns = live(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), wanted=True, seconds=2)
+    now_ns = run(vehicle, MONO_NS, BRAKE, wanted=False, seconds=0.5)
+    now_ns = run(vehicle, now_ns, BRAKE, wanted=True, seconds=3)
+    now_ns = run(vehicle, now_ns, Actuation(0.0, 1.0, 0.0), wanted=True, seconds=2)
     assert vehicle.state().speed_mps > 2
-    now_ns = live(vehicle, now_ns, BRAKE, wanted=False, seconds=3)
+    now_ns = run(vehicle, now_ns, BRAKE, wanted=False, seconds=3)
     assert vehicle.state().speed_mps == 0
-    live(vehicle, now_ns, BRAKE, wanted=False, seconds=1)
+    run(vehicle, now_ns, BRAKE, wanted=False, seconds=1)
     truth = vehicle.ground_truth()
     assert truth is not None
     assert truth.speed_mps == 0

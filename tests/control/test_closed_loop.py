@@ -1,4 +1,4 @@
-"""The driver in front of the simulator's own pictures, in the simplest loop there is: no codec, no network."""
+"""The detector and controller in a closed loop with the simulator's pictures, without codec and network."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROAD = load_road("a_key")
 
 @dataclass
 class Drive:
-    """What became of a drive."""
+    """The course of a drive."""
 
     cross_track_m: list[float]
     speeds_mps: list[float]
@@ -51,10 +51,10 @@ def drive(
     *,
     delay_ns: int = 60 * NS_PER_MS,
     seconds: float = 28,
-    seen: Callable[[Picture], Picture] = unchanged,
-    blind_after_s: float = 1e9,
+    change: Callable[[Picture], Picture] = unchanged,
+    change_after_s: float = 1e9,
 ) -> Drive:
-    """Drive from standstill until something ends it; `seen` is what becomes of pictures after `blind_after_s`."""
+    """Drive from standstill to an ending; `change` is applied to the pictures after `change_after_s`."""
     car = Simulator(road=ROAD, seed=1, start_mono_ns=0)
     detector, watch = LaneDetector(MODEL), LaneWatch()
     controller = make_controller("lane_keeper", PRESETS[preset], wheelbase_m=car.capabilities.wheelbase_m)
@@ -68,7 +68,7 @@ def drive(
         done.cross_track_m.append(truth.cross_track_m)
         done.speeds_mps.append(truth.speed_mps)
         picture = renderer.render(car.pose(), number)
-        lane = detector.detect(picture if now_ns < blind_after_s * NS_PER_S else seen(picture))
+        lane = detector.detect(picture if now_ns < change_after_s * NS_PER_S else change(picture))
         done.lane_state = watch.check(lane.confidence, now_ns)
         decision = controller.decide(lane, truth.speed_mps, now_ns)
         brake = decision.brake if done.lane_state == "ok" else CLIENT_LIMITS.brake  # as the driver node does
@@ -80,7 +80,7 @@ def drive(
 
 @pytest.mark.parametrize("preset", ["designed", pytest.param("paper_calibrated", marks=pytest.mark.full)])
 def test_every_preset_drives_the_turn_at_60_ms(renderer: Renderer, preset: str) -> None:
-    """From standstill each preset completes the 90 degree turn within 0.2 m of the centre 95 % of the time."""
+    """Each preset completes the 90 degree turn, 95 % of the time within 0.2 m of the centre."""
     done = drive(renderer, preset)
     assert done.events == ["completed"]
     assert np.percentile(np.abs(done.cross_track_m), 95) < 0.2
@@ -88,17 +88,21 @@ def test_every_preset_drives_the_turn_at_60_ms(renderer: Renderer, preset: str) 
 
 
 def test_grey_pictures_lead_to_a_stop(renderer: Renderer) -> None:
-    """When all is grey from one picture on, the car follows its last path, slows down, and the watch says stop."""
-    done = drive(renderer, "designed", seen=lambda picture: np.full_like(picture, 128), blind_after_s=8)
+    """With grey pictures the car follows its last path, slows down, and the lane watch returns "stop"."""
+    done = drive(renderer, "designed", change=lambda picture: np.full_like(picture, 128), change_after_s=8)
     assert done.lane_state == "stop"
     assert done.speeds_mps[-1] < done.speeds_mps[8 * 30] - 5
     assert abs(done.cross_track_m[-1]) < 0.6
 
 
 def test_mirrored_pictures_lead_out_of_the_lane(renderer: Renderer) -> None:
-    """With left and right exchanged the car turns the wrong way: it really drives by what it sees."""
+    """With mirrored pictures the car turns the wrong way, so it drives by its pictures."""
     done = drive(
-        renderer, "designed", seconds=16, seen=lambda picture: np.ascontiguousarray(picture[:, ::-1]), blind_after_s=0
+        renderer,
+        "designed",
+        seconds=16,
+        change=lambda picture: np.ascontiguousarray(picture[:, ::-1]),
+        change_after_s=0,
     )
     assert "lane_invasion" in done.events
     assert np.max(np.abs(done.cross_track_m)) > 1.75

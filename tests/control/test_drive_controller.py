@@ -24,8 +24,8 @@ def keeper(preset: Preset = DESIGNED) -> LaneKeeper:
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
-def test_a_decision_is_within_what_a_command_may_hold(name: str) -> None:
-    """Whatever the lane, pedals are in [0, 1], one of them 0, and the path has its points, all finite."""
+def test_a_decision_is_in_the_range_of_a_command(name: str) -> None:
+    """For any lane, pedals are in [0, 1], one of them is 0, and the path has finite points."""
     for centre in ((0.0, 0.0, 0.0), (6.0, 1.0, 0.05), (-30.0, 0.0, 0.0), (0.0, -5.0, 0.1)):
         decision = keeper(PRESETS[name]).decide(lane(*centre), SPEED_MPS, 0)
         assert 0 <= decision.throttle <= 1
@@ -37,7 +37,7 @@ def test_a_decision_is_within_what_a_command_may_hold(name: str) -> None:
 
 @pytest.mark.parametrize("speed_mps", [5.0, SPEED_MPS, 14.0])
 def test_designed_keeps_to_3_mps2(speed_mps: float) -> None:
-    """The steering asked for never needs more than 3 m/s2 to the side, however far off the lane is."""
+    """The designed preset never exceeds 3 m/s2 of lateral acceleration."""
     decision = keeper().decide(lane(3.0), speed_mps, 0)
     for curvature in (curvature_per_m(decision.steering_rad, WHEELBASE_M), *decision.path_curvature_per_m):
         assert abs(curvature) * speed_mps**2 <= 3.0 + 1e-9
@@ -45,20 +45,20 @@ def test_designed_keeps_to_3_mps2(speed_mps: float) -> None:
 
 
 def test_paper_calibrated_keeps_to_a_wheel_angle() -> None:
-    """The steering asked for is at most 0.21 rad, which is 5.2 m/s2 at 30 km/h."""
+    """The paper_calibrated preset never exceeds 0.21 rad, which is 5.2 m/s2 at 30 km/h."""
     decision = keeper(PRESETS["paper_calibrated"]).decide(lane(-4.0), SPEED_MPS, 0)
     assert decision.steering_rad == pytest.approx(-0.21)
 
 
-def test_the_lane_is_followed_as_soon_as_it_is_seen() -> None:
-    """The first picture is enough: no time passes before the first decision."""
+def test_the_first_lane_is_followed() -> None:
+    """The first lane is followed by the first decision."""
     decision = keeper().decide(lane(0.3), 0.0, 123)
     assert decision.steering_rad > 0
     assert decision.throttle == 1.0
 
 
 def lose_lane(controller: LaneKeeper, after_ns: int) -> Decision:
-    """Show a left curve, then nothing, picture for picture until `after_ns`."""
+    """Return the decision at `after_ns`, after one picture of a left curve and then pictures without a lane."""
     decision = controller.decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
     for now_ns in range(FRAME_NS, after_ns + 1, FRAME_NS):
         decision = controller.decide(lane(confidence=0.0), SPEED_MPS, now_ns)
@@ -66,20 +66,20 @@ def lose_lane(controller: LaneKeeper, after_ns: int) -> Decision:
 
 
 def test_without_a_lane_there_is_no_throttle() -> None:
-    """A lost lane lifts the foot at once; braking for it is not the controller's business."""
+    """Without a lane the controller applies neither throttle nor brake."""
     for after_ns in (FRAME_NS, STOP_AFTER_NS + FRAME_NS):
         decision = lose_lane(keeper(), after_ns)
         assert (decision.throttle, decision.brake) == (0.0, 0.0)
 
 
 def test_a_lost_lane_is_followed_from_memory() -> None:
-    """Half a second into blindness on a curve the wheel is still turned as the curve asks."""
+    """Half a second after the lane was lost in a curve, the wheel still follows the curve."""
     seen = keeper().decide(lane(c2=0.5 / 87), SPEED_MPS, 0)
     assert lose_lane(keeper(), BRAKE_AFTER_NS).steering_rad == pytest.approx(seen.steering_rad, rel=0.15)
 
 
-def test_an_offset_is_not_steered_against_twice() -> None:
-    """A lane lost while the car was beside it is reached by memory, not circled: the wheel comes back."""
+def test_a_lost_lane_with_an_offset_is_reached() -> None:
+    """A lane lost with a lateral offset is reached by dead reckoning, and the wheel straightens."""
     controller = keeper()
     first = controller.decide(lane(0.8), SPEED_MPS, 0).steering_rad
     for now_ns in range(FRAME_NS, 2 * NS_PER_S, FRAME_NS):
@@ -87,39 +87,39 @@ def test_an_offset_is_not_steered_against_twice() -> None:
     assert abs(last) < 0.2 * first
 
 
-def test_a_lane_seen_again_is_followed_at_once() -> None:
-    """After a loss the first lane counts, not the memory."""
+def test_a_new_lane_replaces_the_remembered_one() -> None:
+    """After a loss, the first new lane replaces the remembered one."""
     controller = keeper()
     lose_lane(controller, NS_PER_S)
     again = controller.decide(lane(-0.5), SPEED_MPS, NS_PER_S + FRAME_NS)
     assert again.steering_rad == keeper().decide(lane(-0.5), SPEED_MPS, 0).steering_rad
 
 
-def test_unknown_names_are_told_with_the_known_ones() -> None:
-    """A controller or preset that is not there is the user's mistake, and the message names those there are."""
+def test_unknown_names_are_user_errors() -> None:
+    """An unknown controller or preset is a user error that names the known ones."""
     with pytest.raises(UserError, match="lane_keeper"):
         make_controller("lane_keper", PRESETS["designed"], WHEELBASE_M)
     with pytest.raises(UserError, match="designed, paper_calibrated"):
         find_preset("tuned")
 
 
-class Statue:
-    """A controller of somebody else's."""
+class ExternalController:
+    """A controller from another package."""
 
     def __init__(
         self, preset: Preset, *, wheelbase_m: float, max_acceleration_mps2: float, max_braking_mps2: float
     ) -> None:
-        self.known = (preset.name, wheelbase_m, max_acceleration_mps2, max_braking_mps2)
+        self.arguments = (preset.name, wheelbase_m, max_acceleration_mps2, max_braking_mps2)
 
     def decide(self, lane: Lane, speed_mps: float, now_ns: int) -> Decision:
-        """Stand still."""
+        """Return full brake."""
         del lane, speed_mps, now_ns
         return Decision(0.0, 0.0, 1.0, (0.0,) * PATH_POINTS)
 
 
 def test_a_package_adds_a_controller_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A controller registered in the group `lavt.controllers` is found by its name and told what the car is like."""
-    entry = EntryPoint("statue", f"{__name__}:Statue", drive_controller.ENTRY_POINTS)
+    """A controller registered in the group `lavt.controllers` is found by name and gets the car's properties."""
+    entry = EntryPoint("external", f"{__name__}:ExternalController", drive_controller.ENTRY_POINTS)
     monkeypatch.setattr(drive_controller, "entry_points", lambda group: [entry] if group == "lavt.controllers" else [])
-    controller = make_controller("statue", PRESETS["designed"], WHEELBASE_M, max_braking_mps2=8.0)
-    assert getattr(controller, "known", None) == ("designed", WHEELBASE_M, 2.0, 8.0)
+    controller = make_controller("external", PRESETS["designed"], WHEELBASE_M, max_braking_mps2=8.0)
+    assert getattr(controller, "arguments", None) == ("designed", WHEELBASE_M, 2.0, 8.0)

@@ -3,8 +3,8 @@ from lavt.control.lane_watch import BRAKE_AFTER_NS, LANE_CONFIDENCE, STOP_AFTER_
 START_NS = 7_000_000_000
 
 
-def test_half_a_second_without_a_lane_brakes_and_two_and_a_half_stop() -> None:
-    """Time without a lane is counted from the last picture that had one."""
+def test_without_a_lane_it_brakes_at_500_ms_and_stops_at_2500_ms() -> None:
+    """Without a lane for 0.5 s the watch returns "brake", for 2.5 s "stop"."""
     watch = LaneWatch()
     assert watch.check(1.0, START_NS) == "ok"
     assert watch.check(0.0, START_NS + BRAKE_AFTER_NS - 1) == "ok"
@@ -13,8 +13,8 @@ def test_half_a_second_without_a_lane_brakes_and_two_and_a_half_stop() -> None:
     assert watch.check(0.0, START_NS + STOP_AFTER_NS) == "stop"
 
 
-def test_a_lane_seen_again_makes_all_well() -> None:
-    """One picture with a lane starts the count anew."""
+def test_a_lane_restarts_the_time() -> None:
+    """One picture with a lane restarts the time."""
     watch = LaneWatch()
     watch.check(1.0, START_NS)
     assert watch.check(0.0, START_NS + BRAKE_AFTER_NS) == "brake"
@@ -23,7 +23,7 @@ def test_a_lane_seen_again_makes_all_well() -> None:
 
 
 def test_without_any_lane_time_counts_from_the_first_picture() -> None:
-    """A driver that never saw a lane brakes and stops as one that lost it."""
+    """If no lane was ever seen, the time counts from the first picture."""
     watch = LaneWatch()
     assert watch.check(0.0, START_NS) == "ok"
     assert watch.check(0.0, START_NS + STOP_AFTER_NS) == "stop"

@@ -3,13 +3,13 @@ import math
 import pytest
 
 from lavt.control.pure_pursuit import (
-    SEEN_FROM,
+    ORIGIN,
     curvature_per_m,
-    goal_m,
+    goal_point_m,
     lookahead_m,
-    moved,
-    pursued_path,
+    move_along_arc,
     pursuit_curvature_per_m,
+    pursuit_path_per_m,
     steering_rad,
 )
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
@@ -22,70 +22,70 @@ def lane(c0: float = 0.0, c1: float = 0.0, c2: float = 0.0) -> Lane:
 
 
 @pytest.mark.parametrize(("speed_mps", "expected_m"), [(0.0, 4.0), (2.0, 4.0), (8.0, 8.0), (30.0, 20.0)])
-def test_the_lookahead_grows_with_speed_between_its_ends(speed_mps: float, expected_m: float) -> None:
-    """The lookahead is so many seconds of driving, at least 4 and at most 20 m."""
+def test_the_lookahead_grows_with_speed(speed_mps: float, expected_m: float) -> None:
+    """The lookahead grows with speed from 4 to 20 m."""
     assert lookahead_m(1.0, speed_mps) == expected_m
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (1.5, -0.2, 0.012), (-3.0, 0.5, -0.02)])
-def test_the_goal_is_on_the_centre_and_a_lookahead_away(centre: tuple[float, float, float]) -> None:
-    """The point aimed at lies on the polynomial, ahead, at the distance asked for."""
-    x_m, y_m = goal_m(lane(*centre), 6.2)
+def test_the_goal_is_on_the_centre_at_the_lookahead_distance(centre: tuple[float, float, float]) -> None:
+    """The goal is on the lane's centre, ahead, at the lookahead distance."""
+    x_m, y_m = goal_point_m(lane(*centre), 6.2)
     assert math.hypot(x_m, y_m) == pytest.approx(6.2, abs=1e-3)
     assert y_m == pytest.approx(centre[0] + centre[1] * x_m + centre[2] * x_m**2)
     assert x_m > 0
 
 
-def test_on_the_centre_there_is_nothing_to_steer() -> None:
-    """On a straight lane's centre, pointing along it, the wheel is straight."""
+def test_on_the_centre_the_wheel_is_straight() -> None:
+    """On the centre of a straight lane, the wheel is straight."""
     assert pursuit_curvature_per_m(lane(), 8.0) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("offset_m", [-2.0, -0.5, 0.5, 2.0])
 def test_steering_is_towards_the_lane(offset_m: float) -> None:
-    """For a lane to the left the curvature is that of the chord, 2 offset / lookahead^2, and to the left."""
+    """For a lateral offset the curvature is 2 offset / lookahead^2, towards the lane."""
     assert pursuit_curvature_per_m(lane(offset_m), 8.0) == pytest.approx(2 * offset_m / 64, rel=1e-3)
 
 
 def test_a_heading_error_is_steered_back() -> None:
-    """A car turned left of its lane sees it lead away to the right, and steers right."""
+    """A car turned to the left of its lane steers to the right."""
     assert pursuit_curvature_per_m(lane(c1=-0.1), 8.0) == pytest.approx(-2 * math.sin(math.atan(0.1)) / 8.0, rel=1e-3)
 
 
-def test_a_lane_farther_off_than_the_lookahead_is_approached_squarely() -> None:
-    """When no point of the lane is near enough, the car turns towards it as hard as the circle allows."""
+def test_a_lane_beyond_the_lookahead_is_approached_at_the_largest_curvature() -> None:
+    """A lane farther away than the lookahead is approached at the largest curvature."""
     assert pursuit_curvature_per_m(lane(9.0), 4.0) == pytest.approx(0.5, rel=1e-3)
     assert pursuit_curvature_per_m(lane(-9.0), 4.0) == pytest.approx(-0.5, rel=1e-3)
 
 
 def test_the_circle_leads_to_the_goal() -> None:
-    """Driving the curvature for the length of its arc ends at the point aimed at."""
+    """Driving the curvature for the length of its arc ends at the goal."""
     bent = lane(0.5, 0.1, 0.01)
     curvature = pursuit_curvature_per_m(bent, 8.0)
     half_angle_rad = math.asin(curvature * 8.0 / 2)
-    x_m, y_m, _ = moved(SEEN_FROM, 2 * half_angle_rad / curvature, curvature)
-    assert (x_m, y_m) == pytest.approx(goal_m(bent, 8.0), abs=1e-3)
+    x_m, y_m, _ = move_along_arc(ORIGIN, 2 * half_angle_rad / curvature, curvature)
+    assert (x_m, y_m) == pytest.approx(goal_point_m(bent, 8.0), abs=1e-3)
 
 
 def test_steering_and_curvature_are_inverse() -> None:
-    """The wheel angle for a curvature gives that curvature back; 42 m of radius need 3.9 degrees."""
+    """Steering angle and curvature are inverse; a radius of 42 m needs 3.9 degrees."""
     assert steering_rad(1 / 42, WHEELBASE_M) == pytest.approx(math.radians(3.875), rel=1e-3)
     assert curvature_per_m(steering_rad(-0.03, WHEELBASE_M), WHEELBASE_M) == pytest.approx(-0.03)
 
 
-def test_the_path_of_a_car_on_a_bend_is_the_bend() -> None:
-    """On the centre of a gentle curve the path's curvature is the lane's, as far as the lane is one."""
-    path = pursued_path(lane(c2=0.5 / 135), 6.0, limit_per_m=1.0)
+def test_the_path_on_a_curve_has_its_curvature() -> None:
+    """On the centre of a gentle curve, the path has the lane's curvature."""
+    path = pursuit_path_per_m(lane(c2=0.5 / 135), 6.0, limit_per_m=1.0)
     assert len(path) == PATH_POINTS
     assert path[:5] == pytest.approx([1 / 135] * 5, rel=0.1)
 
 
 def test_the_path_leads_back_to_the_lane() -> None:
-    """A car 1 m beside its lane and turned away drives the path it gives to within 0.3 m of the centre, along it."""
+    """The path of a car 1 m off its lane and turned away leads to within 0.3 m of the centre."""
     beside = lane(c0=-1.0, c1=-0.1)
-    place, curvature = SEEN_FROM, pursuit_curvature_per_m(beside, 6.0)
-    for following in pursued_path(beside, 6.0, limit_per_m=1.0):
-        place = moved(place, PATH_STEP_M, curvature)
+    place, curvature = ORIGIN, pursuit_curvature_per_m(beside, 6.0)
+    for following in pursuit_path_per_m(beside, 6.0, limit_per_m=1.0):
+        place = move_along_arc(place, PATH_STEP_M, curvature)
         curvature = following
     x_m, y_m, heading_rad = place
     assert y_m == pytest.approx(-1.0 - 0.1 * x_m, abs=0.3)
@@ -94,10 +94,10 @@ def test_the_path_leads_back_to_the_lane() -> None:
 
 def test_the_path_keeps_to_the_limit() -> None:
     """No curvature of the path exceeds the limit."""
-    path = pursued_path(lane(3.0), 4.0, limit_per_m=0.04)
+    path = pursuit_path_per_m(lane(3.0), 4.0, limit_per_m=0.04)
     assert max(abs(curvature) for curvature in path) == 0.04
 
 
-def test_an_arc_is_driven_round() -> None:
+def test_move_along_arc() -> None:
     """A quarter of a circle of 10 m ends 10 m ahead and 10 m to the left, turned by 90 degrees."""
-    assert moved(SEEN_FROM, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))
+    assert move_along_arc(ORIGIN, math.pi / 2 * 10, 0.1) == pytest.approx((10.0, 10.0, math.pi / 2))

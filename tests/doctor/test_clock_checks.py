@@ -5,21 +5,30 @@ from typing import Any
 
 import pytest
 
-from lavt.doctor.clock_checks import WHAT_TO_DO, ClockComparison, check_host, compare
+from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host, compare
 from lavt.domain import NS_PER_MS
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import ClockProbe, ProbeReply
 
 SERVER = "10.9.0.1"
 GOOD = ClockReport(
-    0, 0, "desk", "chrony", 0.25, 0.0005, follows=SERVER, skew_ppm=4.0, age_s=1.0, peer_delay_s=0.0002,
+    0,
+    0,
+    "desk",
+    "chrony",
+    0.25,
+    0.0005,
+    follows=SERVER,
+    skew_ppm=4.0,
+    age_s=1.0,
+    peer_delay_s=0.0002,
     peer_dispersion_s=0.00003,
-)  # fmt: skip
+)
 REPLY = ProbeReply(1, 0, 0, 0, 0.0, 0.0001)
 
 
 def probes(delta_ms: float, *round_trips_ms: float) -> list[ClockProbe]:
-    """Make exchanges whose both ways take the same time."""
+    """Return probes with symmetric paths."""
     return [
         ClockProbe(
             number,
@@ -40,72 +49,72 @@ def compared(
 
 
 def test_a_good_clock() -> None:
-    """A clock that is known to 2 ms or better is good; whom it follows, correction and bound are told."""
+    """A clock with a bound of 2 ms or better is good; the result names its reference, correction and bound."""
     finding = check_host(GOOD)
     assert finding.good
-    (said,) = finding.says
-    assert all(part in said for part in ("chrony", "10.9.0.1", "+250.000 ms", "0.500 ms"))
+    (sentence,) = finding.says
+    assert all(part in sentence for part in ("chrony", "10.9.0.1", "+250.000 ms", "0.500 ms"))
 
 
-def test_a_clock_known_too_badly() -> None:
-    """A clock that is known to 3 ms is not good enough, and a sentence says so."""
+def test_a_clock_with_a_wide_bound() -> None:
+    """A clock with a bound of 3 ms is not good enough."""
     finding = check_host(dataclasses.replace(GOOD, bound_s=0.003))
     assert not finding.good
-    assert finding.says[1].startswith("3.00 ms are too wide")
+    assert "3.00 ms" in finding.says[1]
 
 
-@pytest.mark.parametrize("status", WHAT_TO_DO)
-def test_a_clock_that_nobody_knows(status: str) -> None:
-    """Where the source cannot tell, why not and what to do about it is told."""
+@pytest.mark.parametrize("status", HINTS)
+def test_a_source_without_an_estimate(status: str) -> None:
+    """For a time source without an estimate, the result is its status and the fix."""
     finding = check_host(ClockReport(0, 0, "desk", "chrony", status=status))
-    assert (finding.good, finding.says) == (False, (f"{status}: {WHAT_TO_DO[status]}",))
+    assert (finding.good, finding.says) == (False, (f"{status}: {HINTS[status]}",))
 
 
-def test_two_opinions_that_agree() -> None:
-    """Delta by both, by the shortest round trip of all; with the path's bound as the client follows this server."""
+def test_two_estimates_that_agree() -> None:
+    """The probe's estimate is from the shortest round trip, and the source's has the bound of the path."""
     finding = compared(250.02)
     assert finding.good
     assert finding.sources is not None
     assert finding.probe is not None
     assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 0.1 + 0.03 + 0.004])
     assert [finding.probe.ms, finding.probe.bound_ms] == pytest.approx([250.02, 0.15])
-    assert "these two agree: they are 0.020 ms apart, 0.284 ms are allowed" in finding.says
+    (agreement,) = (sentence for sentence in finding.says if " agree" in sentence)
+    assert all(part in agreement for part in ("0.020 ms", "0.284 ms"))
 
 
-def test_who_follows_another_host_is_known_by_both_bounds() -> None:
-    """Where the client follows a third host the bound is the sum of the client's and the server's own."""
+def test_a_client_that_follows_another_host() -> None:
+    """If the client follows a third host, the bound is the sum of the client's and the server's bounds."""
     finding = compared(follows="10.9.0.9")
     assert finding.sources is not None
     assert finding.sources.bound_ms == pytest.approx(0.6)
 
 
 def test_a_clock_that_is_steered_meanwhile() -> None:
-    """What the host said last counts, and by how much that differs from what it said first is added to the bound."""
+    """The correction after the probing counts, and its change during the probing is added to the bound."""
     before = dataclasses.replace(GOOD, correction_s=0.251)
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert finding.sources is not None
     assert [finding.sources.ms, finding.sources.bound_ms] == pytest.approx([250.0, 1.0 + 0.1 + 0.03 + 0.004])
 
 
-def test_a_source_that_could_not_tell_before() -> None:
-    """Where the host's source could tell only after the probing, Delta is the probe's, and what to do is told."""
+def test_a_source_without_an_estimate_before_the_probing() -> None:
+    """If the time source has no estimate before the probing, Delta is the probe's, and the fix is suggested."""
     before = ClockReport(0, 0, "desk", "chrony", status="chrony is not synchronised")
     finding = compare(before, GOOD, probes(250.0, 0.3), REPLY, SERVER)
     assert (finding.good, finding.sources) == (True, None)
-    assert finding.says[1] == (
-        "this machine's source of time could not tell before the probing: run `lavt clock` again"
-    )
+    assert "`lavt clock` again" in finding.says[1]
 
 
-def test_two_opinions_that_disagree() -> None:
-    """Opinions further apart than both bounds are not good, and how far they are is told."""
+def test_two_estimates_that_disagree() -> None:
+    """Estimates that differ by more than the sum of their bounds are not good; the result contains the difference."""
     finding = compared(251.0)
     assert not finding.good
-    assert "disagree: 1.000 ms" in finding.says[-1]
+    assert "disagree" in finding.says[-1]
+    assert "1.000 ms" in finding.says[-1]
 
 
 def test_ntp_through_delay() -> None:
-    """An NTP round trip over a millisecond longer than the probe's is told as the one complaint."""
+    """An NTP round trip more than a millisecond longer than the probe's is the only complaint."""
     finding = compared(212.5, peer_delay_s=0.0752)
     assert not finding.good
     assert all(part in finding.says[-1] for part in ("NTP", "75.20 ms", "0.30"))
@@ -114,29 +123,29 @@ def test_ntp_through_delay() -> None:
 
 @pytest.mark.parametrize("lacking", ["client", "server"])
 def test_the_probe_alone(lacking: str) -> None:
-    """Where one side's source cannot tell, Delta is the probe's alone, and what that means is told."""
+    """If one side's time source has no estimate, Delta is the probe's alone, and the result says what that means."""
     unknown: dict[str, Any] = {"correction_s": None, "bound_s": None, "status": "chrony is not installed"}
     reply = REPLY if lacking == "client" else dataclasses.replace(REPLY, correction_s=None, bound_s=None)
     finding = compared(reply=reply, **(unknown if lacking == "client" else {}))
     assert finding.good
     assert finding.sources is None
-    assert any("by the probe alone: +250.000 ms ± 0.150 ms" in sentence for sentence in finding.says)
-    assert any("hidden inside it" in sentence for sentence in finding.says)
+    assert any("+250.000 ms ± 0.150 ms" in sentence for sentence in finding.says)
+    assert any("asymmetry" in sentence for sentence in finding.says)
 
 
-def test_a_probe_over_too_long_a_way() -> None:
-    """By the probe alone a round trip of 5 ms bounds Delta to 2.5 ms: not good enough."""
+def test_a_probe_over_a_long_path() -> None:
+    """From the probe alone, a round trip of 5 ms bounds Delta to 2.5 ms, which is not good enough."""
     finding = compared(round_trip_ms=5.0, correction_s=None, bound_s=None)
     assert not finding.good
-    assert finding.says[-1].startswith("2.50 ms are too wide")
+    assert "2.50 ms" in finding.says[-1]
 
 
-def test_an_exchange_during_which_a_clock_was_set_is_not_used() -> None:
-    """An answer that came before it was asked for says nothing: it is left out, and alone it is not good."""
-    spoilt = ClockProbe(9, 0, 250 * NS_PER_MS, 250 * NS_PER_MS, -999 * NS_PER_MS)
-    finding = compare(GOOD, GOOD, [*probes(250.0, 0.3), spoilt], REPLY, SERVER)
+def test_a_probe_with_a_clock_step_is_ignored() -> None:
+    """A probe with a negative round trip is ignored; without other probes the result is not good."""
+    stepped = ClockProbe(9, 0, 250 * NS_PER_MS, 250 * NS_PER_MS, -999 * NS_PER_MS)
+    finding = compare(GOOD, GOOD, [*probes(250.0, 0.3), stepped], REPLY, SERVER)
     assert finding.good
     assert finding == compare(GOOD, GOOD, probes(250.0, 0.3), REPLY, SERVER)
-    alone = compare(GOOD, GOOD, [spoilt], REPLY, SERVER)
+    alone = compare(GOOD, GOOD, [stepped], REPLY, SERVER)
     assert (alone.good, alone.probe) == (False, None)
     assert len(alone.says) == 1

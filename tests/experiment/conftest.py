@@ -1,4 +1,4 @@
-"""A made-up run whose every latency is known: two records, as the nodes would have written them."""
+"""A synthetic run with known latencies: two records with the channels and fields that the nodes write."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FRAME_NS = 33_333_333
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """What to make up. Times of the truth count from the drive's beginning."""
+    """The parameters of a synthetic drive. Times count from the start of the drive."""
 
     seconds: float = 12.0
     tau_v_ms: float = 62.0
@@ -32,7 +32,7 @@ class Drive:
     tau_c_ms: float = 9.0
     actuator_ms: float = 2.0
     offset_s: float = 0.25
-    """Delta at the beginning: server's wall clock less the client's."""
+    """Delta at the start: server's wall clock minus the client's."""
     drift: float = 20e-6
     bound_s: float | None = 0.0002
     corrected: bool = True
@@ -41,52 +41,52 @@ class Drive:
     ending: str | None = "completed"
     wobble_m: float = 0.5
     step_s: float = 0.0
-    """Step of the client's wall clock."""
+    """The step of the client's wall clock."""
     stepped_s: float = 6.0
-    """When it was: halfway, where the drive has its usual length."""
+    """The time of the step; the default is the middle of a drive of default length."""
     waited_s: int = 1
-    """For how long both sides sampled their clocks before the drive."""
+    """The time before the drive in which both sides sampled their clocks."""
     server_counts: tuple[tuple[str, int], ...] = ()
     skipped: int = 0
-    """Frames that the camera missed in the middle of the drive."""
+    """The number of frames that the camera missed during the drive."""
     undecoded: int | None = 0
-    """For so many frames from number 60 on the decoder gave no picture; None: the record says of none if it did."""
+    """The number of undecoded frames from number 60 on; None: the record has no field `decoded`."""
     server_unpolled_s: tuple[int, int] = (0, 0)
-    """From and until when, not included, the server took no sample of its clocks."""
+    """The interval (end excluded) in which the server did not sample its clocks."""
     client_unpolled_s: tuple[int, int] = (0, 0)
     capture_ms: float | None = None
-    """From a frame's exposure to its stamp; None: the camera does not tell."""
+    """The time from a frame's exposure to its stamp; None: the camera does not report it."""
     server_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
-    """Further fields of the server's clock sample of a second, or others than the usual."""
+    """Further or changed fields of the server's clock sample in a second."""
     client_clock: Callable[[int], dict[str, Any]] = lambda _second: {}
     probes: bool = True
-    """Whether the client's probe was answered, twice a second."""
+    """True if the client's probe was answered, twice per second."""
     there_ms: float = 0.3
-    """How long a probe took to the server."""
+    """The delay of a probe from the client to the server."""
     back_ms: float = 0.3
     late: int = 0
-    """So often the physics was late."""
+    """The number of events `late` of the physics."""
     began_s: float = 0.0
-    """When it was driven: so much later than others."""
+    """The start of the drive on the true time scale."""
 
     def server(self, at_ns: int) -> Now:
-        """Read the server's clocks; its wall clock is the reference."""
+        """Return the server's clocks at a time of the drive; its wall clock is the reference."""
         return Now(SERVER_MONO_NS + at_ns, WALL_NS + round(self.began_s * NS_PER_S) + at_ns)
 
     def client(self, at_ns: int) -> Now:
-        """Read the client's clocks: behind by the offset, and losing `drift` a second."""
+        """Return the client's clocks at a time of the drive: behind by the offset, and losing `drift` per second."""
         ticked = at_ns - round(at_ns * self.drift)
         step_ns = round(self.step_s * NS_PER_S) if at_ns > self.stepped_s * NS_PER_S else 0
         wall_ns = WALL_NS + round((self.began_s - self.offset_s) * NS_PER_S)
         return Now(CLIENT_MONO_NS + ticked, wall_ns + ticked + step_ns)
 
     def client_correction_s(self, at_ns: int) -> float:
-        """Tell what a perfect time service on the client would; of a step during the drive it does not know."""
+        """Return the correction of a perfect time source on the client, which does not notice a step in the drive."""
         step_s = self.step_s if at_ns > self.stepped_s * NS_PER_S and self.stepped_s < 0 else 0.0
         return self.offset_s - step_s + self.drift * at_ns / NS_PER_S if self.corrected else 0.0
 
     def tau_v_of_frame_ns(self, number: int) -> int:
-        """Give the video latency of a frame: five values in turn, even about the median."""
+        """Return the video latency of a frame: five values in turn, evenly spread about the median."""
         return round((self.tau_v_ms + self.spread_ms * (number % 5 - 2) / 2) * NS_PER_MS)
 
 
@@ -110,8 +110,8 @@ def write_server(drive: Drive, path: Path) -> None:
             continue
         now = drive.server(second * NS_PER_S)
         clock = {"host": drive.server_host, "source": "chrony", "correction_s": 0.0, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.server_clock(second)}
-        writer.write("clock", given, now)
+        sample = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.server_clock(second)}
+        writer.write("clock", sample, now)
     writer.write("event", {"mono_ns": drive.server(0).mono_ns, "kind": "drive_began", "detail": ""}, drive.server(0))
     writer.write(
         "event", {"mono_ns": drive.server(5).mono_ns, "kind": "lane_invasion", "detail": "left"}, drive.server(5)
@@ -175,7 +175,7 @@ def write_admission(writer: RecordWriter, drive: Drive, sequence: int, number: i
     sent_ns = read_ns + round(drive.client_ms * NS_PER_MS) + later_ns
     received_ns = sent_ns + round(drive.tau_c_ms * NS_PER_MS)
     applied_ns = received_ns + round(drive.actuator_ms * NS_PER_MS)
-    rejected = sequence % 100 == 98  # an even one: a repetition, so that no loop changes
+    rejected = sequence % 100 == 98  # an even one is a repetition, so that no loop latency changes
     admission: dict[str, Any] = {
         "epoch": 1,
         "sequence": sequence,
@@ -204,8 +204,8 @@ def write_client(drive: Drive, path: Path) -> None:
         now = drive.client(at_ns)
         correction_s = drive.client_correction_s(at_ns)
         clock = {"host": drive.client_host, "source": "chrony", "correction_s": correction_s, "bound_s": drive.bound_s}
-        given = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
-        writer.write("clock", given, now)
+        sample = {"mono_ns": now.mono_ns, "wall_ns": now.wall_ns, **clock, **drive.client_clock(second)}
+        writer.write("clock", sample, now)
     for index in range(-2 * drive.waited_s, round(drive.seconds * 2) + 3 if drive.probes else -2 * drive.waited_s):
         write_probe(writer, drive, index)
     for number in range(-3, round(drive.seconds * NS_PER_S) // FRAME_NS + 1):
@@ -250,7 +250,7 @@ def write_probe(writer: RecordWriter, drive: Drive, index: int) -> None:
 
 @pytest.fixture(scope="session")
 def make_run() -> Callable[..., Path]:
-    """Give a function that writes both records of a made-up drive into a directory; keywords are those of `Drive`."""
+    """Return a function that writes both records of a synthetic drive into a directory; keywords are `Drive`'s."""
 
     def make(directory: Path, **settings: Any) -> Path:
         directory.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
-"""A whole drive with the secure configs, and somebody at the operator's router who hears, repeats, alters and floods.
+"""A drive with the secure configs, and an attacker at the operator's router that records, replays, alters and floods.
 
-He has what the rights of the router's socket should keep from him: a session at the router of the operator. So all that
-holds him back is what is signed.
+The attacker has a session at the operator's router, which the permissions of the router's socket should prevent. So
+only the signatures protect the drive.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.field.secured import BASE, QUIC, dialled, direct, open_session, start_router, tls_changes
+from tests.field.secured import BASE, QUIC, direct, open_session, quic_endpoint, start_router, tls_changes
 
 from lavt.clock import MachineClock, pause
 from lavt.config_file import shipped
@@ -23,14 +23,14 @@ from lavt.transport.zenoh_link import CONTROL
 
 PHASE_NS = 5 * NS_PER_S
 FLOOD_PER_S = 10_000
-LONGEST_S = 90.0
+START_LIMIT_S = 90.0
 BURST = 50
 SIGNATURE_BYTES = 64
 
 
 @dataclass
 class Drive:
-    """What was recorded, and when which attack began and ended (monotonic clock of the machine)."""
+    """The records of a drive, and the begin and end of each attack (the machine's monotonic clock)."""
 
     phases: dict[str, tuple[int, int]]
     sent: dict[str, int]
@@ -41,13 +41,13 @@ class Drive:
 
 
 class Insider:
-    """Somebody with a session at the operator's router."""
+    """An attacker with a session at the operator's router."""
 
     def __init__(self, endpoint: str) -> None:
         self.session = open_session(endpoint)
         self.commands: list[bytes] = []
         self.states: list[bytes] = []
-        self.questions: list[bytes] = []
+        self.queries: list[bytes] = []
         self.sent: dict[str, int] = {}
         self._chance = stream(1, "insider")
         self.session.declare_subscriber(
@@ -60,34 +60,34 @@ class Insider:
 
     def _forge(self, query: Any) -> None:
         with query:
-            self.questions.append(b"" if query.payload is None else query.payload.to_bytes())
-            query.reply(f"{BASE}/session", self.questions[-1])
+            self.queries.append(b"" if query.payload is None else query.payload.to_bytes())
+            query.reply(f"{BASE}/session", self.queries[-1])
 
-    def repeat(self) -> None:
-        """Send what was heard once more: commands of the last second, and what the operator has asked."""
+    def replay(self) -> None:
+        """Replay the commands of the last second, states, and the operator's queries."""
         for data in self.commands[-50:]:
-            self._put("repeated", data)
+            self._put("replayed", data)
         for data in self.states[-10:]:
             self._state.put(data)
-        for data in self.questions[-3:]:
+        for data in self.queries[-3:]:
             self.session.get(f"{BASE}/session", direct(lambda _reply: None), payload=data, timeout=1.0)
 
     def alter(self) -> None:
-        """Send newest command and state with one byte changed, and the command under a signature of random bytes."""
-        for heard, put in ((self.commands, self._control.put), (self.states, self._state.put)):
-            data = bytearray(heard[-1])
+        """Send the newest command and state with one bit flipped, and the command with a random signature."""
+        for recorded, put in ((self.commands, self._control.put), (self.states, self._state.put)):
+            data = bytearray(recorded[-1])
             data[int(self._chance.integers(len(data)))] ^= 1 << int(self._chance.integers(8))
             put(bytes(data))
         self._put("altered", self.commands[-1][:-SIGNATURE_BYTES] + self._chance.bytes(SIGNATURE_BYTES))
 
-    def everywhere(self) -> None:
-        """Publish to `**` what might be taken for anything."""
+    def publish_to_wildcards(self) -> None:
+        """Publish commands, states and random bytes to `**` and `lavt/**`."""
         for data in (self.commands[-1], self.states[-1], self._chance.bytes(200)):
             self.session.put("**", data)
             self.session.put("lavt/**", data)
 
     def flood(self) -> None:
-        """Send a burst of what looks most like a true command: the newest, with random bytes for code and signature."""
+        """Send a burst of copies of the newest command with a random MAC and signature."""
         newest = self.commands[-1][:-80]
         for _ in range(BURST):
             self._put("flood", newest + self._chance.bytes(80))
@@ -97,27 +97,27 @@ class Insider:
         self._control.put(data)
 
     def close(self) -> None:
-        """Leave."""
+        """Close the session."""
         self.session.close()
 
 
 def drive(work: Path, keys: Path) -> Drive:
-    """Drive, quietly at first, then under one attack after the other."""
+    """Drive without an attack at first, then under one attack after the other."""
     clock = MachineClock()
     with Processes(work) as processes:
         insider, server, client = start_secure_loop(processes, work, keys)
-        wait(clock, lambda: server.latest.get("status", {}).get("safety") == "driving", LONGEST_S)
-        wait(clock, lambda: len(insider.commands) > 50 and len(insider.states) > 50, LONGEST_S)
+        wait_until(clock, lambda: server.latest.get("status", {}).get("safety") == "driving", START_LIMIT_S)
+        wait_until(clock, lambda: len(insider.commands) > 50 and len(insider.states) > 50, START_LIMIT_S)
         attacks: dict[str, tuple[Callable[[], None], int]] = {
             "quiet": (lambda: None, 20 * NS_PER_MS),
-            "repeated": (insider.repeat, 100 * NS_PER_MS),
+            "replayed": (insider.replay, 100 * NS_PER_MS),
             "altered": (insider.alter, 10 * NS_PER_MS),
-            "everywhere": (insider.everywhere, 20 * NS_PER_MS),
+            "wildcards": (insider.publish_to_wildcards, 20 * NS_PER_MS),
             "flood": (insider.flood, NS_PER_S * BURST // FLOOD_PER_S),
         }
         phases = {}
         for name, (attack, period_ns) in attacks.items():
-            phases[name] = attacked(clock, attack, period_ns)
+            phases[name] = run_attack(clock, attack, period_ns)
             pause(NS_PER_S)
         status = server.latest["status"]
         insider.close()
@@ -125,13 +125,17 @@ def drive(work: Path, keys: Path) -> Drive:
         server.end()
         shown = [bytes(data) for data in insider.states]
     return Drive(
-        phases, insider.sent, shown, read_record(work / "server" / "server.mcap"),
-        read_record(work / "client" / "client.mcap"), status,
-    )  # fmt: skip
+        phases,
+        insider.sent,
+        shown,
+        read_record(work / "server" / "server.mcap"),
+        read_record(work / "client" / "client.mcap"),
+        status,
+    )
 
 
-def attacked(clock: MachineClock, attack: Callable[[], None], period_ns: int) -> tuple[int, int]:
-    """Attack once in every period, catching up after a pause of the machine."""
+def run_attack(clock: MachineClock, attack: Callable[[], None], period_ns: int) -> tuple[int, int]:
+    """Attack once per period for 5 s, catching up after a stall of the machine; return begin and end."""
     began_ns = clock.now().mono_ns
     number = 0
     while (now_ns := clock.now().mono_ns) < began_ns + PHASE_NS:
@@ -143,47 +147,72 @@ def attacked(clock: MachineClock, attack: Callable[[], None], period_ns: int) ->
 
 
 def start_secure_loop(processes: Processes, work: Path, keys: Path) -> tuple[Insider, Process, Process]:
-    """Start both routers, `lavt server` and `lavt client` with the secure configs; the insider is there before."""
+    """Start both routers, the insider, and then `lavt server` and `lavt client` with the secure configs."""
     sockets = {name: f"unixsock-stream/{work}/{name}.sock" for name in ("vehicle", "operator")}
     vehicle = start_router(
-        processes, "vehicle", "router-server-tls.json5",
-        f'listen.endpoints=["{sockets["vehicle"]}", "{QUIC}"]', *tls_changes(keys, "vehicle-1", "listen"),
-    )  # fmt: skip
+        processes,
+        "vehicle",
+        "router-server-tls.json5",
+        f'listen.endpoints=["{sockets["vehicle"]}", "{QUIC}"]',
+        *tls_changes(keys, "vehicle-1", "listen"),
+    )
     start_router(
-        processes, "operator", "router-client-tls.json5", f'listen.endpoints=["{sockets["operator"]}"]',
-        f'connect.endpoints=["{dialled(vehicle)}"]', *tls_changes(keys, "operator-1", "connect"),
-    ).ready()  # fmt: skip
+        processes,
+        "operator",
+        "router-client-tls.json5",
+        f'listen.endpoints=["{sockets["operator"]}"]',
+        f'connect.endpoints=["{quic_endpoint(vehicle)}"]',
+        *tls_changes(keys, "operator-1", "connect"),
+    ).ready()
     insider = Insider(sockets["operator"])
     server = processes.start(
-        "server", "server", str(shipped("configs/server-secure.yaml")), "--out", str(work / "server"),
+        "server",
+        "server",
+        str(shipped("configs/server-secure.yaml")),
+        "--out",
+        str(work / "server"),
         *sets(
-            f"zenoh.router={sockets['vehicle']}", f"security.key={keys}/vehicle-1.sign.key",
-            f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}", "video.bind=127.0.0.1", "video.port=0",
-            "clock.probe_port=0", "clock.source=probe", "vehicle.scenery=none", "vehicle.route=a",
+            f"zenoh.router={sockets['vehicle']}",
+            f"security.key={keys}/vehicle-1.sign.key",
+            f"security.operators={{operator-1: {keys}/operator-1.sign.pub}}",
+            "video.bind=127.0.0.1",
+            "video.port=0",
+            "clock.probe_port=0",
+            "clock.source=probe",
+            "vehicle.scenery=none",
+            "vehicle.route=a",
         ),
-    )  # fmt: skip
+    )
     ports = server.ready()["ready"]
     client = processes.start(
-        "client", "client", str(shipped("configs/client-secure.yaml")), "--out", str(work / "client"),
+        "client",
+        "client",
+        str(shipped("configs/client-secure.yaml")),
+        "--out",
+        str(work / "client"),
         *sets(
-            f"zenoh.router={sockets['operator']}", f"security.key={keys}/operator-1.sign.key",
-            f"security.vehicle={keys}/vehicle-1.sign.pub", "video.server=127.0.0.1",
-            f"video.port={ports['video_port']}", f"clock.probe_port={ports['probe_port']}",
-            "clock.source=probe", "controller.rearm=true",
+            f"zenoh.router={sockets['operator']}",
+            f"security.key={keys}/operator-1.sign.key",
+            f"security.vehicle={keys}/vehicle-1.sign.pub",
+            "video.server=127.0.0.1",
+            f"video.port={ports['video_port']}",
+            f"clock.probe_port={ports['probe_port']}",
+            "clock.source=probe",
+            "controller.rearm=true",
         ),
-    )  # fmt: skip
+    )
     client.ready()
     return insider, server, client
 
 
 def sets(*changes: str) -> list[str]:
-    """Give the arguments for changes of a config."""
+    """Return the command-line arguments for changes of a config."""
     return [word for change in changes for word in ("--set", change)]
 
 
-def wait(clock: MachineClock, holds: Callable[[], bool], limit_s: float) -> None:
-    """Wait until something holds."""
+def wait_until(clock: MachineClock, condition: Callable[[], bool], limit_s: float) -> None:
+    """Wait until a condition is true."""
     limit_ns = clock.now().mono_ns + round(limit_s * NS_PER_S)
-    while not holds():
-        assert clock.now().mono_ns < limit_ns, f"it did not hold within {limit_s:g} s"
+    while not condition():
+        assert clock.now().mono_ns < limit_ns, f"not within {limit_s:g} s"
         pause(50 * NS_PER_MS)

@@ -1,18 +1,18 @@
-"""What the tests in networks of their own share."""
+"""Fixtures of the field tests, which run in network namespaces."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import pytest
-from tests.field.namespaces import kernel_rejects, programs_missing
+from tests.field.namespaces import kernel_lacks_namespaces, programs_missing
 from tests.require import need
 
 
 @pytest.fixture(scope="session")
 def namespaces() -> None:
-    """Have network namespaces, or skip."""
-    if kernel_rejects():
+    """Skip unless network namespaces can be made."""
+    if kernel_lacks_namespaces():
         need("namespaces", "needs root and a kernel that lets it make network namespaces with NAT")
     if programs_missing():
         need("namespaces", "needs ip and nft: apt-get install iproute2 nftables")
@@ -20,7 +20,7 @@ def namespaces() -> None:
 
 @pytest.fixture(scope="session")
 def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Print what was measured, whatever becomes of the test."""
+    """Print a measurement, even if the test fails or its output is captured."""
     plugins = request.config.pluginmanager
     reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
     assert reporter is not None

@@ -1,11 +1,10 @@
-"""What an outage did, from the server's records and from what a process outside has heard.
+"""Measure the effects of outages from the server's records and from the observer's (`outside.py`).
 
-Stale is a command that comes to a vehicle which, since it was sent, has stopped for safety (or its server has been
-started anew); or one whose picture was sent before that; or one that was sent more than 500 ms ago. Send times and
-stamps are read by the process outside, which also knows when the command came to the vehicle's machine: all clocks are
-those of one kernel. When the vehicle stopped and which commands it obeyed is what the server's records say. A router
-that has no time drops a command for one of its listeners: the few that were obeyed and not heard outside are judged by
-what the server wrote down of them.
+A command is stale if the vehicle has begun a safe stop, or its server was restarted, since the command or its picture
+was sent; or if it was sent more than 500 ms before it arrived. The observer reads send times and stamps, and knows when
+a command arrived at the vehicle's machine; all clocks are those of one kernel. The server's records say when the
+vehicle stopped and which commands it accepted. A busy router may drop a command for one of its subscribers, so the few
+accepted commands that the observer missed are judged by the server's record of them.
 """
 
 from __future__ import annotations
@@ -21,15 +20,13 @@ from lavt.domain import NS_PER_MS, NS_PER_S, FloatArray, Now
 from lavt.recording.record import Record
 from lavt.recording.table import IntArray
 
-LONG_AGO_NS = 500 * NS_PER_MS
+MAX_AGE_NS = 500 * NS_PER_MS
 STANDSTILL_MPS = 0.05
-FOR_EVER_NS = 2**63 - 1
-HEAD = (
-    "outage", "to degraded", "to safe stop", "to standstill", "to driving again", "commands heard", "stale", "accepted",
-    "stale",
-)  # fmt: skip
-Name = tuple[int, int]
-"""Of a command: epoch and sequence."""
+FOREVER_NS = 2**63 - 1
+TIME_HEADS = ("to degraded", "to safe stop", "to standstill", "to driving again")
+HEAD = ("outage", *TIME_HEADS, "commands observed", "stale", "accepted", "stale")
+CommandId = tuple[int, int]
+"""Epoch and sequence of a command."""
 
 
 @dataclass(frozen=True)
@@ -42,26 +39,26 @@ class Transition:
 
 
 @dataclass(frozen=True)
-class Came:
-    """A command as it came: to the process outside, or to the server."""
+class ReceivedCommand:
+    """A command as the observer or the server received it."""
 
-    name: Name
+    command_id: CommandId
     sent_wall_ns: int
     stamp_ns: int
     at: Now
 
 
 @dataclass(frozen=True)
-class Accepted:
-    """A command that the server obeyed, and whether its picture was newer than those before."""
+class AcceptedCommand:
+    """A command that the server accepted, and whether its picture was newer than those before."""
 
-    command: Came
+    command: ReceivedCommand
     fresh: bool
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What one outage did; seconds on the monotonic clock, None where it did not come to that."""
+class OutageEffects:
+    """The effects of one outage: times in seconds on the monotonic clock, None for what did not happen."""
 
     outage: Outage
     to_degraded_s: float | None
@@ -69,28 +66,29 @@ class Measured:
     to_standstill_s: float | None
     to_driving_s: float | None
     """From the end of the outage."""
-    silence_s: tuple[float, ...]
-    """From the last fresh command to degraded and, where it came, to the safe stop."""
+    command_gap_at_degraded_s: float | None
+    """Time since the last fresh command."""
+    command_gap_at_safe_stop_s: float | None
     stopping_s: float | None
     """From the safe stop to standstill."""
     stopped_from_mps: float | None
-    heard: int
-    """Commands that the process outside heard from the outage's begin to that of the next."""
-    stale_heard: int
+    observed: int
+    """Commands that the observer received from the begin of the outage to that of the next."""
+    stale_observed: int
     accepted: int
     stale_accepted: int
-    accepted_unheard: int
+    accepted_unobserved: int
 
 
-def measure(drive: Drive) -> list[Measured]:
-    """Measure all outages of a drive that has ended."""
-    seen = _Seen(drive)
-    begins = [outage.begin.mono_ns for outage in drive.outages] + [FOR_EVER_NS]
-    return [seen.measured(outage, until) for outage, until in zip(drive.outages, begins[1:], strict=True)]
+def measure(drive: Drive) -> list[OutageEffects]:
+    """Measure the effects of all outages of a drive that has ended."""
+    evidence = _Evidence(drive)
+    begins = [outage.begin.mono_ns for outage in drive.outages] + [FOREVER_NS]
+    return [evidence.measure(outage, until) for outage, until in zip(drive.outages, begins[1:], strict=True)]
 
 
-class _Seen:
-    """Everything that was recorded and heard, over all restarts."""
+class _Evidence:
+    """The records of the server and the observer, over all restarts."""
 
     def __init__(self, drive: Drive) -> None:
         records = drive.records("server")
@@ -99,54 +97,55 @@ class _Seen:
         truths = [record.table("truth") for record in records]
         self.truth_ns: IntArray = np.concatenate([truth.ints("mono_ns") for truth in truths])
         self.speed_mps: FloatArray = np.concatenate([truth.floats("speed_mps") for truth in truths])
-        self.heard = {each.name: each for each in map(_heard, drive.heard_outside())}
+        self.observed = {each.command_id: each for each in map(_observed, drive.observed_commands())}
         stops = [each.at for each in self.transitions if each.after == "safe_stop"]
         restarts = [_begin(record) for record in records[1:]]
         self.stops = sorted([*stops, *restarts], key=lambda stop: stop.mono_ns)
 
-    def measured(self, outage: Outage, until_ns: int) -> Measured:
+    def measure(self, outage: Outage, until_ns: int) -> OutageEffects:
         begin_ns = outage.begin.mono_ns
-        here = [each for each in self.transitions if begin_ns < each.at.mono_ns < until_ns]
-        degraded = next((each for each in here if each.after == "degraded"), None)
-        stop = next((each for each in here if each.after == "safe_stop"), None)
-        left = next((each for each in here if each.before == "driving"), None)
-        again = next((each for each in here if each.after == "driving"), None)
+        changes = [each for each in self.transitions if begin_ns < each.at.mono_ns < until_ns]
+        degraded = next((each for each in changes if each.after == "degraded"), None)
+        stop = next((each for each in changes if each.after == "safe_stop"), None)
+        left_driving = next((each for each in changes if each.before == "driving"), None)
+        driving = next((each for each in changes if each.after == "driving"), None)
         stationary_since_ns = None if stop is None else self._stationary_since_ns(stop.at.mono_ns)
-        heard = [each for each in self.heard.values() if begin_ns < each.at.mono_ns < until_ns]
+        observed = [each for each in self.observed.values() if begin_ns < each.at.mono_ns < until_ns]
         accepted = [each.command for each in self.accepted if begin_ns < each.command.at.mono_ns < until_ns]
-        return Measured(
+        return OutageEffects(
             outage,
             _since(begin_ns, degraded),
             _since(begin_ns, stop),
             None if stationary_since_ns is None else (stationary_since_ns - begin_ns) / NS_PER_S,
-            _since(outage.end.mono_ns, again),
-            tuple(self._silence_s(each) for each in (left, stop) if each is not None),
+            _since(outage.end.mono_ns, driving),
+            None if left_driving is None else self._since_fresh_command_s(left_driving),
+            None if stop is None else self._since_fresh_command_s(stop),
             None if stop is None or stationary_since_ns is None else (stationary_since_ns - stop.at.mono_ns) / NS_PER_S,
             None if stop is None else float(self.speed_mps[np.searchsorted(self.truth_ns, stop.at.mono_ns)]),
-            len(heard),
-            sum(self._stale(each, each.at.mono_ns) for each in heard),
+            len(observed),
+            sum(self._is_stale(each, each.at.mono_ns) for each in observed),
             len(accepted),
-            sum(self._stale(self.heard.get(each.name, each), each.at.mono_ns) for each in accepted),
-            sum(each.name not in self.heard for each in accepted),
+            sum(self._is_stale(self.observed.get(each.command_id, each), each.at.mono_ns) for each in accepted),
+            sum(each.command_id not in self.observed for each in accepted),
         )
 
-    def _stale(self, command: Came, came_ns: int) -> bool:
-        """Tell whether a command is stale where it came at `came_ns`."""
-        stopped_ns = next((stop.wall_ns for stop in reversed(self.stops) if stop.mono_ns < came_ns), 0)
-        of_before = min(command.sent_wall_ns, command.stamp_ns) <= stopped_ns
-        return of_before or command.at.wall_ns - command.sent_wall_ns > LONG_AGO_NS
+    def _is_stale(self, command: ReceivedCommand, received_ns: int) -> bool:
+        """Return whether a command that was received at `received_ns` is stale."""
+        stopped_ns = next((stop.wall_ns for stop in reversed(self.stops) if stop.mono_ns < received_ns), 0)
+        is_from_before_stop = min(command.sent_wall_ns, command.stamp_ns) <= stopped_ns
+        return is_from_before_stop or command.at.wall_ns - command.sent_wall_ns > MAX_AGE_NS
 
-    def _silence_s(self, transition: Transition) -> float:
+    def _since_fresh_command_s(self, transition: Transition) -> float:
         fresh_ns = [each.command.at.mono_ns for each in self.accepted if each.fresh]
         return (transition.at.mono_ns - max(at_ns for at_ns in fresh_ns if at_ns < transition.at.mono_ns)) / NS_PER_S
 
     def _stationary_since_ns(self, after_ns: int) -> int | None:
-        stands = self.truth_ns[(self.truth_ns > after_ns) & (self.speed_mps < STANDSTILL_MPS)]
-        return int(stands[0]) if len(stands) else None
+        stationary_ns = self.truth_ns[(self.truth_ns > after_ns) & (self.speed_mps < STANDSTILL_MPS)]
+        return int(stationary_ns[0]) if len(stationary_ns) else None
 
 
 def transitions(record: Record) -> Iterator[Transition]:
-    """Give the changes of the safety state in a server's record."""
+    """Yield the transitions of the safety state in a server's record."""
     events = record.table("event")
     rows = zip(events.texts("kind"), events.texts("detail"), events.ints("mono_ns"), events.wall_ns, strict=True)
     for kind, detail, mono_ns, wall_ns in rows:
@@ -155,7 +154,7 @@ def transitions(record: Record) -> Iterator[Transition]:
             yield Transition(Now(int(mono_ns), int(wall_ns)), before, after)
 
 
-def _accepted(record: Record) -> Iterator[Accepted]:
+def _accepted(record: Record) -> Iterator[AcceptedCommand]:
     admissions = record.table("admission")
     commands = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     stamps_ns = commands.ints("stamp_ns")
@@ -163,13 +162,14 @@ def _accepted(record: Record) -> Iterator[Accepted]:
     columns = (commands.ints(f"{name}_ns") for name in ("sent_wall", "stamp", "received_mono", "received_wall"))
     rows = zip(commands.objects("epoch"), commands.ints("sequence"), *columns, fresh, strict=True)
     for epoch, sequence, sent_wall_ns, stamp_ns, mono_ns, wall_ns, newer in rows:
-        command = Came((epoch, int(sequence)), int(sent_wall_ns), int(stamp_ns), Now(int(mono_ns), int(wall_ns)))
-        yield Accepted(command, bool(newer))
+        at = Now(int(mono_ns), int(wall_ns))
+        command = ReceivedCommand((epoch, int(sequence)), int(sent_wall_ns), int(stamp_ns), at)
+        yield AcceptedCommand(command, bool(newer))
 
 
-def _heard(line: Mapping[str, Any]) -> Came:
+def _observed(line: Mapping[str, Any]) -> ReceivedCommand:
     at = Now(line["mono_ns"], line["wall_ns"])
-    return Came((line["epoch"], line["sequence"]), line["sent_wall_ns"], line["stamp_ns"], at)
+    return ReceivedCommand((line["epoch"], line["sequence"]), line["sent_wall_ns"], line["stamp_ns"], at)
 
 
 def _begin(record: Record) -> Now:
@@ -181,12 +181,12 @@ def _since(begin_ns: int, transition: Transition | None) -> float | None:
     return None if transition is None else (transition.at.mono_ns - begin_ns) / NS_PER_S
 
 
-def table(rows: Sequence[Measured]) -> str:
-    """Write what was measured as a table in Markdown; times in seconds."""
+def table(rows: Sequence[OutageEffects]) -> str:
+    """Return the effects of outages as a Markdown table; times in seconds."""
     lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for row in rows:
         times = (row.to_degraded_s, row.to_safe_stop_s, row.to_standstill_s, row.to_driving_s)
-        counts = (row.heard, row.stale_heard, row.accepted, row.stale_accepted)
+        counts = (row.observed, row.stale_observed, row.accepted, row.stale_accepted)
         cells = [row.outage.name, *("–" if time is None else f"{time:.2f}" for time in times), *map(str, counts)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

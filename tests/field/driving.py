@@ -1,4 +1,4 @@
-"""A loop whose ends are in networks of their own, driven and broken on purpose, and what its records say of it."""
+"""Run a loop whose ends are in network namespaces of their own, and break it on purpose."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ CLIENT = ("configs/client.yaml", f"video.server={VEHICLE}", "controller.rearm=tr
 BOTH = ("record.video=false",)
 OUTSIDE = Path(__file__).with_name("outside.py")
 POLL_NS = 20 * NS_PER_MS
-AGAIN_S = 90.0
-"""Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
+DRIVING_WITHIN_S = 90.0
+"""Routers find each other, the client gets control, arms and speeds up: about 8 s on a quiet machine."""
 
 
-def wait_until(what: str, holds: Callable[[], bool], limit_s: float = AGAIN_S) -> None:
+def wait_until(expectation: str, condition: Callable[[], bool], limit_s: float = DRIVING_WITHIN_S) -> None:
     clock = MachineClock()
     limit_ns = clock.now().mono_ns + round(limit_s * NS_PER_S)
-    while not holds():
-        assert clock.now().mono_ns < limit_ns, f"waited {limit_s:g} s in vain until {what}"
+    while not condition():
+        assert clock.now().mono_ns < limit_ns, f"not within {limit_s:g} s: {expectation}"
         pause(POLL_NS)
 
 
@@ -40,21 +40,22 @@ def _mixed(host: str) -> str:
 
 @dataclass(frozen=True)
 class Links:
-    """How the routers talk: the config of each, and what of it is changed."""
+    """The configs of the routers, the rendezvous and both sides, each with its changes."""
 
     vehicle: tuple[str, ...] = ("router-server.json5",)
     operator: tuple[str, ...] = ("router-client.json5", f'connect.endpoints=["{_mixed(VEHICLE)}"]')
     cloud: tuple[str, ...] = ()
-    """Empty: there is no router in the cloud, and the operator's dials the vehicle's."""
+    """Empty without a router in the cloud: the operator's router then dials the vehicle's."""
     rendezvous: tuple[str, ...] = ()
-    """Config and changes of what forwards video and probe in the cloud; empty: the client reaches the vehicle."""
+    """Empty without a rendezvous: the client then reaches the vehicle directly."""
     server: tuple[str, ...] = ()
-    """Changes of the sides' configs."""
+    """Only changes of the config."""
     client: tuple[str, ...] = ()
+    """Only changes of the config."""
 
 
 MIXED = Links()
-"""As shipped: a reliable stream and best-effort datagrams over UDP, a lease of 2 s."""
+"""The shipped configs: a reliable stream and best-effort datagrams over UDP, and a lease of 2 s."""
 TCP = Links(
     (
         "router-server.json5",
@@ -63,7 +64,7 @@ TCP = Links(
     ),
     ("router-client.json5", f'connect.endpoints=["tcp/{VEHICLE}:7448"]', "transport.link.tx.lease=10000"),
 )
-"""Zenoh's own: TCP and a lease of 10 s. The kernel keeps what is sent in an outage, and delivers it afterwards."""
+"""Zenoh's defaults: TCP and a lease of 10 s. The kernel buffers messages in an outage and delivers them afterwards."""
 CLOUD = Links(
     (
         "router-client.json5",
@@ -73,11 +74,11 @@ CLOUD = Links(
     ("router-client.json5", f'connect.endpoints=["{_mixed(INTERNET)}"]'),
     ("router-server.json5", f'listen.endpoints=["{_mixed("0.0.0.0")}"]'),
 )
-"""Both ends dial a router in the cloud."""
+"""Both sides' routers dial a router in the cloud."""
 
 
 def through_rendezvous(keys: Path) -> Links:
-    """Let both ends dial the cloud for everything: messages signed, video encrypted with what `lavt keys` has made."""
+    """Return links with everything through the cloud, signed and encrypted with keys of `lavt keys`."""
     return replace(
         CLOUD,
         rendezvous=("rendezvous.yaml", f"bind={INTERNET}", f"vehicle_key={keys}/vehicle-1.sign.pub"),
@@ -96,7 +97,7 @@ def through_rendezvous(keys: Path) -> Links:
 
 @dataclass(frozen=True)
 class Outage:
-    """What was broken when; its effects last until `over`, when the next begins."""
+    """An outage with its begin and end; its effects are measured until the next outage begins."""
 
     name: str
     begin: Now
@@ -105,7 +106,7 @@ class Outage:
 
 @dataclass
 class Drive:
-    """The processes of a loop, which are started again where one was killed; the test reads the clocks they read."""
+    """The processes of a loop, and the outages caused in it; the test reads the same clocks as the processes."""
 
     networks: Field
     processes: Processes
@@ -118,83 +119,83 @@ class Drive:
     clock: MachineClock = field(default_factory=MachineClock)
 
     def start(self) -> None:
-        """Start everything in order."""
+        """Start all processes in order."""
         if self.links.cloud:
-            self.start_again("cloud-router")
+            self.start_process("cloud-router")
         if self.links.rendezvous:
-            self.start_again("rendezvous")
-        self.start_again("vehicle-router")
-        self.start_again("outside")
-        self.start_again("server")
-        self.start_again("operator-router")
-        self.start_again("client")
+            self.start_process("rendezvous")
+        self.start_process("vehicle-router")
+        self.start_process("outside")
+        self.start_process("server")
+        self.start_process("operator-router")
+        self.start_process("client")
 
-    def start_again(self, what: str) -> Process:
-        """Start a part, for the first time or after its end, and wait until it is ready."""
-        self.started[what] = self.started.get(what, 0) + 1
-        name = f"{what}-{self.started[what]}"
+    def start_process(self, role: str) -> Process:
+        """Start or restart the process with a role, and wait until it is ready."""
+        self.started[role] = self.started.get(role, 0) + 1
+        name = f"{role}-{self.started[role]}"
         out = str(self.work / name)
         links = self.links
         table: dict[str, tuple[str, list[str], tuple[str, ...]]] = {
-            "vehicle-router": ("vehicle", _carrier("router", *links.vehicle), LAVT),
-            "operator-router": ("operator", _carrier("router", *links.operator), LAVT),
-            "cloud-router": ("internet", _carrier("router", *links.cloud), LAVT),
-            "rendezvous": ("internet", _carrier("rendezvous", *links.rendezvous), LAVT),
-            "server": ("vehicle", _side("server", (*SERVER, *links.server), out), self.server_program),
-            "client": ("operator", _side("client", (*CLIENT, *links.client), out), LAVT),
+            "vehicle-router": ("vehicle", _network_arguments("router", *links.vehicle), LAVT),
+            "operator-router": ("operator", _network_arguments("router", *links.operator), LAVT),
+            "cloud-router": ("internet", _network_arguments("router", *links.cloud), LAVT),
+            "rendezvous": ("internet", _network_arguments("rendezvous", *links.rendezvous), LAVT),
+            "server": ("vehicle", _side_arguments("server", (*SERVER, *links.server), out), self.server_program),
+            "client": ("operator", _side_arguments("client", (*CLIENT, *links.client), out), LAVT),
             "outside": ("vehicle", [out], (str(OUTSIDE),)),
         }
-        part, arguments, program = table[what]
+        part, arguments, program = table[role]
         process = self.networks.inside(part, lambda: self.processes.start(name, *arguments, program=program))
         process.ready()
-        self.running[what] = process
+        self.running[role] = process
         return process
 
     def reach(self, speed_mps: float) -> None:
-        """Wait until the vehicle is driven, and this fast."""
+        """Wait until the vehicle is driven and has reached a speed."""
 
         def reached() -> bool:
-            told = self.running["server"].latest.get("status", {})
+            status = self.running["server"].latest.get("status", {})
             phase = self.running["client"].latest.get("status", {}).get("phase")
-            return (told.get("safety"), phase) == ("driving", "driving") and bool(told["speed_mps"] >= speed_mps)
+            return (status.get("safety"), phase) == ("driving", "driving") and bool(status["speed_mps"] >= speed_mps)
 
         wait_until(f"the vehicle is driven with {speed_mps} m/s", reached)
 
     def cut(self, name: str, ways: Sequence[Way], duration_s: float) -> None:
-        """Let the network carry nothing these ways for a while."""
+        """Block the network in these directions for a while."""
         self.networks.block(ways)
         begin = self.clock.now()
         pause(round(duration_s * NS_PER_S))
         self.networks.unblock()
-        self._over(name, begin)
+        self._note_outage(name, begin)
 
-    def kill_and_restart(self, name: str, what: str, after_s: float) -> None:
-        """End a part with SIGKILL, and start it again; the outage ends when it is ready."""
+    def kill_and_restart(self, name: str, role: str, after_s: float) -> None:
+        """Kill a process and restart it; the outage ends when it is ready."""
         begin = self.clock.now()
-        self.running[what].popen.kill()
+        self.running[role].popen.kill()
         pause(round(after_s * NS_PER_S))
-        self.start_again(what)
-        self._over(name, begin)
+        self.start_process(role)
+        self._note_outage(name, begin)
 
-    def freeze(self, name: str, what: str, duration_s: float) -> None:
-        """Let a part stand still for a while."""
+    def freeze(self, name: str, role: str, duration_s: float) -> None:
+        """Suspend a process for a while."""
         begin = self.clock.now()
-        self.running[what].popen.send_signal(signal.SIGSTOP)
+        self.running[role].popen.send_signal(signal.SIGSTOP)
         pause(round(duration_s * NS_PER_S))
-        self.running[what].popen.send_signal(signal.SIGCONT)
-        self._over(name, begin)
+        self.running[role].popen.send_signal(signal.SIGCONT)
+        self._note_outage(name, begin)
 
-    def _over(self, name: str, begin: Now) -> None:
+    def _note_outage(self, name: str, begin: Now) -> None:
         self.outages.append(Outage(name, begin, self.clock.now()))
 
     def records(self, side: str) -> list[Record]:
-        """Read what each process of a side has recorded."""
+        """Read the records of all processes of a side."""
         return [
             read_record(self.work / f"{side}-{number}" / f"{side}.mcap") for number in range(1, self.started[side] + 1)
         ]
 
-    def heard_outside(self) -> list[dict[str, Any]]:
-        """Give every command that the process outside has heard."""
+    def observed_commands(self) -> list[dict[str, Any]]:
+        """Return every command that the observer recorded."""
         lines = [json.loads(line) for line in (self.work / "outside-1").read_text().splitlines()]
         assert not any("unreadable" in line for line in lines)
         return lines
@@ -204,19 +205,19 @@ class Drive:
 def driven(
     networks: Field, work: Path, links: Links = MIXED, server_program: tuple[str, ...] = LAVT
 ) -> Iterator[Drive]:
-    """Start a loop in these networks, and end it."""
+    """Run a loop in these networks."""
     with Processes(work) as processes:
         drive = Drive(networks, processes, work, links, server_program)
         drive.start()
         yield drive
 
 
-def _carrier(command: str, *file_and_changes: str) -> list[str]:
+def _network_arguments(command: str, *file_and_changes: str) -> list[str]:
     folder = {"router": "zenoh-configs", "rendezvous": "configs"}[command]
     return [command, *(f"{folder}/{file}" for file in file_and_changes[:1]), *_sets(file_and_changes[1:])]
 
 
-def _side(side: str, config_and_changes: tuple[str, ...], out: str) -> list[str]:
+def _side_arguments(side: str, config_and_changes: tuple[str, ...], out: str) -> list[str]:
     config, *changes = config_and_changes
     return [side, config, *_sets([*changes, *BOTH]), "--out", out]
 

@@ -1,16 +1,16 @@
-"""The field: a vehicle's network, an operator's, and the internet that routes between them, in one kernel.
+"""The networks of the field tests: a vehicle's, an operator's, and an internet that routes between them, in one kernel.
 
-Plain, the ends have addresses that everybody reaches:
+Without NAT both ends have public addresses:
 
     vehicle 203.0.113.2 ── internet ── 198.51.100.2 operator
 
-With NAT there is a home router at each end. The internet knows no way to what is behind them, and they let through only
-what was begun from inside, and what the test has them forward:
+With NAT there is a home router at each end. The internet has no route to the networks behind them. They let through
+only connections from inside and the ports that a test forwards:
 
     vehicle 192.168.1.2 ── vehicle-nat 203.0.113.2 ── internet ── 198.51.100.2 operator-nat ── 192.168.2.2 operator
 
-All are network namespaces of one kernel, and so have one clock. Their names hold the test's process: what a test left
-behind that was killed is taken away by the next.
+All are network namespaces of one kernel, and so have one clock. Their names contain the test's process id, by which the
+next test removes the namespaces of a test that was killed.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ Way = Literal["uplink", "downlink"]
 """uplink: client to server; downlink: server to client."""
 
 PACKAGES = ("iproute2", "nftables")
-"""Debian's; .ci/run installs them."""
+"""Debian packages, which .ci/run installs."""
 PREFIX = "lavt-field-"
 VEHICLE, OPERATOR, INTERNET = "203.0.113.2", "198.51.100.2", "198.51.100.1"
 VEHICLE_AT_HOME = "192.168.1.2"
 NEXT_VEHICLE, NEXT_OPERATOR = "203.0.113.7", "198.51.100.7"
-"""What the addresses change to."""
-FROM: dict[Way, str] = {"uplink": "operator", "downlink": "vehicle"}
-"""The device of the internet by which what goes a way comes in."""
+"""The addresses after a change."""
+INPUT_DEVICES: dict[Way, str] = {"uplink": "operator", "downlink": "vehicle"}
+"""The device by which packets of a direction enter the internet."""
 INTERNET_RULES = (
     "add table inet outage",
     "add chain inet outage counting { type filter hook postrouting priority mangle; }",
@@ -59,12 +59,12 @@ Result = TypeVar("Result")
 
 
 def programs_missing() -> bool:
-    """Whether Debian's packages are not here."""
+    """Return whether the programs of the Debian packages are missing."""
     return shutil.which("ip") is None or shutil.which("nft") is None
 
 
-def kernel_rejects() -> bool:
-    """Whether this process may not make network namespaces, or the kernel has no NAT in them; for want of nft: no."""
+def kernel_lacks_namespaces() -> bool:
+    """Return whether this process may not make network namespaces, or they have no NAT (not checked without nft)."""
     if os.geteuid() != 0 or not _works("unshare", "--net", "true"):
         return True
     return shutil.which("nft") is not None and not _works("unshare", "--net", "nft", "; ".join(NAT_RULES[:3]))
@@ -76,7 +76,7 @@ def _works(*words: str) -> bool:
 
 @dataclass(frozen=True)
 class End:
-    """One end of a link: a device of a part, and its address."""
+    """One end of a link: a device in a namespace, and its address."""
 
     part: str
     device: str
@@ -85,16 +85,16 @@ class End:
 
 @dataclass(frozen=True)
 class Field:
-    """Network namespaces of this process, by the names in the drawing above."""
+    """The network namespaces of a test process, by the names in the drawing above."""
 
     owner: int
 
     def name(self, part: str) -> str:
-        """Name a part's namespace as the system knows it."""
+        """Return the system's name of a namespace."""
         return f"{PREFIX}{self.owner}-{part}"
 
     def run(self, part: str, *words: str) -> str:
-        """Run a command in a namespace, which must succeed."""
+        """Run a command in a namespace and return its output; the command must succeed."""
         ended = subprocess.run(
             ["ip", "netns", "exec", self.name(part), *words], capture_output=True, text=True, check=False
         )
@@ -102,43 +102,42 @@ class Field:
         return ended.stdout
 
     def inside(self, part: str, function: Callable[[], Result]) -> Result:
-        """Call a function in a namespace; processes that it starts are there, too."""
+        """Call a function in a namespace, in which it may also start processes."""
         return inside(self.name(part), function)
 
     def block(self, ways: Sequence[Way]) -> None:
-        """Drop all that the internet carries these ways, without a word to anybody."""
-        self.run("internet", "nft", "; ".join(f"add rule inet outage forward iifname {FROM[way]} drop" for way in ways))
+        """Silently drop all packets in these directions."""
+        rules = (f"add rule inet outage forward iifname {INPUT_DEVICES[way]} drop" for way in ways)
+        self.run("internet", "nft", "; ".join(rules))
 
     def unblock(self) -> None:
-        """Carry everything again."""
+        """Forward all packets again."""
         self.run("internet", "nft", "flush chain inet outage forward")
 
     def count(self, name: str, packets: str) -> None:
-        """Count packets that the internet carries or sends, and that nft's expression `packets` matches."""
+        """Start to count the internet's outgoing packets that match nft's expression `packets`."""
         rules = f"add counter inet outage {name}; add rule inet outage counting {packets} counter name {name}"
         self.run("internet", "nft", rules)
 
     def counted(self, name: str) -> int:
-        """Tell how many packets were counted."""
+        """Return how many packets were counted."""
         found = re.search(r"packets (\d+)", self.run("internet", "nft", f"list counter inet outage {name}"))
         assert found is not None
         return int(found[1])
 
     def forward_ports(self, ports: Sequence[int]) -> None:
-        """Have the vehicle's home router hand on what comes for these UDP ports."""
+        """Forward these UDP ports from the vehicle's home router to the vehicle."""
         numbers = ", ".join(map(str, ports))
-        self.run(
-            "vehicle-nat",
-            "nft", f"add rule ip nat in iifname internet udp dport {{ {numbers} }} dnat to {VEHICLE_AT_HOME}",
-        )  # fmt: skip
+        rule = f"add rule ip nat in iifname internet udp dport {{ {numbers} }} dnat to {VEHICLE_AT_HOME}"
+        self.run("vehicle-nat", "nft", rule)
 
-    def change_the_operators_address(self) -> None:
-        """Give the operator's home router another address: with the old one goes every connection it knew."""
+    def change_operator_address(self) -> None:
+        """Change the address of the operator's home router, which loses all its connections."""
         self._change_address("operator-nat", OPERATOR, NEXT_OPERATOR, INTERNET)
 
-    def change_the_vehicles_address(self) -> None:
-        """Give the vehicle's home router another address."""
-        self._change_address("vehicle-nat", VEHICLE, NEXT_VEHICLE, VEHICLES_WAY.address)
+    def change_vehicle_address(self) -> None:
+        """Change the address of the vehicle's home router."""
+        self._change_address("vehicle-nat", VEHICLE, NEXT_VEHICLE, VEHICLE_UPLINK_ROUTER.address)
 
     def _change_address(self, part: str, old: str, new: str, router: str) -> None:
         self.run(part, "ip", "addr", "del", f"{old}/24", "dev", "internet")
@@ -146,7 +145,7 @@ class Field:
         self.run(part, "ip", "route", "add", "default", "via", router)
 
     def _join(self, end: End, router: End) -> None:
-        """Join two namespaces: for the first the second is the way to everywhere else."""
+        """Link two namespaces; the second is the default route of the first."""
         devices = [f"{each.device} netns {self.name(each.part)}" for each in (end, router)]
         command(f"ip link add {devices[0]} type veth peer name {devices[1]}")
         for each in (end, router):
@@ -160,32 +159,32 @@ class Field:
             command(f"ip -n {self.name(part)} link set lo up")
             self.run(part, "sysctl", "-qw", f"net.ipv4.ip_forward={int(part not in ('vehicle', 'operator'))}")
 
-    def take_away(self) -> None:
-        """End what runs in the namespaces, and take them away."""
-        for name in _listed():
+    def remove(self) -> None:
+        """Kill the processes in the namespaces and delete the namespaces."""
+        for name in _list_namespaces():
             if name.startswith(self.name("")):
-                _take_away(name)
+                _remove(name)
 
 
-VEHICLES_WAY = End("internet", "vehicle", "203.0.113.1")
-OPERATORS_WAY = End("internet", "operator", INTERNET)
+VEHICLE_UPLINK_ROUTER = End("internet", "vehicle", "203.0.113.1")
+OPERATOR_UPLINK_ROUTER = End("internet", "operator", INTERNET)
 
 
 @contextmanager
 def plain_field() -> Iterator[Field]:
-    """Make the field without NAT."""
+    """Make the networks without NAT."""
     with _field("vehicle", "internet", "operator") as field:
-        field._join(End("vehicle", "internet", VEHICLE), VEHICLES_WAY)
-        field._join(End("operator", "internet", OPERATOR), OPERATORS_WAY)
+        field._join(End("vehicle", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
+        field._join(End("operator", "internet", OPERATOR), OPERATOR_UPLINK_ROUTER)
         yield field
 
 
 @contextmanager
 def nat_field() -> Iterator[Field]:
-    """Make the field with NAT on both ends."""
+    """Make the networks with NAT at both ends."""
     with _field("vehicle", "vehicle-nat", "internet", "operator-nat", "operator") as field:
-        field._join(End("vehicle-nat", "internet", VEHICLE), VEHICLES_WAY)
-        field._join(End("operator-nat", "internet", OPERATOR), OPERATORS_WAY)
+        field._join(End("vehicle-nat", "internet", VEHICLE), VEHICLE_UPLINK_ROUTER)
+        field._join(End("operator-nat", "internet", OPERATOR), OPERATOR_UPLINK_ROUTER)
         field._join(End("vehicle", "internet", VEHICLE_AT_HOME), End("vehicle-nat", "home", "192.168.1.1"))
         field._join(End("operator", "internet", "192.168.2.2"), End("operator-nat", "home", "192.168.2.1"))
         for part in ("vehicle-nat", "operator-nat"):
@@ -195,29 +194,29 @@ def nat_field() -> Iterator[Field]:
 
 @contextmanager
 def _field(*parts: str) -> Iterator[Field]:
-    clear_what_was_left()
+    remove_stale_namespaces()
     field = Field(os.getpid())
     try:
         field._make(*parts)
         field.run("internet", "nft", "; ".join(INTERNET_RULES))
         yield field
     finally:
-        field.take_away()
+        field.remove()
 
 
-def clear_what_was_left() -> None:
-    """Take away the namespaces of tests whose process has ended."""
-    for name in _listed():
+def remove_stale_namespaces() -> None:
+    """Remove the namespaces of tests whose process has ended."""
+    for name in _list_namespaces():
         found = re.match(rf"{PREFIX}(\d+)-", name)
         if found and not Path(f"/proc/{found[1]}").exists():
-            _take_away(name)
+            _remove(name)
 
 
-def _listed() -> list[str]:
+def _list_namespaces() -> list[str]:
     return [line.split()[0] for line in command("ip netns list").splitlines()]
 
 
-def _take_away(name: str) -> None:
+def _remove(name: str) -> None:
     for process in command(f"ip netns pids {name}").split():
         with suppress(ProcessLookupError):
             os.kill(int(process), signal.SIGKILL)

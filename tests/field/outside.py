@@ -1,7 +1,7 @@
-"""A process outside the loop that counts: it hears every command as the vehicle does, and writes down what it heard.
+"""Record every command at the vehicle's router, in a process that is independent of the server.
 
-It has a session of its own with the vehicle's router, and shares nothing with the server but that router and the clocks
-of the kernel. A line for each command: when it arrived here, when it was sent, as it says, and its picture's stamp.
+The observer has a session of its own with the vehicle's router, and shares only that router and the kernel's clocks
+with the server. It writes one line per command: when it arrived here, its send time, and the stamp of its picture.
 
     python tests/field/outside.py FILE
 """
@@ -32,16 +32,16 @@ def line_of(payload: bytes, arrived: Now) -> str:
     except BadMessage:
         return json.dumps({"unreadable": len(payload)})
     names = ("epoch", "sequence", "sent_wall_ns", "stamp_ns", "mode")
-    heard = {name: getattr(command, name) for name in names}
-    return json.dumps({**heard, "mono_ns": arrived.mono_ns, "wall_ns": arrived.wall_ns})
+    values = {name: getattr(command, name) for name in names}
+    return json.dumps({**values, "mono_ns": arrived.mono_ns, "wall_ns": arrived.wall_ns})
 
 
 def main(out: Path) -> None:
     clock = MachineClock()
-    heard: deque[tuple[bytes, Now]] = deque()
-    # Called where Zenoh receives, and quick: nothing is dropped, and nothing waits before it has its time.
+    received: deque[tuple[bytes, Now]] = deque()
+    # Called in the thread that receives, and quick, so that no command is dropped or timestamped late.
     listener: Any = zenoh.handlers.Callback(
-        lambda sample: heard.append((sample.payload.to_bytes(), clock.now())), indirect=False
+        lambda sample: received.append((sample.payload.to_bytes(), clock.now())), indirect=False
     )
     session = zenoh.open(zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5"))))
     subscriber = session.declare_subscriber(KEY, listener)
@@ -51,8 +51,8 @@ def main(out: Path) -> None:
         with out.open("w") as file:
             while True:
                 pause(WRITE_PERIOD_NS)
-                while heard:
-                    file.write(line_of(*heard.popleft()) + "\n")
+                while received:
+                    file.write(line_of(*received.popleft()) + "\n")
                 file.flush()
     except KeyboardInterrupt:
         pass

@@ -1,6 +1,6 @@
-"""Routers as shipped for two machines, encrypted, on the loopback; who may use them, and who tries to.
+"""The shipped encrypted routers on the loopback, with a vehicle, an operator and attackers.
 
-Bare Zenoh sessions stand in for the vehicle and the operator, and attack: they are held back by nothing of LAVT's.
+All of these are bare Zenoh sessions, so that only the routers protect against the attackers, and nothing of LAVT.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BASE = "lavt/vehicle-1"
 QUIC = "quic/127.0.0.1:0?mixed_rel=1"
 ROUND_NS = 20 * NS_PER_MS
 ROUNDS = 25
-"""The operator's so many commands, states and answers come while somebody attacks: nothing less was given time."""
+"""The number of commands, states and replies that must arrive during an attack, so that the attack had time."""
 LIMIT_S = 15.0
 LONG = 5000
 
@@ -36,7 +36,7 @@ def make_keys(directory: Path, *arguments: str) -> None:
 
 
 def tls_changes(keys: Path, name: str, way: str) -> tuple[str, ...]:
-    """Say where the keys of a router are that listens or connects (`way`)."""
+    """Return the config changes for the keys of a router that listens or connects (`way`)."""
     base = "transport.link.tls"
     return (
         f"{base}.root_ca_certificate={keys}/authority.pem",
@@ -51,20 +51,20 @@ def start_router(processes: Processes, name: str, file: str, *changes: str) -> P
     return processes.start(name, "router", str(shipped(f"zenoh-configs/{file}")), *sets)
 
 
-def dialled(router: Process) -> str:
-    """Where other routers dial this one, as an endpoint."""
+def quic_endpoint(router: Process) -> str:
+    """Return the endpoint at which other routers dial this one."""
     return str(next(each for each in router.ready()["locators"] if each.startswith("quic/")))
 
 
 def port(endpoint: str) -> int:
-    """UDP port of such an endpoint."""
+    """Return the UDP port of an endpoint."""
     return int(endpoint.partition("?")[0].rpartition(":")[2])
 
 
 def open_session(endpoint: str, mode: str = "client", *, authority: Path | None = None, own: Path | None = None) -> Any:
-    """Open a session at `endpoint` as a client, or beside it as a router, with or without a certificate of its own.
+    """Open a session at `endpoint` as a client or a router.
 
-    `authority` is the certificate it trusts; `own` is that of the session, its key beside it.
+    `authority` is the certificate that the session trusts; `own` is its own certificate, whose key is next to it.
     """
     tls: dict[str, Any] = {"enable_mtls": own is not None}
     if authority is not None:
@@ -84,104 +84,104 @@ def open_session(endpoint: str, mode: str = "client", *, authority: Path | None 
     return zenoh.open(config)
 
 
-def direct(hear: Callable[[Any], None]) -> Any:
-    """Make a handler that hears on Zenoh's own thread."""
-    return zenoh.handlers.Callback(hear, indirect=False)
+def direct(callback: Callable[[Any], None]) -> Any:
+    """Return a handler that is called in Zenoh's own thread."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
-class Vehicle:
-    """Stands in for `lavt server`: hears commands, answers questions, tells a state."""
+class VehicleStandIn:
+    """A stand-in for `lavt server` that receives commands, answers queries and publishes states."""
 
     def __init__(self, endpoint: str) -> None:
         self.commands: list[bytes] = []
         self.deleted = 0
-        self.requested: list[bytes] = []
+        self.queries: list[bytes] = []
         self.session = open_session(endpoint)
         self._state = self.session.declare_publisher(f"{BASE}/state", **STATE)
-        self.session.declare_subscriber(f"{BASE}/control", direct(self._hear))
+        self.session.declare_subscriber(f"{BASE}/control", direct(self._on_command))
         for key in (f"{BASE}/session", f"{BASE}/netem"):
-            self.session.declare_queryable(key, direct(self._answer))
+            self.session.declare_queryable(key, direct(self._on_query))
         self._alive = self.session.liveliness().declare_token(f"{BASE}/alive/server-1")
 
-    def tell(self) -> None:
-        """Tell a state."""
+    def publish_state(self) -> None:
+        """Publish a state."""
         self._state.put(b"state")
 
-    def _hear(self, sample: Any) -> None:
+    def _on_command(self, sample: Any) -> None:
         if sample.kind == zenoh.SampleKind.DELETE:
             self.deleted += 1
         self.commands.append(sample.payload.to_bytes())
 
-    def _answer(self, query: Any) -> None:
+    def _on_query(self, query: Any) -> None:
         with query:
-            self.requested.append(b"" if query.payload is None else query.payload.to_bytes())
+            self.queries.append(b"" if query.payload is None else query.payload.to_bytes())
             for key in (f"{BASE}/session", f"{BASE}/netem"):
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
-                    query.reply(key, b"answer of " + key.rpartition("/")[2].encode())
+                    query.reply(key, b"reply to " + key.rpartition("/")[2].encode())
 
 
-class Client:
-    """Stands in for `lavt client`: sends commands that bear a name, hears the state, asks."""
+class ClientStandIn:
+    """A stand-in for `lavt client` that sends commands with a name, receives states and sends queries."""
 
     def __init__(self, session: Any, name: bytes) -> None:
         self.session = session
         self.name = name
-        self.heard: dict[str, list[bytes]] = {}
-        self.answers: list[bytes] = []
+        self.received: dict[str, list[bytes]] = {}
+        self.replies: list[bytes] = []
         self._own_id = str(session.info.zid())
         self._control = session.declare_publisher(f"{BASE}/control", **CONTROL)
-        self.listen(f"{BASE}/state")
+        self.subscribe(f"{BASE}/state")
 
-    def listen(self, key: str) -> None:
-        """Hear what comes on a key, kept under it."""
-        kept = self.heard.setdefault(key, [])
-        self.session.declare_subscriber(key, direct(lambda sample: kept.append(sample.payload.to_bytes())))
+    def subscribe(self, key: str) -> None:
+        """Store the payloads that are published on a key."""
+        payloads = self.received.setdefault(key, [])
+        self.session.declare_subscriber(key, direct(lambda sample: payloads.append(sample.payload.to_bytes())))
 
     def command(self) -> None:
         """Send a command."""
         self._control.put(self.name)
 
-    def ask(self, key: str) -> None:
-        """Ask a question; what comes back is kept."""
-        self.session.get(key, direct(self._answered), payload=self.name, timeout=1.0)
+    def query(self, key: str) -> None:
+        """Send a query and store the replies."""
+        self.session.get(key, direct(self._on_reply), payload=self.name, timeout=1.0)
 
-    def _answered(self, reply: Any) -> None:
-        if reply.ok is not None and self._own_id not in str(reply.ok.key_expr):  # a session tells itself of itself
-            self.answers.append(reply.ok.payload.to_bytes())
+    def _on_reply(self, reply: Any) -> None:
+        if reply.ok is not None and self._own_id not in str(reply.ok.key_expr):  # a session also answers itself
+            self.replies.append(reply.ok.payload.to_bytes())
 
 
 @dataclass
 class Site:
-    """A vehicle and its operator at routers of their own, which found each other."""
+    """A vehicle and its operator at linked routers of their own."""
 
     keys: Path
     endpoint: str
-    """Where the router is dialled that everybody from outside dials: the vehicle's or a cloud's."""
+    """The endpoint of the router that accepts links from outside: the vehicle's or the cloud's."""
     operator_socket: Path
-    vehicle: Vehicle
-    operator: Client
+    vehicle: VehicleStandIn
+    operator: ClientStandIn
     processes: Processes
     clock: MachineClock = field(default_factory=MachineClock)
 
     def intruder(self, name: str, mode: str) -> Intruder:
-        """Dial with the certificate of `name`, of this site's authority."""
+        """Return an intruder that dials with the certificate of `name`, from this site's authority."""
         own = self.keys / f"{name}.pem"
         return Intruder(open_session(self.endpoint, mode, authority=self.keys / "authority.pem", own=own))
 
-    def drive(self, beside: Callable[[], None] = lambda: None) -> None:
-        """Have `ROUNDS` commands, states and answers of both questions come through, and do something in each round."""
-        commands, states, answers = (len(each) for each in self._came())
+    def drive(self, action: Callable[[], None] = lambda: None) -> None:
+        """Exchange messages until `ROUNDS` of each kind have arrived; call `action` in each round."""
+        commands, states, replies = (len(each) for each in self._arrived())
         limit_ns = self._limit_ns()
         while True:
-            self._round(beside)
-            now_commands, now_states, now_answers = (len(each) for each in self._came())
-            came = min(now_commands - commands, now_states - states, (now_answers - answers) // 2)
-            if came >= ROUNDS:
+            self._round(action)
+            now_commands, now_states, now_replies = (len(each) for each in self._arrived())
+            rounds = min(now_commands - commands, now_states - states, (now_replies - replies) // 2)
+            if rounds >= ROUNDS:
                 return
-            assert self.clock.now().mono_ns < limit_ns, f"only {came} rounds came through in {LIMIT_S:g} s"
+            assert self.clock.now().mono_ns < limit_ns, f"only {rounds} rounds arrived in {LIMIT_S:g} s"
 
     def attack(self, intruder: Intruder, aims: set[str]) -> set[str]:
-        """Have `intruder` try all it can in each round until it has achieved `aims`, or time is up; say what it has."""
+        """Let an intruder attack until it has achieved its aims or the time is up; return what it has achieved."""
         limit_ns = self._limit_ns()
         while True:
             self._round(intruder.attempt)
@@ -192,29 +192,29 @@ class Site:
     def _limit_ns(self) -> int:
         return self.clock.now().mono_ns + round(LIMIT_S * NS_PER_S)
 
-    def _round(self, beside: Callable[[], None]) -> None:
-        beside()
+    def _round(self, action: Callable[[], None]) -> None:
+        action()
         self.operator.command()
-        self.vehicle.tell()
-        for question in ("session", "netem"):
-            self.operator.ask(f"{BASE}/{question}")
+        self.vehicle.publish_state()
+        for channel in ("session", "netem"):
+            self.operator.query(f"{BASE}/{channel}")
         pause(ROUND_NS)
 
-    def _came(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
+    def _arrived(self) -> tuple[list[bytes], list[bytes], list[bytes]]:
         return (
             [each for each in self.vehicle.commands if each == self.operator.name],
-            [each for each in self.operator.heard[f"{BASE}/state"] if each == b"state"],
-            [each for each in self.operator.answers if each.startswith(b"answer of ")],
+            [each for each in self.operator.received[f"{BASE}/state"] if each == b"state"],
+            [each for each in self.operator.replies if each.startswith(b"reply to ")],
         )
 
 
-class Intruder(Client):
-    """Somebody with a session who tries all there is: `attempt` in each round, `achieved` in the end."""
+class Intruder(ClientStandIn):
+    """An attacker with a session that tries everything: `attempt` in each round, `achieved` at the end."""
 
     def __init__(self, session: Any) -> None:
         super().__init__(session, b"intruder")
         for key in ("**", "lavt/**", "lavt/*/*", f"{BASE}/control"):
-            self.listen(key)
+            self.subscribe(key)
         self.alive: list[str] = []
         session.liveliness().declare_subscriber(
             f"{BASE}/alive/*", direct(lambda sample: self.alive.append(str(sample.key_expr))), history=True
@@ -223,7 +223,7 @@ class Intruder(Client):
             session.declare_queryable(key, direct(self._forge), complete=True)
 
     def attempt(self) -> None:
-        """Send everything once."""
+        """Send one message of each kind."""
         self.command()
         for key in ("**", "lavt/**", "lavt/*/control", f"{BASE}/*"):
             self.session.put(key, b"wildcard")
@@ -231,31 +231,31 @@ class Intruder(Client):
         self.session.put(f"{BASE}/control", b"long" * (LONG // 4))
         self.session.put(f"{BASE}/state", b"forged")
         for key in (f"{BASE}/session", f"{BASE}/netem", "lavt/**", "@/**"):
-            self.ask(key)
+            self.query(key)
 
     def achieved(self, site: Site) -> set[str]:
-        """Say what had an effect on vehicle or operator, and what was learned."""
-        seen = [each for key, heard in self.heard.items() for each in heard if key != f"{BASE}/state"]
-        answers = set(self.answers) - {b"forged"}
+        """Return the effects on vehicle and operator, and the kinds of messages that were received."""
+        seen = [each for key, payloads in self.received.items() for each in payloads if key != f"{BASE}/state"]
+        replies = set(self.replies) - {b"forged"}
         effects = {
             "commands": b"intruder" in site.vehicle.commands,
             "wildcard commands": b"wildcard" in site.vehicle.commands,
             "deletes": site.vehicle.deleted > 0,
             "long commands": any(len(each) >= LONG for each in site.vehicle.commands),
-            "questions": b"intruder" in site.vehicle.requested,
-            "session": b"answer of session" in answers,
-            "netem": b"answer of netem" in answers,
-            "the routers' own state": bool(answers - {b"answer of session", b"answer of netem"}),
-            "forged state": any(each != b"state" for each in site.operator.heard[f"{BASE}/state"]),
-            "forged answers": b"forged" in site.operator.answers,
-            "state": b"state" in self.heard[f"{BASE}/state"],
+            "queries": b"intruder" in site.vehicle.queries,
+            "session": b"reply to session" in replies,
+            "netem": b"reply to netem" in replies,
+            "the routers' own state": bool(replies - {b"reply to session", b"reply to netem"}),
+            "forged state": any(each != b"state" for each in site.operator.received[f"{BASE}/state"]),
+            "forged replies": b"forged" in site.operator.replies,
+            "state": b"state" in self.received[f"{BASE}/state"],
             "others' commands": site.operator.name in seen,
             "alive": f"{BASE}/alive/server-1" in self.alive,
         }
-        return {effect for effect, came in effects.items() if came}
+        return {effect for effect, occurred in effects.items() if occurred}
 
     def close(self) -> None:
-        """Leave."""
+        """Close the session."""
         self.session.close()
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""The networks that the tests of outages and routes stand on."""
+"""Tests of the networks that the field tests use."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from tests.field.namespaces import OPERATOR, VEHICLE, Field, Way, clear_what_was_left, plain_field
+from tests.field.namespaces import OPERATOR, VEHICLE, Field, Way, plain_field, remove_stale_namespaces
 
 pytestmark = pytest.mark.usefixtures("namespaces")
 
@@ -16,7 +16,7 @@ PORT = 7000
 
 
 def test_an_outage_has_a_direction() -> None:
-    """What is blocked one way passes the other way, and what is unblocked passes again."""
+    """Packets are dropped in a blocked direction only, and pass again after unblocking."""
     with plain_field() as field:
         ends = {"uplink": "operator", "downlink": "vehicle"}
         to: dict[Way, str] = {"uplink": VEHICLE, "downlink": OPERATOR}
@@ -52,8 +52,8 @@ def test_an_outage_has_a_direction() -> None:
             each.close()
 
 
-def test_what_a_killed_test_left_behind_is_taken_away() -> None:
-    """The namespaces of a test whose process has died go, with what runs in them, and nobody else's."""
+def test_namespaces_of_a_killed_test_are_removed() -> None:
+    """The namespaces of a test whose process has died are removed with their processes, and no others."""
     died = subprocess.Popen(["true"])
     died.wait()
     theirs = Field(died.pid)
@@ -62,5 +62,5 @@ def test_what_a_killed_test_left_behind_is_taken_away() -> None:
     with plain_field() as ours:
         assert left.wait(timeout=5) == -signal.SIGKILL
         assert not Path("/run/netns", theirs.name("vehicle")).exists()
-        clear_what_was_left()
+        remove_stale_namespaces()
         assert Path("/run/netns", ours.name("vehicle")).exists()

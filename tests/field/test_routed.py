@@ -1,9 +1,9 @@
 """A vehicle and an operator, each behind a NAT of its own, and a router in the cloud that both dial.
 
-Commands, state and session go through the cloud. Video and clock probe go one of two ways: straight, where the
-vehicle's NAT forwards two UDP ports (the client begins both, so its own NAT needs no setting); or, where nothing is
-forwarded, through a rendezvous in the cloud, here with everything signed and encrypted. Each test is of both ways.
-`docs/outages.md` says so too.
+Commands, states and session requests go through the cloud. Video and clock probe take one of two ways: directly, with
+two UDP ports that the vehicle's NAT forwards (the client sends first, so its own NAT needs no setting); or, without
+forwarded ports, through a rendezvous in the cloud, here with everything signed and encrypted. Each test is run for both
+ways. See also `docs/outages.md`.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ pytestmark = [pytest.mark.usefixtures("namespaces")]
 VIDEO_PORT, PROBE_PORT = 5600, 5602
 """As in configs/server.yaml."""
 HELLO_BYTES, CHALLENGE_BYTES, ANSWER_BYTES = 38, 38, 62
-"""Of the datagrams by which the video's path is proven; RTCP comes in fours of bytes."""
-UNINVITED_S = 1.0
-"""Within one kernel a datagram that gets through is there at once."""
+"""Sizes of the datagrams that validate the video's path; RTCP datagrams have multiples of 4 bytes."""
+UNSOLICITED_S = 1.0
+"""Within one kernel a datagram that passes arrives at once."""
 SPEED_MPS = 5.0
-WHILE_S = 3.0
-WHILE_NS = round(WHILE_S * NS_PER_S)
-ANEW_S = 3.0
-"""From a change of the address to video on the new one: the client asks 0.15 s after its last packet."""
+WINDOW_S = 3.0
+WINDOW_NS = round(WINDOW_S * NS_PER_S)
+NEW_PATH_S = 3.0
+"""From a change of address to video at the new one: the client sends a hello 0.15 s after the last packet."""
 STALL_MS = 100
-AGAIN_S = 10.0
-"""From there until the vehicle is driven again, where it has stopped meanwhile."""
+RECOVERY_S = 10.0
+"""From a change of address until the vehicle is driven again, if it has stopped."""
 
 
 @pytest.fixture(scope="module", params=["forwarded ports", "rendezvous"])
 def way(request: pytest.FixtureRequest) -> str:
-    """How video and probe find the vehicle."""
+    """Return the way of video and probe to the vehicle."""
     return str(request.param)
 
 
@@ -61,7 +61,7 @@ def field(namespaces: None, way: str) -> Iterator[Field]:  # noqa: ARG001 (skips
 
 @pytest.fixture(scope="module")
 def links(way: str, tmp_path_factory: pytest.TempPathFactory) -> Links:
-    """How the ends talk."""
+    """Return the links of both ends."""
     if way == "forwarded ports":
         return CLOUD
     keys: Path = tmp_path_factory.mktemp("signing") / "keys"
@@ -71,25 +71,28 @@ def links(way: str, tmp_path_factory: pytest.TempPathFactory) -> Links:
 
 @dataclass(frozen=True)
 class Routed:
-    """A drive, what it left, and when in the middle of it the operator's address changed."""
+    """The records of a drive during which the operator's address changed, and numbers of video packets."""
 
     changed: Now
     ended: Now
     server: Record
     client: Record
     to_old_before: int
-    """Packets of the video to the first address when it was changed, two seconds later, and to the second."""
+    """Video packets to the old address until the change."""
     to_old_soon: int
+    """Video packets to the old address until 3 s after the change."""
     to_old: int
+    """Video packets to the old address until the end."""
     to_new: int
+    """Video packets to the new address until the end."""
 
     def before(self, record: Record, channel: str) -> Table:
-        """Take from a record what was there in the last seconds before the change."""
+        """Return the rows of a channel from the last seconds before the change."""
         table = record.table(channel)
-        return table.where((table.mono_ns > self.changed.mono_ns - WHILE_S * NS_PER_S) & self._until_change(table))
+        return table.where((table.mono_ns > self.changed.mono_ns - WINDOW_S * NS_PER_S) & self._until_change(table))
 
     def after(self, record: Record, channel: str) -> Table:
-        """Take from a record what was there from the change on."""
+        """Return the rows of a channel from the change on."""
         table = record.table(channel)
         return table.where(~self._until_change(table) & (table.mono_ns < self.ended.mono_ns))
 
@@ -101,56 +104,56 @@ class Routed:
 def routed(
     field: Field, links: Links, way: str, tmp_path_factory: pytest.TempPathFactory, tell: Callable[[str], None]
 ) -> Routed:
-    """Drive, change the operator's address, drive on."""
+    """Drive while the operator's address changes."""
     work: Path = tmp_path_factory.mktemp("routed")
     field.count("to_old", f"ip daddr {OPERATOR} udp sport {VIDEO_PORT}")
     field.count("to_new", f"ip daddr {NEXT_OPERATOR} udp sport {VIDEO_PORT}")
     with driven(field, work, links) as drive:
         drive.reach(SPEED_MPS)
-        pause(round(WHILE_S * NS_PER_S))
+        pause(round(WINDOW_S * NS_PER_S))
         to_old_before = field.counted("to_old")
         changed = drive.clock.now()
-        field.change_the_operators_address()
-        pause(round(ANEW_S * NS_PER_S))
+        field.change_operator_address()
+        pause(round(NEW_PATH_S * NS_PER_S))
         to_old_soon = field.counted("to_old")
         drive.reach(SPEED_MPS)
-        pause(round(WHILE_S * NS_PER_S))
+        pause(round(WINDOW_S * NS_PER_S))
         ended = drive.clock.now()
         counts = to_old_before, to_old_soon, field.counted("to_old"), field.counted("to_new")
     (server,), (client,) = drive.records("server"), drive.records("client")
     routed = Routed(changed, ended, server, client, *counts)
-    tell(f"{way}: an address changed: {longest_gap_s(routed, 'picture'):.2f} s without pictures, "
-         f"{longest_gap_s(routed, 'state'):.2f} s without state")  # fmt: skip
+    pictures_s, states_s = (longest_gap_s(routed, channel) for channel in ("picture", "state"))
+    tell(f"{way}: an address changed: {pictures_s:.2f} s without pictures, {states_s:.2f} s without state")
     return routed
 
 
 def longest_gap_s(routed: Routed, channel: str) -> float:
-    """How long the client went without, from the change on."""
+    """Return the client's longest time without a message on a channel, from the change on."""
     return gap_s(routed.client.table(channel), routed.changed.mono_ns, routed.ended.mono_ns)
 
 
 def gap_s(arrivals: Table, begin_ns: int, end_ns: int) -> float:
-    """How long nothing came at most, between these times."""
+    """Return the longest time without an arrival between two times."""
     within_ns = arrivals.mono_ns[(arrivals.mono_ns > begin_ns) & (arrivals.mono_ns < end_ns)]
     return float(np.max(np.diff([begin_ns, *within_ns, end_ns]))) / NS_PER_S
 
 
 def first_ns(datagrams: Table, size_bytes: int) -> int:
-    """When the first of this size was heard or said."""
+    """Return the time of the first datagram of a size."""
     return int(datagrams.where(datagrams.ints("size_bytes") == size_bytes).mono_ns[0])
 
 
-def pictures_failed(routed: Routed, at_ns: int) -> bool:
-    """Whether the client had no picture for a while in the second before, after which it proves its address again."""
+def had_picture_gap(routed: Routed, at_ns: int) -> bool:
+    """Return whether the client had a gap in the pictures in the second before, which causes a re-validation."""
     return gap_s(routed.client.table("picture"), at_ns - NS_PER_S, at_ns) * NS_PER_S > HELLO_AGAIN_NS / 2
 
 
 def per_second(table: Table) -> float:
-    return len(table) / WHILE_S
+    return len(table) / WINDOW_S
 
 
-def test_behind_nat_nobody_is_reached_uninvited(field: Field, way: str) -> None:
-    """The vehicle's NAT lets in what comes for a forwarded port, from the operator's public address, and no more."""
+def test_nat_drops_unsolicited_datagrams(field: Field, way: str) -> None:
+    """The vehicle's NAT passes datagrams to a forwarded port, with the operator's public address, and drops others."""
     forwarded, closed = (
         field.inside("vehicle", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
     )
@@ -159,13 +162,13 @@ def test_behind_nat_nobody_is_reached_uninvited(field: Field, way: str) -> None:
         forwarded.bind(("", VIDEO_PORT))
         closed.bind(("", VIDEO_PORT + 1))
         for each in (forwarded, closed):
-            each.settimeout(UNINVITED_S)
-        operator.sendto(b"uninvited", (VEHICLE, VIDEO_PORT + 1))
+            each.settimeout(UNSOLICITED_S)
+        operator.sendto(b"unsolicited", (VEHICLE, VIDEO_PORT + 1))
         operator.sendto(b"expected", (VEHICLE, VIDEO_PORT))
 
         if way == "forwarded ports":
-            heard, (came_from, _port) = forwarded.recvfrom(100)
-            assert (heard, came_from) == (b"expected", OPERATOR)
+            datagram, (sender, _port) = forwarded.recvfrom(100)
+            assert (datagram, sender) == (b"expected", OPERATOR)
         else:
             with pytest.raises(TimeoutError):
                 forwarded.recvfrom(100)
@@ -174,63 +177,63 @@ def test_behind_nat_nobody_is_reached_uninvited(field: Field, way: str) -> None:
 
 
 def test_everything_passes_two_nats_and_a_cloud(routed: Routed, stalls: Stalls) -> None:
-    """Video, commands, state, clock probe and session all work, and at their rates."""
+    """Video, commands, states, clock probe and session work at their rates through two NATs and a cloud."""
     admissions = routed.before(routed.server, "admission")
 
-    with stalls.judging(routed.changed.later(-WHILE_NS).mono_ns, routed.changed.mono_ns, stall_ms=STALL_MS):
+    with stalls.judging(routed.changed.later(-WINDOW_NS).mono_ns, routed.changed.mono_ns, stall_ms=STALL_MS):
         assert per_second(routed.before(routed.client, "picture")) >= 25
-        assert admissions.texts("verdict").count("accepted") / WHILE_S >= 45
+        assert admissions.texts("verdict").count("accepted") / WINDOW_S >= 45
         assert per_second(routed.before(routed.client, "state")) >= 45
         assert per_second(routed.before(routed.client, "clock_probe")) >= 1.5
     assert len(routed.client.table("session_reply")) > 0
     states = [each.after for each in transitions(routed.server) if each.at.mono_ns < routed.changed.mono_ns]
     assert states[-2:] == ["arming", "driving"]
-    assert set(states[:-2]) <= {"arming", "disarmed"}  # arming begins anew where the host stalled
+    assert set(states[:-2]) <= {"arming", "disarmed"}  # arming is repeated if the host stalled
 
 
 def test_a_client_whose_address_changes_keeps_its_video(routed: Routed, stalls: Stalls) -> None:
-    """Within 3 s the video comes to the new address and no more to the old one, at its full rate."""
+    """Within 3 s the video goes to the client's new address at its full rate, and no longer to the old one."""
     pictures = routed.after(routed.client, "picture")
-    last = pictures.where(pictures.mono_ns > routed.ended.mono_ns - WHILE_S * NS_PER_S)
+    last = pictures.where(pictures.mono_ns > routed.ended.mono_ns - WINDOW_S * NS_PER_S)
 
     with stalls.judging(routed.changed.mono_ns, routed.ended.mono_ns, stall_ms=STALL_MS):
-        assert longest_gap_s(routed, "picture") <= ANEW_S
+        assert longest_gap_s(routed, "picture") <= NEW_PATH_S
         assert per_second(last) >= 25
     assert routed.to_old_before > 0
     assert routed.to_old == routed.to_old_soon
     assert routed.to_new > 100
 
 
-def test_only_a_new_proof_moves_the_video(routed: Routed) -> None:
-    """Pictures come to the new address after the client has said hello and answered a challenge from there.
+def test_only_a_new_validation_moves_the_video(routed: Routed) -> None:
+    """Pictures go to the new address only after the client has answered a challenge from there.
 
-    Before, it does so only where a stall of the host left it without pictures.
+    Before the change of address a re-validation occurs only after frame loss.
     """
-    heard, said = routed.after(routed.server, "feedback"), routed.after(routed.server, "rtp")
-    hello_ns = first_ns(heard, HELLO_BYTES)
-    challenge_ns = first_ns(said, CHALLENGE_BYTES)
-    answer_ns = first_ns(heard, ANSWER_BYTES)
+    received, sent = routed.after(routed.server, "feedback"), routed.after(routed.server, "rtp")
+    hello_ns = first_ns(received, HELLO_BYTES)
+    challenge_ns = first_ns(sent, CHALLENGE_BYTES)
+    answer_ns = first_ns(received, ANSWER_BYTES)
     pictures_ns = routed.after(routed.client, "picture").mono_ns
-    heard_before = routed.before(routed.server, "feedback")
-    proofs_before_ns = heard_before.mono_ns[np.isin(heard_before.ints("size_bytes"), [HELLO_BYTES, ANSWER_BYTES])]
+    before = routed.before(routed.server, "feedback")
+    validations_before_ns = before.mono_ns[np.isin(before.ints("size_bytes"), [HELLO_BYTES, ANSWER_BYTES])]
 
-    assert all(pictures_failed(routed, at_ns) for at_ns in proofs_before_ns)
+    assert all(had_picture_gap(routed, at_ns) for at_ns in validations_before_ns)
     assert hello_ns < challenge_ns < answer_ns
     assert np.sum((hello_ns < pictures_ns) & (pictures_ns < answer_ns)) == 0
     assert np.sum(pictures_ns > answer_ns) > 100
 
 
-def test_a_drive_goes_on_after_a_change_of_address(routed: Routed, stalls: Stalls) -> None:
-    """State, clock probe and commands go on too, and a vehicle that has stopped meanwhile is armed again and driven."""
+def test_a_drive_continues_after_a_change_of_address(routed: Routed, stalls: Stalls) -> None:
+    """States, clock probe and commands continue, and a vehicle that has stopped is armed again and driven."""
     changes = [
         each for each in transitions(routed.server) if routed.changed.mono_ns < each.at.mono_ns < routed.ended.mono_ns
     ]
 
     with stalls.judging(routed.changed.mono_ns, routed.ended.mono_ns, stall_ms=STALL_MS):
-        assert longest_gap_s(routed, "state") <= AGAIN_S
-        assert longest_gap_s(routed, "clock_probe") <= AGAIN_S
+        assert longest_gap_s(routed, "state") <= RECOVERY_S
+        assert longest_gap_s(routed, "clock_probe") <= RECOVERY_S
         assert not changes or changes[-1].after == "driving"
-        assert not changes or changes[-1].at.mono_ns - routed.changed.mono_ns <= AGAIN_S * NS_PER_S
+        assert not changes or changes[-1].at.mono_ns - routed.changed.mono_ns <= RECOVERY_S * NS_PER_S
     assert "accepted" in routed.after(routed.server, "admission").texts("verdict")[-20:]
 
 
@@ -238,19 +241,19 @@ def test_a_drive_goes_on_after_a_change_of_address(routed: Routed, stalls: Stall
 def test_a_vehicle_whose_address_changes_keeps_its_video(
     field: Field, links: Links, tmp_path: Path, tell: Callable[[str], None], stalls: Stalls
 ) -> None:
-    """The rendezvous finds the vehicle at its new address, and pictures come again within 3 s, at their full rate."""
+    """After a change of the vehicle's address, pictures arrive again within 3 s at their full rate."""
     with driven(field, tmp_path, links) as drive:
         drive.reach(SPEED_MPS)
         changed = drive.clock.now()
-        field.change_the_vehicles_address()
-        pause(round((ANEW_S + WHILE_S) * NS_PER_S))
+        field.change_vehicle_address()
+        pause(round((NEW_PATH_S + WINDOW_S) * NS_PER_S))
         ended = drive.clock.now()
     (client,) = drive.records("client")
     pictures = client.table("picture")
     gap = gap_s(pictures, changed.mono_ns, ended.mono_ns)
     tell(f"the vehicle's address changed: {gap:.2f} s without pictures")
 
-    last = (pictures.mono_ns > ended.mono_ns - WHILE_S * NS_PER_S) & (pictures.mono_ns < ended.mono_ns)
+    last = (pictures.mono_ns > ended.mono_ns - WINDOW_S * NS_PER_S) & (pictures.mono_ns < ended.mono_ns)
     with stalls.judging(changed.mono_ns, ended.mono_ns, stall_ms=STALL_MS):
-        assert gap <= ANEW_S
+        assert gap <= NEW_PATH_S
         assert per_second(pictures.where(last)) >= 25

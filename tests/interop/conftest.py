@@ -1,4 +1,4 @@
-"""Tests against video tools that nobody here wrote, over real UDP on the loopback."""
+"""Tests with third-party video tools over real UDP on the loopback."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ def pytest_runtest_setup() -> None:
 
 @pytest.fixture(autouse=True)
 def _own_switch_interval(own_switch_interval: None) -> None:
-    """Our runtime runs in this process."""
+    """Set the switch interval, since our runtime runs in this process."""

@@ -1,4 +1,4 @@
-"""What GStreamer and ffmpeg send, as our receiver sees it."""
+"""Streams of GStreamer and ffmpeg, received by our receiver."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lavt.transport.video.stamp_check import LEARNED_AFTER
 
 WIDTH_PX, HEIGHT_PX, RATE_HZ = 640, 480, 30
 COUNT = 60
-"""Frames, of two seconds; the tools send them in real time."""
+"""Number of frames, for two seconds; the tools send them in real time."""
 STAMPS_NS = [1_790_000_000 * NS_PER_S + number * NS_PER_S // RATE_HZ for number in range(COUNT)]
 
 GSTREAMER = (
@@ -47,38 +47,38 @@ FFMPEG = (
 )
 SINGLE, STAP_A, FU_A = "single NAL unit", "STAP-A", "FU-A"
 BASELINE, HIGH = (66, False), (100, True)
-"""Profile and whether the entropy coding is CABAC, as the parameter sets say them."""
+"""Profile and whether the entropy coding is CABAC, from the parameter sets."""
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """A GStreamer pipeline, and what it must have sent for its test to be about what it says."""
+class GStreamerCase:
+    """A GStreamer pipeline and the packets that it must send for the test to be valid."""
 
     encoder: str
     packets: tuple[str, ...]
-    """Kinds of packets that occur; most are of the first."""
+    """Packet types that must occur; most packets must have the first one."""
     aggregate: str = "none"
     profile: str = "constrained-baseline"
     slices: int = 1
-    """In each picture, at least."""
+    """Least number in each picture."""
 
 
 FAST, WITH_CABAC = "speed-preset=ultrafast", "speed-preset=medium cabac=true dct8x8=true bframes=0"
 CASES = {
-    "single NAL units": Case(f"{FAST} option-string=slice-max-size=1100", (SINGLE,)),
-    "STAP-A at once": Case(f"{FAST} option-string=slice-max-size=500", (STAP_A,), "zero-latency"),
-    "STAP-A of all that fits": Case(f"{FAST} option-string=slice-max-size=300", (STAP_A,), "max-stap"),
-    "FU-A": Case(FAST, (FU_A, SINGLE)),
-    "several slices": Case(f"{FAST} option-string=slices=8", (FU_A, SINGLE, STAP_A), "zero-latency", slices=8),
-    "slices by threads": Case(f"{FAST} threads=4 sliced-threads=true", (FU_A,), "zero-latency", slices=4),
-    "baseline": Case(FAST, (FU_A, SINGLE, STAP_A), "zero-latency", "baseline"),
-    "high": Case(WITH_CABAC, (FU_A, SINGLE, STAP_A), "zero-latency", "high"),
+    "single NAL units": GStreamerCase(f"{FAST} option-string=slice-max-size=1100", (SINGLE,)),
+    "STAP-A without latency": GStreamerCase(f"{FAST} option-string=slice-max-size=500", (STAP_A,), "zero-latency"),
+    "STAP-A of all that fits": GStreamerCase(f"{FAST} option-string=slice-max-size=300", (STAP_A,), "max-stap"),
+    "FU-A": GStreamerCase(FAST, (FU_A, SINGLE)),
+    "several slices": GStreamerCase(f"{FAST} option-string=slices=8", (FU_A, SINGLE, STAP_A), "zero-latency", slices=8),
+    "slices by threads": GStreamerCase(f"{FAST} threads=4 sliced-threads=true", (FU_A,), "zero-latency", slices=4),
+    "baseline": GStreamerCase(FAST, (FU_A, SINGLE, STAP_A), "zero-latency", "baseline"),
+    "high": GStreamerCase(WITH_CABAC, (FU_A, SINGLE, STAP_A), "zero-latency", "high"),
 }
 
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write stamped pictures of something that moves, as raw I420."""
+    """Write stamped pictures with motion as raw I420."""
     texture = stream(1, "texture").integers(40, 216, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
     soft = cv2.GaussianBlur(texture, (0, 0), 4.0)
     path = tmp_path_factory.mktemp("raw") / "frames.i420"
@@ -90,14 +90,14 @@ def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def packets_from(command: str, raw: Path, said: Path) -> list[tuple[RtpPacket, int]]:
-    """Run a tool that sends the pictures to us: each packet with the time when it came, until the tool has ended."""
+def receive_from(command: str, raw: Path, log: Path) -> list[tuple[RtpPacket, int]]:
+    """Run a tool that sends the pictures to us until it ends; return each packet with its time of arrival."""
     packets, clock = [], MachineClock()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as receiver:
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(0.1)
-        with running(command.format(raw=raw, port=receiver.getsockname()[1]).split(), said) as tool:
+        with running(command.format(raw=raw, port=receiver.getsockname()[1]).split(), log) as tool:
             while True:
                 ended = tool.poll() is not None
                 try:
@@ -105,35 +105,35 @@ def packets_from(command: str, raw: Path, said: Path) -> list[tuple[RtpPacket, i
                 except TimeoutError:
                     if ended:
                         break
-            assert tool.returncode == 0, said.read_text(errors="replace")
+            assert tool.returncode == 0, log.read_text(errors="replace")
     return packets
 
 
 def units_of(packets: Sequence[tuple[RtpPacket, int]]) -> list[AccessUnit]:
-    """Put packets in order and access units together, as the receiver's node does."""
-    reorder, depacketizer = JitterBuffer(), Depacketizer()
-    ordered = [each for packet, arrived_ns in packets for each in reorder.push(packet, arrived_ns)]
-    ordered += reorder.expire(packets[-1][1] + NS_PER_S)
+    """Return the access units of packets, as the receiver node reassembles them."""
+    jitter_buffer, depacketizer = JitterBuffer(), Depacketizer()
+    ordered = [each for packet, arrived_ns in packets for each in jitter_buffer.push(packet, arrived_ns)]
+    ordered += jitter_buffer.expire(packets[-1][1] + NS_PER_S)
     units = [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
-    assert (reorder.lost, reorder.stray, depacketizer.malformed) == (0, 0, 0)
+    assert (jitter_buffer.lost, jitter_buffer.stray, depacketizer.malformed) == (0, 0, 0)
     return units
 
 
-def kinds_of(packets: Sequence[tuple[RtpPacket, int]]) -> Counter[str]:
-    """Count the kinds of packets (RFC 6184, section 5.4)."""
+def count_types(packets: Sequence[tuple[RtpPacket, int]]) -> Counter[str]:
+    """Count the packet types (RFC 6184, section 5.4)."""
     names = {**dict.fromkeys(range(1, 24), SINGLE), 24: STAP_A, 28: FU_A}
     return Counter(names[packet.payload[0] & 0x1F] for packet, _ in packets)
 
 
 def check_each_picture(units: Sequence[AccessUnit]) -> None:
-    """Each picture that was sent is there, whole, in its order and at its time."""
+    """Assert that each sent picture arrived complete, in order and with its timestamp."""
     assert len(units) == COUNT
     assert all(unit.complete for unit in units)
     decoder = Decoder()
     pictures = [decoder.decode(unit.data) for unit in units]
     assert not any(picture is None or picture.corrupt for picture in pictures)
     assert [read_stamp(picture.luma) for picture in pictures if picture is not None] == STAMPS_NS
-    # The sender's RTP clock begins anywhere, and runs as the stamps do: to one tick, as both are rounded.
+    # The sender's RTP clock has any base and runs as the stamps do, to one tick, as both are rounded.
     ahead = [rtp_timestamp(stamp_ns) - unit.timestamp for stamp_ns, unit in zip(STAMPS_NS, units, strict=True)]
     assert {(ticks - ahead[0] + 1) % 2**32 for ticks in ahead} <= {0, 1, 2}
 
@@ -143,37 +143,37 @@ def slices_of(unit: AccessUnit) -> int:
 
 
 def coding_of(keyframe: AccessUnit) -> tuple[int, bool]:
-    """Read profile_idc and, after two numbers of one bit, entropy_coding_mode_flag (H.264, 7.3.2.1 and 7.3.2.2)."""
+    """Return profile_idc and, after two numbers of one bit, entropy_coding_mode_flag (H.264, 7.3.2.1 and 7.3.2.2)."""
     sets = {nal[0] & 0x1F: nal for nal in split_nal_units(keyframe.data)}
     return sets[7][1], bool(sets[8][1] & 0x20)
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_gstreamer_is_received(name: str, raw: Path, tmp_path: Path) -> None:
-    """Whatever kinds of packets GStreamer makes of whatever H.264, each picture arrives whole and its stamp is read."""
+    """Each picture that GStreamer sends, with any packet types and H.264 profile, arrives complete with its stamp."""
     case = CASES[name]
     command = GSTREAMER.format(
         encoder=case.encoder, profile=case.profile, aggregate=case.aggregate, raw="{raw}", port="{port}"
     )
-    packets = packets_from(command, raw, tmp_path / "said")
+    packets = receive_from(command, raw, tmp_path / "log")
     units = units_of(packets)
     check_each_picture(units)
-    kinds = kinds_of(packets)
-    assert kinds.keys() >= {*case.packets}
-    assert kinds.most_common(1)[0][0] == case.packets[0]
+    types = count_types(packets)
+    assert types.keys() >= {*case.packets}
+    assert types.most_common(1)[0][0] == case.packets[0]
     assert coding_of(units[0]) == (HIGH if case.profile == "high" else BASELINE)
     assert min(slices_of(unit) for unit in units) >= case.slices
 
 
 def test_ffmpeg_is_received(raw: Path, tmp_path: Path) -> None:
-    """Each picture that ffmpeg sends by RTP arrives whole and its stamp is read."""
-    packets = packets_from(FFMPEG, raw, tmp_path / "said")
+    """Each picture that ffmpeg sends by RTP arrives complete with its stamp."""
+    packets = receive_from(FFMPEG, raw, tmp_path / "log")
     check_each_picture(units_of(packets))
-    assert kinds_of(packets).keys() >= {FU_A, STAP_A}
+    assert count_types(packets).keys() >= {FU_A, STAP_A}
 
 
 def test_gstreamer_is_watched(raw: Path, tmp_path: Path) -> None:
-    """`lavt watch` accepts the stamps of all that GStreamer sends, but for those that its base is learned from."""
+    """`lavt watch` accepts the stamps of all pictures that GStreamer sends, except the first from which it learns."""
     options = ["--bind", "127.0.0.1", "--port", "0", "--sender", "foreign", "--json"]
     program = [sys.executable, "-m", "lavt", "watch", *options]
     with running(program, tmp_path / "watched", output=True) as watching:
@@ -182,15 +182,15 @@ def test_gstreamer_is_watched(raw: Path, tmp_path: Path) -> None:
         command = GSTREAMER.format(
             encoder=FAST, profile="constrained-baseline", aggregate="zero-latency", raw=raw, port=port
         )
-        with running(command.split(), tmp_path / "said") as tool:
-            assert tool.wait(LIMIT_S) == 0, (tmp_path / "said").read_text(errors="replace")
-        seen = 0
-        while seen < COUNT:
-            seen += json.loads(watching.stdout.readline())["second"]["pictures"]
+        with running(command.split(), tmp_path / "log") as tool:
+            assert tool.wait(LIMIT_S) == 0, (tmp_path / "log").read_text(errors="replace")
+        pictures = 0
+        while pictures < COUNT:
+            pictures += json.loads(watching.stdout.readline())["second"]["pictures"]
         watching.send_signal(signal.SIGINT)
         out, _ = watching.communicate(timeout=LIMIT_S)
-    in_all = json.loads(out.splitlines()[-1])["summary"]
+    summary = json.loads(out.splitlines()[-1])["summary"]
     assert watching.returncode == 0
-    assert (in_all["pictures"], in_all["stamps_accepted"]) == (COUNT, COUNT - LEARNED_AFTER + 1)
-    assert (in_all["lost"], in_all["stamps_unreadable"]) == (0, LEARNED_AFTER - 1)
-    assert "the check is weaker" in in_all["check"]
+    assert (summary["pictures"], summary["stamps_accepted"]) == (COUNT, COUNT - LEARNED_AFTER + 1)
+    assert (summary["lost"], summary["stamps_unreadable"]) == (0, LEARNED_AFTER - 1)
+    assert "weaker" in summary["check"]

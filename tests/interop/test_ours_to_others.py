@@ -1,4 +1,4 @@
-"""What our server sends to a plain receiver, as GStreamer and ffmpeg see it."""
+"""Our server's stream to a plain receiver, received by GStreamer and ffmpeg."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SERVER = shipped("configs/server.yaml")
 WIDTH_PX, HEIGHT_PX = 320, 240
 FRAME_BYTES = WIDTH_PX * HEIGHT_PX * 3 // 2
 WANTED = 90
-"""Frames, of three seconds."""
+"""Number of frames, for three seconds."""
 GSTREAMER = (
     "gst-launch-1.0 -q udpsrc address=127.0.0.1 port={port} buffer-size=4194304"
     " caps=application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96"
@@ -41,27 +41,27 @@ FFMPEG = (
 )
 
 
-class Stamps:
-    """A recorder that keeps the stamps of the frames sent."""
+class StampRecorder:
+    """A recorder that keeps the stamps of the sent frames."""
 
     def __init__(self) -> None:
         self.sent: list[int] = []
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
-        """Write one entry; frames are written before their packets go."""
+        """Record a message; frames are recorded before their packets are sent."""
         if topic == "frame":
             self.sent.append(payload.stamp_ns)
 
 
-class Nowhere:
-    """A link to a client that is not there."""
+class AbsentClientLink:
+    """A link to an absent client."""
 
     def send(self, *sends: Send) -> None:
-        """Forget messages."""
+        """Discard messages."""
 
 
-def changes(port: int) -> list[str]:
-    """Give what is changed of the shipped config: to whom, small pictures, a keyframe each half second."""
+def config_changes(port: int) -> list[str]:
+    """Return the changes of the shipped config: the receiver, small pictures, a keyframe every 0.5 s."""
     return [
         f"video.send_to=['127.0.0.1:{port}']",
         f"camera.width_px={WIDTH_PX}",
@@ -73,15 +73,16 @@ def changes(port: int) -> list[str]:
 
 
 @contextmanager
-def our_server(port: int) -> Iterator[Stamps]:
-    """Run the server's nodes in real time with a real socket; nobody holds the vehicle, so it stands."""
-    config = load_config(ServerConfig, SERVER, changes(port))
-    clock, stamps = MachineClock(), Stamps()
+def our_server(port: int) -> Iterator[StampRecorder]:
+    """Run the server's nodes in real time with a real socket; no client has control, so the vehicle is stationary."""
+    config = load_config(ServerConfig, SERVER, config_changes(port))
+    clock, stamps = MachineClock(), StampRecorder()
     link = UdpLink(clock, "feedback", lambda *_: None, bind=("127.0.0.1", 0))
     nodes = build_server(config, clock.now, MachineEntropy(), host="here", video_port=link.port).all
     runtime = RealRuntime(clock, nodes, stamps, lambda: None)
     with closing(link):
-        runtime.start({"video": link, "zenoh": Nowhere(), "probe": Nowhere(), "netem": Nowhere()})
+        absent = AbsentClientLink()
+        runtime.start({"video": link, "zenoh": absent, "probe": absent, "netem": absent})
         try:
             yield stamps
         finally:
@@ -89,34 +90,34 @@ def our_server(port: int) -> Iterator[Stamps]:
     assert runtime.failed is None
 
 
-def received(command: str, port: int, said: Path) -> tuple[list[int], list[int]]:
-    """Run a tool that writes raw frames until it has given enough of them: stamps sent, stamps read."""
-    with our_server(port) as stamps, running(command.split(), said, output=True) as tool:
+def receive_with(command: str, port: int, log: Path) -> tuple[list[int], list[int]]:
+    """Run a tool until it has written enough raw frames; return the stamps sent and the stamps read."""
+    with our_server(port) as stamps, running(command.split(), log, output=True) as tool:
         assert tool.stdout is not None
         frames = list(read_frames(tool.stdout, FRAME_BYTES, WANTED))
-    assert len(frames) == WANTED, said.read_text(errors="replace")
+    assert len(frames) == WANTED, log.read_text(errors="replace")
     lumas = [np.frombuffer(frame, np.uint8)[: WIDTH_PX * HEIGHT_PX].reshape(HEIGHT_PX, WIDTH_PX) for frame in frames]
     return stamps.sent, [read_stamp(luma) for luma in lumas]
 
 
 def check_each_in_order(sent: list[int], read: list[int]) -> None:
-    """From the first picture that the tool gave, it gave each one that was sent."""
+    """Assert that the tool returned every frame in order, from its first one on."""
     assert read[0] in sent
     begin = sent.index(read[0])
     assert read == sent[begin : begin + len(read)]
 
 
-def test_gstreamer_sees_each_frame(tmp_path: Path) -> None:
-    """GStreamer depacketizes and decodes what we send, and each picture has the stamp of the frame sent."""
+def test_gstreamer_receives_each_frame(tmp_path: Path) -> None:
+    """GStreamer receives and decodes our stream, and each picture has the stamp of the sent frame."""
     port = free_pair()
-    check_each_in_order(*received(GSTREAMER.format(port=port), port, tmp_path / "said"))
+    check_each_in_order(*receive_with(GSTREAMER.format(port=port), port, tmp_path / "log"))
 
 
 @pytest.mark.parametrize("flags", ["", "-fflags nobuffer -flags low_delay"])
-def test_ffmpeg_sees_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
-    """With no more than what `lavt sdp` prints ffmpeg finds and decodes our stream, and reads each stamp sent."""
+def test_ffmpeg_receives_each_frame_by_our_sdp(flags: str, tmp_path: Path) -> None:
+    """With the output of `lavt sdp` ffmpeg receives and decodes our stream, and each picture has its stamp."""
     port, sdp = free_pair(), tmp_path / "lavt.sdp"
-    settings = [part for change in changes(port) for part in ("--set", change)]
+    settings = [part for change in config_changes(port) for part in ("--set", change)]
     with sdp.open("wb") as file:
         subprocess.run([sys.executable, "-m", "lavt", "sdp", str(SERVER), *settings], stdout=file, check=True)
-    check_each_in_order(*received(FFMPEG.format(flags=flags, sdp=sdp), port, tmp_path / "said"))
+    check_each_in_order(*receive_with(FFMPEG.format(flags=flags, sdp=sdp), port, tmp_path / "log"))

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from tests.interop.tools import DEBIANS_PYTHON
+from tests.interop.tools import DEBIAN_PYTHON
 
 from lavt.clock import MachineClock
 from lavt.domain import NS_PER_S
-from lavt.transport.rtp.ntp_time import short_time
+from lavt.transport.rtp.ntp_time import ntp_to_short
 from lavt.transport.rtp.rtcp import (
     ReceptionReport,
     parse_announcement,
@@ -43,23 +43,23 @@ pipeline = Gst.parse_launch(
 session, out = pipeline.get_by_name("session"), pipeline.get_by_name("out")
 session.get_property("internal-session").set_property("rtcp-min-interval", 100_000_000)
 
-def say(kind, what):
-    print(json.dumps([kind, what]), flush=True)
+def print_message(kind, content):
+    print(json.dumps([kind, content]), flush=True)
 
-def tell_rtcp(_sink):
+def print_rtcp(_sink):
     buffer = out.emit("pull-sample").get_buffer()
-    say("rtcp", buffer.extract_dup(0, buffer.get_size()).hex())
+    print_message("rtcp", buffer.extract_dup(0, buffer.get_size()).hex())
     return Gst.FlowReturn.OK
 
-def tell_event(_pad, info):
+def print_event(_pad, info):
     structure = info.get_event().get_structure()
     if structure is not None:
-        say("event", structure.get_name())
+        print_message("event", structure.get_name())
     return Gst.PadProbeReturn.OK
 
-out.connect("new-sample", tell_rtcp)
+out.connect("new-sample", print_rtcp)
 pad = pipeline.get_by_name("send").get_static_pad("src")
-pad.add_probe(Gst.PadProbeType.EVENT_UPSTREAM, tell_event)
+pad.add_probe(Gst.PadProbeType.EVENT_UPSTREAM, print_event)
 pipeline.set_state(Gst.State.PLAYING)
 NAMES = ("ssrc", "have-sr", "sr-ntptime", "sr-rtptime", "sr-octet-count", "sr-packet-count",
          "have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter", "rb-round-trip")
@@ -68,41 +68,43 @@ for line in sys.stdin:
     if kind == "stats":
         stats = session.get_property("stats")
         sources = stats.get_value("source-stats")
-        say("stats", [{name: source.get_value(name) for name in NAMES if source.has_field(name)} for source in sources])
+        print_message(
+            "stats", [{name: source.get_value(name) for name in NAMES if source.has_field(name)} for source in sources]
+        )
     else:
         pipeline.get_by_name(kind).emit("push-buffer", Gst.Buffer.new_wrapped(bytes.fromhex(rest[0])))
 pipeline.set_state(Gst.State.NULL)
 """
 
 
-class Session:
-    """GStreamer's rtpsession in a process of its own: it receives our stream 77 and sends a stream 99 of its own."""
+class GStreamerSession:
+    """GStreamer's rtpsession in another process: it receives our stream 77 and sends its own stream 99."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
-    def tell(self, kind: str, datagram: bytes = b"") -> None:
-        """Give it RTP, RTCP, or RTP to send (`rtp`, `rtcp`, `send`)."""
+    def push(self, kind: str, datagram: bytes = b"") -> None:
+        """Push received RTP (`rtp`), received RTCP (`rtcp`) or RTP to send (`send`), or request `stats`."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{kind} {datagram.hex()}\n")
         self._process.stdin.flush()
 
-    def hear(self, kind: str) -> Any:
-        """Wait for the next thing of a kind that it says."""
+    def read(self, kind: str) -> Any:
+        """Wait for its next message of a kind and return the content."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            said, what = json.loads(line)
-            if said == kind:
-                return what
+            message_kind, content = json.loads(line)
+            if message_kind == kind:
+                return content
         raise AssertionError("GStreamer has ended")
 
 
 @contextmanager
-def gstreamer() -> Iterator[Session]:
+def gstreamer() -> Iterator[GStreamerSession]:
     pipe = subprocess.PIPE
-    with subprocess.Popen([DEBIANS_PYTHON, "-c", SESSION], stdin=pipe, stdout=pipe, text=True) as process:
+    with subprocess.Popen([DEBIAN_PYTHON, "-c", SESSION], stdin=pipe, stdout=pipe, text=True) as process:
         try:
-            yield Session(process)
+            yield GStreamerSession(process)
         finally:
             process.kill()
 
@@ -111,59 +113,59 @@ def packet(sequence: int, ssrc: int) -> bytes:
     return RtpPacket(96, sequence % 2**16, 3000 * sequence, ssrc, True, b"\x41abc").to_bytes()
 
 
-def heard_with_age(session: Session, highest_sequence: int) -> ReceptionReport:
+def read_report_with_age(session: GStreamerSession, highest_sequence: int) -> ReceptionReport:
     """Return the first reception report that has a packet and the age of a sender report.
 
-    GStreamer repeats its reports. Packets and sender report take different threads there: either may come later. The
-    age is 0 in a report that leaves as the sender report arrives.
+    GStreamer repeats its reports. It handles packets and sender reports in different threads, so either may come later.
+    The age is 0 in a report that is sent when the sender report arrives.
     """
     while True:
-        for block in parse_feedback(bytes.fromhex(session.hear("rtcp"))).reports:
+        for block in parse_feedback(bytes.fromhex(session.read("rtcp"))).reports:
             if block.last_report_age_ns > 0 and block.highest_sequence == highest_sequence:
                 return block
 
 
 @pytest.mark.timeout(60)
-def test_gstreamer_hears_our_sender() -> None:
-    """GStreamer's receiver reads our sender report to the last bit and sends the middle of its time back."""
+def test_gstreamer_reads_our_sender_reports() -> None:
+    """GStreamer's receiver parses all fields of our sender report and returns its time in short format."""
     with gstreamer() as session:
         for number in range(65_530, 65_540):
-            session.tell("rtp", packet(number, OURS))
+            session.push("rtp", packet(number, OURS))
         wall_ns = 1_700_000_000_123_456_789
         report = sender_report(OURS, wall_ns=wall_ns, rtp_timestamp=123, packets=10, octets=40, cname="camera@lavt")
-        told_ns = CLOCK.now().mono_ns
-        session.tell("rtcp", report)
+        sent_ns = CLOCK.now().mono_ns
+        session.push("rtcp", report)
         (sent,) = parse_announcement(report).reports
-        block = heard_with_age(session, highest_sequence=65_539)
+        block = read_report_with_age(session, highest_sequence=65_539)
         assert block.media_ssrc == OURS
-        assert block.last_report == short_time(sent.ntp_time)
-        assert block.last_report_age_ns < CLOCK.now().mono_ns - told_ns
-        session.tell("stats")
-        (source,) = (each for each in session.hear("stats") if each["ssrc"] == OURS)
+        assert block.last_report == ntp_to_short(sent.ntp_time)
+        assert block.last_report_age_ns < CLOCK.now().mono_ns - sent_ns
+        session.push("stats")
+        (source,) = (each for each in session.read("stats") if each["ssrc"] == OURS)
         names = ("have-sr", "sr-ntptime", "sr-rtptime", "sr-packet-count", "sr-octet-count")
         assert [source[name] for name in names] == [True, sent.ntp_time, 123, 10, 40]
 
 
 @pytest.mark.timeout(60)
-def test_gstreamer_hears_our_receiver() -> None:
-    """GStreamer's sender reads our receiver report, knows the round trip that we made, and obeys a picture loss."""
+def test_gstreamer_reads_our_receiver_reports() -> None:
+    """GStreamer's sender parses our receiver report, computes the round-trip time and accepts a picture loss."""
     with gstreamer() as session:
         for number in range(5):
-            session.tell("send", packet(number, THEIRS))
+            session.push("send", packet(number, THEIRS))
         while True:
-            reports = parse_announcement(bytes.fromhex(session.hear("rtcp"))).reports
+            reports = parse_announcement(bytes.fromhex(session.read("rtcp"))).reports
             if reports:
                 break
         (sent,) = reports
         assert (sent.ssrc, sent.packets, sent.octets) == (THEIRS, 5, 20)
-        six_seconds_ago = (short_time(sent.ntp_time) - 6 * 65_536) % 2**32
+        six_seconds_ago = (ntp_to_short(sent.ntp_time) - 6 * 65_536) % 2**32
         report = ReceptionReport(THEIRS, 65_541, 0.25, 3, 17, six_seconds_ago, 5 * NS_PER_S)
-        session.tell("rtcp", receiver_report(RECEIVER, report, clock_ns=NS_PER_S))
-        session.tell("rtcp", picture_loss(RECEIVER, THEIRS))
-        while session.hear("event") != "GstForceKeyUnit":
+        session.push("rtcp", receiver_report(RECEIVER, report, clock_ns=NS_PER_S))
+        session.push("rtcp", picture_loss(RECEIVER, THEIRS))
+        while session.read("event") != "GstForceKeyUnit":
             pass
-        session.tell("stats")
-        (source,) = (each for each in session.hear("stats") if each["ssrc"] == RECEIVER)
+        session.push("stats")
+        (source,) = (each for each in session.read("stats") if each["ssrc"] == RECEIVER)
         names = ("have-rb", "rb-ssrc", "rb-fractionlost", "rb-packetslost", "rb-exthighestseq", "rb-jitter")
         assert [source[name] for name in names] == [True, THEIRS, 64, 3, 65_541, 17]
         assert 65_536 <= source["rb-round-trip"] < 30 * 65_536

@@ -1,4 +1,4 @@
-"""GStreamer and ffmpeg: whether they are here, and how they are run so that none outlives its test."""
+"""GStreamer and ffmpeg: checks that they are installed, and running them so that none outlives its test."""
 
 from __future__ import annotations
 
@@ -22,38 +22,48 @@ PACKAGES = (
     "python3-gst-1.0",
     "gir1.2-gst-plugins-base-1.0",
 )
-"""Debian's; .ci/run installs them."""
+"""Debian packages; .ci/run installs them."""
 PROGRAMS = ("gst-launch-1.0", "gst-inspect-1.0", "ffmpeg")
 ELEMENTS = (
-    "udpsrc", "rtpjitterbuffer", "rtph264depay", "avdec_h264", "videoconvert", "fdsink",
-    "filesrc", "rawvideoparse", "x264enc", "rtph264pay", "udpsink", "rtpsession",
-)  # fmt: skip
-DEBIANS_PYTHON = "/usr/bin/python3"
-"""For which Debian's modules of GStreamer are made."""
+    "udpsrc",
+    "rtpjitterbuffer",
+    "rtph264depay",
+    "avdec_h264",
+    "videoconvert",
+    "fdsink",
+    "filesrc",
+    "rawvideoparse",
+    "x264enc",
+    "rtph264pay",
+    "udpsink",
+    "rtpsession",
+)
+DEBIAN_PYTHON = "/usr/bin/python3"
+"""The Python of Debian's GStreamer modules."""
 MODULES = "import gi; gi.require_version('GstApp', '1.0'); from gi.repository import Gst, GstApp"
 LIMIT_S = 60.0
-"""By then a tool that works has ended long ago, on however busy a machine."""
+"""Longest run of a tool: more than a working tool needs, even on a busy machine."""
 
 
 @functools.cache
 def missing() -> tuple[str, ...]:
-    """Name the programs, Python modules and elements of GStreamer that are not here."""
+    """Return the missing programs, Python modules and GStreamer elements."""
     if absent := tuple(program for program in PROGRAMS if shutil.which(program) is None):
         return absent
-    python = shutil.which(DEBIANS_PYTHON)
+    python = shutil.which(DEBIAN_PYTHON)
     if python is None or subprocess.run([python, "-c", MODULES], check=False, capture_output=True).returncode:
         return ("GStreamer's modules for Debian's Python",)
-    requested = ["gst-inspect-1.0", "--exists"]
-    return tuple(each for each in ELEMENTS if subprocess.run([*requested, each], check=False).returncode)
+    command = ["gst-inspect-1.0", "--exists"]
+    return tuple(each for each in ELEMENTS if subprocess.run([*command, each], check=False).returncode)
 
 
 @contextmanager
-def running(command: list[str], said: Path, *, output: bool = False) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a tool, what it says going to the file `said`; with `output` its standard output is a pipe.
+def running(command: list[str], log: Path, *, output: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a tool with its messages in the file `log`; with `output` its standard output is a pipe.
 
-    It is killed at the end, and after `LIMIT_S`, so that nothing waits for it for ever.
+    The tool is killed at the end, and after `LIMIT_S`, so that no test waits for it forever.
     """
-    with said.open("wb") as err:
+    with log.open("wb") as err:
         out = subprocess.PIPE if output else err
         tool = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
     watchdog = threading.Timer(LIMIT_S, tool.kill)
@@ -70,7 +80,7 @@ def running(command: list[str], said: Path, *, output: bool = False) -> Iterator
 
 
 def read_frames(output: IO[bytes], frame_bytes: int, count: int) -> Iterator[bytes]:
-    """Give raw frames as a tool writes them, until there are `count`; fewer where it ends before."""
+    """Yield up to `count` raw frames that a tool writes; fewer if the tool ends before."""
     for _ in range(count):
         frame = output.read(frame_bytes)
         if len(frame) < frame_bytes:

@@ -1,6 +1,6 @@
-"""What the tests on a real kernel share: the two machines, the truth of their clocks, and drives between them.
+"""Fixtures of the tests on a real kernel: the two machines, their true clock offset, and drives between them.
 
-Each test finds the machines as they were: nothing started by the one before, clocks set back, no queue left.
+Each test finds the machines unchanged: no programs of an earlier test, clocks reset, and no qdiscs.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 from tests.kernel.lane import clocks, netem
-from tests.kernel.lane.driving import Drive, Loop, collect, start_loop, wait_for_the_end
-from tests.kernel.lane.guests import LINE
+from tests.kernel.lane.driving import DriveResult, LoopPrograms, collect, start_loop, wait_for_end
+from tests.kernel.lane.guests import SERIAL_LINE
 from tests.kernel.lane.host_stalls import HostProbe
 from tests.kernel.lane.machine import Machine, local_machine, remote_machine
 from tests.kernel.lane.verdicts import require_valid
@@ -21,7 +21,7 @@ from tests.support.inconclusive import SESSION
 from tests.support.stalls import Stalls
 
 LANE = os.environ.get("LAVT_KERNEL_LANE", "")
-"""`pair` in the first of two machines, `native` on this machine's own kernel; set by tests/kernel/run alone."""
+"""`pair` in the first of two machines, `native` on this machine's own kernel; set only by tests/kernel/run."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -32,9 +32,9 @@ def pytest_runtest_setup() -> None:
 
 @pytest.fixture(scope="session")
 def stalls(request: pytest.FixtureRequest) -> Stalls:
-    """Give the record of the host's stalls, as everywhere; inside a machine it is what the host's own probes tell."""
+    """Return the record of the host's stalls; inside a machine, the record of the host's own probes."""
     if LANE == "pair":
-        probe = HostProbe(LINE)
+        probe = HostProbe(SERIAL_LINE)
         measured = Stalls([probe], probe.processor_times)
     else:
         measured = Stalls.measured()
@@ -44,7 +44,7 @@ def stalls(request: pytest.FixtureRequest) -> Stalls:
 
 @pytest.fixture(scope="session")
 def machines() -> tuple[Machine, Machine]:
-    """Give both machines, with one time; `server_machine` and `client_machine` are what tests take."""
+    """Return both machines with equal wall clocks; tests use `server_machine` and `client_machine`."""
     if LANE != "pair":
         pytest.skip("needs two machines: run tests/kernel/run without --native")
     key = os.environ["LAVT_KERNEL_KEY"].encode()
@@ -55,70 +55,72 @@ def machines() -> tuple[Machine, Machine]:
 
 @pytest.fixture
 def server_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
-    """Give the vehicle's machine, which the tests run on."""
-    yield from as_it_was(machines[0])
+    """Return the vehicle's machine, which runs the tests."""
+    yield from restored_afterwards(machines[0])
 
 
 @pytest.fixture
 def client_machine(machines: tuple[Machine, Machine]) -> Iterator[Machine]:
-    """Give the remote machine."""
-    yield from as_it_was(machines[1])
+    """Return the remote machine."""
+    yield from restored_afterwards(machines[1])
 
 
-def as_it_was(machine: Machine) -> Iterator[Machine]:
-    less_raw_ns = machine.call(clocks.wall_less_raw_ns)
+def restored_afterwards(machine: Machine) -> Iterator[Machine]:
+    minus_raw_ns = machine.call(clocks.wall_minus_raw_ns)
     yield machine
-    machine.end_all()
-    machine.call(clocks.restore, less_raw_ns)
+    machine.stop_all()
+    machine.call(clocks.restore, minus_raw_ns)
     netem.clear(machine)
 
 
 @pytest.fixture
-def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Print a figure that was measured, whatever becomes of the test: the lane's output has them all."""
+def report_figure(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    """Return a function that prints a measured figure into the lane's output, whether or not the test passes."""
     plugins = request.config.pluginmanager
     reporter, capture = plugins.getplugin("terminalreporter"), plugins.getplugin("capturemanager")
     assert reporter is not None
     assert capture is not None
 
-    def line(figure: str) -> None:
+    def write_line(figure: str) -> None:
         with capture.global_and_fixture_disabled():
             reporter.write_line(f"\n{request.node.name}: {figure}")
 
-    return line
+    return write_line
 
 
 @pytest.fixture
 def true_offset_ns(server_machine: Machine, client_machine: Machine) -> Callable[[], int]:
-    """Tell how far the server's wall clock is ahead of the client's, from what both read of one counter."""
+    """Return a function that measures the server's wall clock less the client's, by the counter that both read."""
     return lambda: offset_ns(server_machine, client_machine)
 
 
 def offset_ns(server: Machine, client: Machine) -> int:
-    of_client = client.call(clocks.reading)
-    return clocks.ahead_ns(server.call(clocks.reading), of_client)
+    of_client = client.call(clocks.read_wall_clock)
+    return clocks.offset_ns(server.call(clocks.read_wall_clock), of_client)
 
 
 @pytest.fixture
-def drive(server_machine: Machine, client_machine: Machine, tmp_path: Path, stalls: Stalls) -> Callable[..., Drive]:
-    """Drive over both machines, from the start of the four programs to the result.
+def drive(
+    server_machine: Machine, client_machine: Machine, tmp_path: Path, stalls: Stalls
+) -> Callable[..., DriveResult]:
+    """Return a function that drives over both machines, from starting the four programs to the result.
 
-    Nothing may speak against the drive other than the reason its test is about, which begins with `about`.
+    The drive must be valid, except for a reason that begins with `expected_reason`.
     """
 
-    def once(
+    def drive_once(
         name: str = "drive",
         *,
         server: tuple[str, ...] = (),
         client: tuple[str, ...] = (),
-        about: str | None = None,
-        meanwhile: Callable[[Loop], None] = lambda _: None,
-    ) -> Drive:
+        expected_reason: str | None = None,
+        meanwhile: Callable[[LoopPrograms], None] = lambda _: None,
+    ) -> DriveResult:
         out = tmp_path / f"{name}-{len(list(tmp_path.iterdir()))}"
         loop = start_loop(server_machine, client_machine, out, server_changes=server, client_changes=client)
-        wait_for_the_end(loop, meanwhile)
-        driven = collect(loop, client_machine, out)
-        require_valid(driven, stalls, about)
-        return driven
+        wait_for_end(loop, meanwhile)
+        finished_drive = collect(loop, client_machine, out)
+        require_valid(finished_drive, stalls, expected_reason)
+        return finished_drive
 
-    return once
+    return drive_once

@@ -1,4 +1,4 @@
-"""Two network namespaces joined by a veth pair, and one-way delays between them by the kernel's receive stamps."""
+"""Two network namespaces joined by a veth pair, and one-way delays between them from the kernel's receive times."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from lavt.transport.arrival import SO_TIMESTAMPNS
 DEVICES = {"server": "va", "client": "vb"}
 ADDRESSES = {"server": ("10.9.0.1", "fd09::1"), "client": ("10.9.0.2", "fd09::2")}
 MARK = struct.Struct(">8sIq")
-AFTER_S = 0.35
-"""What is under way after the last has been sent gets so much time."""
+DRAIN_S = 0.35
+"""Time to wait for packets after the last one was sent."""
 _CLONE_NEWNET = 0x40000000
 _ALL_PROTOCOLS = 3
 _SO_RCVBUFFORCE = 33
 Result = TypeVar("Result")
-_lines = itertools.count()
+_numbers = itertools.count()
 
 
-def command(words: str) -> str:
-    """Run a command, which must succeed."""
-    ended = subprocess.run(words.split(), capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, f"{words}: {ended.stderr}"
-    return ended.stdout
+def command(command_line: str) -> str:
+    """Run a command that must succeed, and return its output."""
+    completed = subprocess.run(command_line.split(), capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, f"{command_line}: {completed.stderr}"
+    return completed.stdout
 
 
-def make_pair() -> None:
-    """Make both namespaces, with one link between them."""
+def create_namespaces() -> None:
+    """Create both namespaces and the link between them."""
     socket.socket(socket.AF_INET6, socket.SOCK_DGRAM).close()  # loads IPv6
     command("ip netns add server")
     command("ip netns add client")
@@ -49,14 +49,14 @@ def make_pair() -> None:
         command(f"ip -n {name} addr add {ADDRESSES[name][1]}/64 dev {device} nodad")
 
 
-def take_pair_away() -> None:
-    """Take both namespaces away."""
+def delete_namespaces() -> None:
+    """Delete both namespaces."""
     command("ip netns del server")
     command("ip netns del client")
 
 
 def inside(name: str, function: Callable[[], Result]) -> Result:
-    """Call a function in a thread that is in a namespace; what it starts is there, too."""
+    """Call a function in a thread inside a namespace; processes that it starts are in the namespace, too."""
     results: list[Any] = []
     errors: list[BaseException] = []
 
@@ -79,8 +79,8 @@ def inside(name: str, function: Callable[[], Result]) -> Result:
 
 
 @dataclass(frozen=True)
-class Flight:
-    """What is sent: from one namespace to the other, between two ports, with a first byte."""
+class ProbeFlow:
+    """A test flow from one namespace to the other, between two ports, with a given first byte."""
 
     name: str
     sender: Literal["server", "client"]
@@ -93,13 +93,13 @@ class Flight:
 
     @property
     def receiver(self) -> Literal["server", "client"]:
-        """Where it arrives."""
+        """The namespace that receives the flow."""
         return "client" if self.sender == "server" else "server"
 
 
 @dataclass
-class Flown:
-    """What arrived, in order: (number, one-way delay in milliseconds, kernel's receive stamp in nanoseconds)."""
+class Arrivals:
+    """The packets that arrived, in order: (number, one-way delay in milliseconds, receive time in nanoseconds)."""
 
     sent: int
     arrived: list[tuple[int, float, int]] = field(default_factory=list)
@@ -121,22 +121,22 @@ class Flown:
 
     @property
     def inversions(self) -> int:
-        """How often a packet arrived right after a later one."""
+        """How many packets arrived directly after a later one."""
         return sum(later < earlier for earlier, later in zip(self.numbers, self.numbers[1:], strict=False))
 
 
-def fly(
-    flights: Sequence[Flight], count: int, period_ms: float, *, at: dict[int, Callable[[], None]] | None = None
-) -> dict[str, Flown]:
-    """Send `count` of each flight and tell what arrived when.
+def send_flows(
+    flows: Sequence[ProbeFlow], count: int, period_ms: float, *, at: dict[int, Callable[[], None]] | None = None
+) -> dict[str, Arrivals]:
+    """Send `count` packets of each flow, and return what arrived.
 
-    `at` names what a thread does meanwhile, by number; until that is done, more than `count` are sent.
+    `at` maps packet numbers to functions that a thread runs meanwhile; sending continues until they have returned.
     """
     clock = MachineClock()
-    watchers = {name: inside(name, lambda name=name: _watcher(DEVICES[name])) for name in DEVICES}  # type: ignore[misc]
-    lines = [_Line(flight) for flight in flights]
-    flown = {flight.name: Flown(count) for flight in flights}
-    names = {line.mark: line.flight.name for line in lines}
+    captures = {name: inside(name, lambda name=name: _open_capture(DEVICES[name])) for name in DEVICES}  # type: ignore[misc]
+    sockets = [_FlowSockets(flow) for flow in flows]
+    arrivals = {flow.name: Arrivals(count) for flow in flows}
+    names = {flow_sockets.mark: flow_sockets.flow.name for flow_sockets in sockets}
     try:
         begin_ns = clock.now().mono_ns
         meanwhile: list[threading.Thread] = []
@@ -146,80 +146,80 @@ def fly(
             if at and number in at:
                 meanwhile.append(threading.Thread(target=at[number]))
                 meanwhile[-1].start()
-            for line in lines:
-                line.send(number, clock.now().wall_ns)
-                flown[line.flight.name].sent = number + 1
-            _take(watchers, names, flown)
+            for flow_sockets in sockets:
+                flow_sockets.send(number, clock.now().wall_ns)
+                arrivals[flow_sockets.flow.name].sent = number + 1
+            _receive(captures, names, arrivals)
             while clock.now().mono_ns < begin_ns + round((number + 1) * period_ms * NS_PER_MS):
                 pause(NS_PER_MS // 2)
-                _take(watchers, names, flown)
+                _receive(captures, names, arrivals)
         for thread in meanwhile:
             thread.join()
-        end_ns = clock.now().mono_ns + round(AFTER_S * NS_PER_S)
+        end_ns = clock.now().mono_ns + round(DRAIN_S * NS_PER_S)
         while clock.now().mono_ns < end_ns:
-            _take(watchers, names, flown)
+            _receive(captures, names, arrivals)
             pause(NS_PER_MS)
     finally:
-        for line in lines:
-            line.close()
-        for watcher in watchers.values():
-            watcher.close()
-    return flown
+        for flow_sockets in sockets:
+            flow_sockets.close()
+        for capture in captures.values():
+            capture.close()
+    return arrivals
 
 
-class _Line:
-    """The sockets of one flight."""
+class _FlowSockets:
+    """The sockets of one test flow."""
 
-    def __init__(self, flight: Flight) -> None:
-        self.flight = flight
-        self.mark = b"FLY%05d" % next(_lines)
-        family = socket.AF_INET if flight.version == 4 else socket.AF_INET6
-        kind = socket.SOCK_DGRAM if flight.protocol == "udp" else socket.SOCK_STREAM
-        there = ADDRESSES[flight.receiver][flight.version == 6]
-        self._receiver = inside(flight.receiver, lambda: _bound(family, kind, there, flight.destination))
-        here = ADDRESSES[flight.sender][flight.version == 6]
-        self._sender = inside(flight.sender, lambda: _bound(family, kind, here, flight.source))
+    def __init__(self, flow: ProbeFlow) -> None:
+        self.flow = flow
+        self.mark = b"FLY%05d" % next(_numbers)
+        family = socket.AF_INET if flow.version == 4 else socket.AF_INET6
+        kind = socket.SOCK_DGRAM if flow.protocol == "udp" else socket.SOCK_STREAM
+        receiver_address = ADDRESSES[flow.receiver][flow.version == 6]
+        self._receiver = inside(flow.receiver, lambda: _bound(family, kind, receiver_address, flow.destination))
+        sender_address = ADDRESSES[flow.sender][flow.version == 6]
+        self._sender = inside(flow.sender, lambda: _bound(family, kind, sender_address, flow.source))
         self._accepted: list[socket.socket] = []
-        if flight.protocol == "tcp":
+        if flow.protocol == "tcp":
             self._receiver.listen()
-        self._sender.connect((there, flight.destination))
-        if flight.protocol == "tcp":
+        self._sender.connect((receiver_address, flow.destination))
+        if flow.protocol == "tcp":
             self._accepted.append(self._receiver.accept()[0])
             self._sender.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, number: int, now_ns: int) -> None:
-        data = bytes([self.flight.first_byte]) + MARK.pack(self.mark, number, now_ns)
-        self._sender.send(data.ljust(self.flight.bytes_each, b"."))
+        data = bytes([self.flow.first_byte]) + MARK.pack(self.mark, number, now_ns)
+        self._sender.send(data.ljust(self.flow.bytes_each, b"."))
 
     def close(self) -> None:
-        for opened in (*self._accepted, self._sender, self._receiver):
-            opened.close()
+        for sock in (*self._accepted, self._sender, self._receiver):
+            sock.close()
 
 
 def _bound(family: int, kind: int, address: str, port: int) -> socket.socket:
-    opened = socket.socket(family, kind)
-    opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if kind == socket.SOCK_STREAM:  # no waiting for the last packets of a connection: the ports are used again
-        opened.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    opened.bind((address, port))
-    return opened
+    sock = socket.socket(family, kind)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if kind == socket.SOCK_STREAM:  # close without TIME_WAIT: the ports are used again
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    sock.bind((address, port))
+    return sock
 
 
-def _watcher(device: str) -> socket.socket:
-    """See everything that comes in, with the kernel's receive stamp."""
-    watcher = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ALL_PROTOCOLS))
-    watcher.bind((device, _ALL_PROTOCOLS))
-    watcher.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    watcher.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
-    watcher.setblocking(False)
-    return watcher
+def _open_capture(device: str) -> socket.socket:
+    """Open a socket that captures all incoming packets with the kernel's receive times."""
+    capture = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ALL_PROTOCOLS))
+    capture.bind((device, _ALL_PROTOCOLS))
+    capture.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    capture.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
+    capture.setblocking(False)
+    return capture
 
 
-def _take(watchers: dict[str, socket.socket], names: dict[bytes, str], flown: dict[str, Flown]) -> None:
-    for watcher in watchers.values():
+def _receive(captures: dict[str, socket.socket], names: dict[bytes, str], arrivals: dict[str, Arrivals]) -> None:
+    for capture in captures.values():
         while True:
             try:
-                frame, ancillary, _flags, address = watcher.recvmsg(2048, 64)
+                frame, ancillary, _flags, address = capture.recvmsg(2048, 64)
             except BlockingIOError:
                 break
             if address[2] == socket.PACKET_OUTGOING:
@@ -230,4 +230,4 @@ def _take(watchers: dict[str, socket.socket], names: dict[bytes, str], flown: di
             _, number, sent_ns = MARK.unpack_from(frame, found[1])
             seconds, nanoseconds = struct.unpack_from("qq", ancillary[0][2])
             stamp_ns = seconds * NS_PER_S + nanoseconds
-            flown[names[found[0]]].arrived.append((number, (stamp_ns - sent_ns) / NS_PER_MS, stamp_ns))
+            arrivals[names[found[0]]].arrived.append((number, (stamp_ns - sent_ns) / NS_PER_MS, stamp_ns))

@@ -1,4 +1,4 @@
-"""A port on the kernel's own CAN: vcan, which goes and comes back as a real interface does."""
+"""A CAN port on the kernel's own CAN: a vcan interface that is lost and recovers like a real one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def channel() -> Iterator[str]:
-    """A virtual CAN interface that is up."""
+    """Create a virtual CAN interface that is up, and delete it afterwards."""
     ip("link", "add", "vcan7", "type", "vcan")
     ip("link", "set", "vcan7", "up")
     yield "vcan7"
@@ -34,7 +34,7 @@ def channel() -> Iterator[str]:
 
 @pytest.fixture
 def ports(channel: str) -> Iterator[tuple[CanPort, CanPort]]:
-    """Two ports on it."""
+    """Open two ports on the interface."""
     with ExitStack() as ends:
         one, other = (
             ends.enter_context(closing(CanPort("socketcan", channel, {}, clock=MachineClock()))) for _ in range(2)
@@ -46,60 +46,60 @@ def now_ns() -> int:
     return MachineClock().now().mono_ns
 
 
-def until(done: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     end_ns = now_ns() + DEADLINE_S * NS_PER_S
-    while not done():
+    while not condition():
         assert now_ns() < end_ns, "it did not happen"
         pause(NS_PER_MS)
 
 
-def is_heard(sender: CanPort, hearer: CanPort) -> bool:
-    """Send and see whether anything comes; a bus that is gone carries nothing."""
+def is_received(sender: CanPort, receiver: CanPort) -> bool:
+    """Send a frame and return whether it arrives; a lost bus carries none."""
     try:
         sender.take(now_ns())
         sender.send([STEERING], now_ns())
         pause(NS_PER_MS)
-        return any(each.frame == STEERING for each in hearer.take(now_ns()))
+        return any(each.frame == STEERING for each in receiver.take(now_ns()))
     except BusGone:
         return False
 
 
-def why_gone(port: CanPort) -> str:
-    """Why a port can neither be read from nor written to."""
-    whys: list[str] = []
+def reason_gone(port: CanPort) -> str:
+    """Wait until a port reports the lost bus on reading and writing, and return the reason."""
+    reasons: list[str] = []
 
     def is_gone() -> bool:
         try:
             port.take(0)
         except BusGone as gone:
-            whys.append(str(gone))
-        return bool(whys)
+            reasons.append(str(gone))
+        return bool(reasons)
 
-    until(is_gone)
+    wait_until(is_gone)
     with pytest.raises(BusGone):
         port.send([STEERING], now_ns())
-    return whys[0]
+    return reasons[0]
 
 
-def test_frames(ports: tuple[CanPort, CanPort]) -> None:
-    """Frames come to the other port as they were, soon by the kernel's own time, and not back to the one that sent."""
+def test_frames_pass_unchanged(ports: tuple[CanPort, CanPort]) -> None:
+    """Frames reach the other port unchanged with the kernel's receive time, and do not return to the sender."""
     one, other = ports
     before_ns = now_ns()
     one.send([STEERING, FAR], before_ns)
-    heard = []
+    received = []
 
-    def is_all() -> bool:
-        heard.extend(other.take(now_ns()))
-        return len(heard) >= 2
+    def has_all() -> bool:
+        received.extend(other.take(now_ns()))
+        return len(received) >= 2
 
-    until(is_all)
-    assert [each.frame for each in heard] == [STEERING, FAR]
-    assert all(before_ns - NS_PER_MS < each.arrived_ns < now_ns() for each in heard)
+    wait_until(has_all)
+    assert [each.frame for each in received] == [STEERING, FAR]
+    assert all(before_ns - NS_PER_MS < each.arrived_ns < now_ns() for each in received)
     assert one.take(now_ns()) == []
 
 
 @pytest.mark.parametrize(
-    ("go", "come"),
+    ("disable", "enable"),
     [
         ([("link", "set", "vcan7", "down")], [("link", "set", "vcan7", "up")]),
         (
@@ -109,28 +109,30 @@ def test_frames(ports: tuple[CanPort, CanPort]) -> None:
     ],
     ids=["down and up", "gone and back"],
 )
-def test_gone_and_back(ports: tuple[CanPort, CanPort], go: list[tuple[str, ...]], come: list[tuple[str, ...]]) -> None:
-    """An interface that goes down, or away, is told by reading and writing, and heard again once it is back."""
+def test_lost_interface_is_reported_and_recovers(
+    ports: tuple[CanPort, CanPort], disable: list[tuple[str, ...]], enable: list[tuple[str, ...]]
+) -> None:
+    """An interface that goes down or is deleted is reported on reading and writing, and works again afterwards."""
     one, other = ports
-    until(lambda: is_heard(one, other))
-    for command in go:
+    wait_until(lambda: is_received(one, other))
+    for command in disable:
         ip(*command)
-    assert "socketcan vcan7" in why_gone(one)
-    why_gone(other)
-    for command in come:
+    assert "socketcan vcan7" in reason_gone(one)
+    reason_gone(other)
+    for command in enable:
         ip(*command)
-    until(lambda: is_heard(one, other))
-    until(lambda: is_heard(other, one))
+    wait_until(lambda: is_received(one, other))
+    wait_until(lambda: is_received(other, one))
 
 
-def test_kind(channel: str) -> None:
-    """The kernel says which channel is virtual; one that it does not have, or of another kind, is not."""
+def test_virtual_channels_are_recognised(channel: str) -> None:
+    """A vcan channel is virtual; a missing channel, or an interface of another kind, is not."""
     assert is_virtual("socketcan", channel)
     assert not is_virtual("socketcan", "lo")
     assert not is_virtual("socketcan", "can7")
 
 
-def test_no_such_channel() -> None:
-    """A channel that is not there is refused with what to do."""
+def test_missing_channel_is_rejected() -> None:
+    """A missing channel is rejected with a hint."""
     with pytest.raises(UserError, match=r"socketcan nosuch0 cannot be opened .*: name a channel that `ip link` shows"):
         CanPort("socketcan", "nosuch0", {}, clock=MachineClock())

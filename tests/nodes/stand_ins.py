@@ -1,6 +1,6 @@
-"""Small stand-ins for what is slow or moves by itself, and how to walk a message through a node."""
+"""Fakes of cameras and vehicles, and helpers that send a message through a node."""
 
-# ruff: noqa: D102 (stand-ins do what their protocols say)
+# ruff: noqa: D102 (the protocols document these methods)
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from lavt.domain import NS_PER_S, Actuation, CameraModel, GroundTruth, Now, Picture, Pose, VehicleEvent, VehicleState
 from lavt.node import Message, Node, Send
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.vehicle.camera import CapturedFrame
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
@@ -33,20 +33,20 @@ CAPABILITIES = Capabilities(
 
 
 def at(mono_ns: int, wall_ns: int | None = None) -> Now:
-    """Give a reading `mono_ns` after the begin; the wall clock goes with it unless told."""
+    """Return a clock reading `mono_ns` after the start; the wall clock is in step unless `wall_ns` is given."""
     return Now(MONO_NS + mono_ns, WALL_NS + (mono_ns if wall_ns is None else wall_ns))
 
 
 def give(
     node: Node, channel: str, payload: Any, now: Now, peer: Any = None, *, arrived: Now | None = None
 ) -> list[Send]:
-    """Walk one message through a node whose hops take no time."""
+    """Send one message through a node whose stages take no time, and return its sends."""
     message = Message(channel, payload, arrived or now, peer)
-    return walk(node.name, node.chains[channel], message, now, repeat(now)).sends
+    return run_stages(node.name, node.pipelines[channel], message, now, repeat(now)).sends
 
 
 def of(sends: list[Send], channel: str) -> list[Any]:
-    """Give the payloads on one channel."""
+    """Return the payloads on one channel."""
     return [send.payload for send in sends if send.channel == channel]
 
 
@@ -57,14 +57,14 @@ def noise(number: int, model: CameraModel = SMALL) -> Picture:
 
 @dataclass
 class NoiseCamera:
-    """A `Camera` whose pictures are small and all different; it remembers what it was asked."""
+    """A `Camera` with small pictures that are all different; it stores the arguments of each call."""
 
     model: CameraModel = SMALL
     rate_hz: float = 30.0
     phase_ns: int = 0
     broken: bool = False
     stuck: Picture | None = None
-    """The same buffer each time."""
+    """The picture to return each time."""
     requested: list[tuple[int, int, Pose | None]] = field(default_factory=list)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
@@ -75,14 +75,14 @@ class NoiseCamera:
 
 
 @dataclass
-class StandingVehicle:
-    """A `Vehicle` that is wherever the test puts it and remembers what it was asked to do."""
+class FakeVehicle:
+    """A `Vehicle` whose state the test sets; it stores the actuations and engagement that it gets."""
 
     speed_mps: float = 0.0
     now_ns: int = MONO_NS
-    happens: list[VehicleEvent] = field(default_factory=list)
-    accepted: list[Actuation] = field(default_factory=list)
-    wanted: bool = False
+    next_events: list[VehicleEvent] = field(default_factory=list)
+    applied: list[Actuation] = field(default_factory=list)
+    is_engage_requested: bool = False
     reached: list[ReachedCommand] = field(default_factory=list)
 
     @property
@@ -91,14 +91,14 @@ class StandingVehicle:
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
         self.now_ns = max(self.now_ns, to_ns)
-        happened, self.happens = self.happens, []
-        return happened
+        events, self.next_events = self.next_events, []
+        return events
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
-        self.accepted.append(actuation)
+        self.applied.append(actuation)
 
     def engage(self, wanted: bool, now_ns: int) -> None:  # noqa: ARG002 (the protocol's)
-        self.wanted = wanted
+        self.is_engage_requested = wanted
 
     def take_reached(self) -> list[ReachedCommand]:
         reached, self.reached = self.reached, []

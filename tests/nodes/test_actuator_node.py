@@ -1,4 +1,4 @@
-# ruff: noqa: D102 (a bench for tests: short methods say themselves what they do)
+# ruff: noqa: D102 (a test bench with short methods)
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, Literal
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.nodes.stand_ins import MONO_NS, StandingVehicle, at, give, of
+from tests.nodes.stand_ins import MONO_NS, FakeVehicle, at, give, of
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Command, EventKind, SessionReply, SessionRequest, State, VehicleEvent
 from lavt.node import WAKE, Send
 from lavt.nodes.actuator import POSE_AHEAD_NS, ActuatorNode
 from lavt.nodes.payloads import Admission, AtWheel, FrameWritten, Route
-from lavt.safety.gate import SafetyGate
+from lavt.safety.gate import RejectionReason, SafetyGate
 from lavt.safety.limiter import Limiter
 from lavt.safety.limits import LIMITS
 from lavt.transport.messages import decode, encode
@@ -27,20 +27,25 @@ TICK_NS = 20 * NS_PER_MS
 
 
 class Bench:
-    """An actuator node with a vehicle that stands, and a client that commands it."""
+    """An actuator node with a stationary vehicle, and a client that commands it."""
 
     def __init__(
         self,
         route: Route | None = None,
-        looks: Sequence[FrameTimes] = (),
+        sample_times: Sequence[FrameTimes] = (),
         after_collision: Literal["end", "continue"] = "end",
     ) -> None:
         numbers = count(1)
         limiter = Limiter(LIMITS, wheelbase_m=2.8448, max_steering_rad=0.513, max_braking_mps2=6.0)
-        self.vehicle = StandingVehicle()
+        self.vehicle = FakeVehicle()
         self.gate = SafetyGate(LIMITS, limiter, new_epoch=lambda: next(numbers), new_token=lambda: bytes(16))
         self.node = ActuatorNode(
-            self.vehicle, self.gate, start_ns=MONO_NS, route=route, looks=looks, after_collision=after_collision
+            self.vehicle,
+            self.gate,
+            start_ns=MONO_NS,
+            route=route,
+            sample_times=sample_times,
+            after_collision=after_collision,
         )
         self.mono_ns = 0
         self.sequence = 0
@@ -53,7 +58,7 @@ class Bench:
         return sends
 
     def go(self, duration_ns: int) -> list[Send]:
-        """Wake the node whenever it asked to, for so long."""
+        """Let time pass, and wake the node whenever it is due."""
         end_ns, sends = self.mono_ns + duration_ns, []
         while (wake_ns := self.node.next_wake_ns() - MONO_NS) <= end_ns:
             self.mono_ns = max(self.mono_ns, wake_ns)
@@ -61,7 +66,7 @@ class Bench:
         self.mono_ns = end_ns
         return sends
 
-    def ask(self, operation: Any, number: int = 0) -> SessionReply:
+    def request(self, operation: Any, number: int = 0) -> SessionReply:
         sends = self.take("session", encode(SessionRequest(operation, "alice", 1, number)), peer="query")
         (reply,) = [decode(SessionReply, send.payload) for send in sends if send.peer == "query"]
         self.epoch = reply.epoch or self.epoch
@@ -89,7 +94,7 @@ class Bench:
         return self.gate.state
 
     def armed(self) -> Bench:
-        self.ask("hold")
+        self.request("hold")
         for _ in range(51):
             self.go(TICK_NS)
             self.command()
@@ -100,8 +105,8 @@ class Bench:
         return [event.detail for event in of(self.sends, "event") if event.kind == kind]
 
 
-def test_the_state_is_told_50_times_a_second() -> None:
-    """In one second there are 50 states, each with the vehicle's own time and the safety state."""
+def test_the_state_is_published_50_times_a_second() -> None:
+    """The state is published 50 times a second, with the vehicle's own time and the safety state."""
     bench = Bench()
     states = [decode(State, payload) for payload in of(bench.go(NS_PER_S - 1), "state")]
     assert len(states) == 50
@@ -109,10 +114,10 @@ def test_the_state_is_told_50_times_a_second() -> None:
     assert [state.state_mono_ns for state in states] == sorted(state.state_mono_ns for state in states)
 
 
-def test_a_vehicle_that_lives_on_demand_is_looked_at_before_each_frame() -> None:
-    """Given the times of frames it wakes just before each of them, and for its state, and not at each physics step."""
+def test_lazy_physics_advances_before_each_frame() -> None:
+    """With sample times, physics advances just before each frame and for each state, not at each physics step."""
     frames = FrameTimes(MONO_NS + 7 * NS_PER_MS, 30.0)
-    bench, woken = Bench(looks=[frames]), []
+    bench, woken = Bench(sample_times=[frames]), []
     while (wake_ns := bench.node.next_wake_ns()) < MONO_NS + NS_PER_S:
         bench.mono_ns = wake_ns - MONO_NS
         bench.take(WAKE, None)
@@ -122,8 +127,8 @@ def test_a_vehicle_that_lives_on_demand_is_looked_at_before_each_frame() -> None
     assert len(woken) == 30 + 50
 
 
-def test_a_late_node_tells_one_state_and_says_that_the_physics_was_late() -> None:
-    """After a second of standstill of the node there is one state, not fifty, and an event tells of the lateness."""
+def test_a_late_node_publishes_one_state_and_reports_late_physics() -> None:
+    """After a stall of 1 s the node publishes one state and reports that physics was late."""
     bench = Bench()
     bench.mono_ns = NS_PER_S
     assert len(of(bench.take(WAKE, None), "state")) == 1
@@ -131,33 +136,46 @@ def test_a_late_node_tells_one_state_and_says_that_the_physics_was_late() -> Non
     assert bench.node.next_wake_ns() > at(NS_PER_S).mono_ns
 
 
-def test_an_admission_says_all_about_a_command() -> None:
-    """The record of an obeyed command holds what was sent, when it was received and applied, and what was asked."""
+def test_an_accepted_command_is_recorded_completely() -> None:
+    """The record of an accepted command has its content, its times and the limits that changed it."""
     bench = Bench().armed()
     admission = bench.drive(steering_rad=0.4)
     now = at(bench.mono_ns)
     assert admission == Admission(
-        bench.epoch, bench.sequence, now.wall_ns, 11, 22, now.mono_ns, now.wall_ns, now.mono_ns, "accepted", "",
-        "steering rate", "drive", 0.4, 0.5, 0.0,
-    )  # fmt: skip
-    assert bench.vehicle.accepted[-1].throttle == 0.5
+        epoch=bench.epoch,
+        sequence=bench.sequence,
+        stamp_ns=now.wall_ns,
+        sent_wall_ns=11,
+        stamp_received_wall_ns=22,
+        received_mono_ns=now.mono_ns,
+        received_wall_ns=now.wall_ns,
+        applied_mono_ns=now.mono_ns,
+        verdict="accepted",
+        reason="",
+        limited="steering rate",
+        mode="drive",
+        steering_rad=0.4,
+        throttle=0.5,
+        brake=0.0,
+    )
+    assert bench.vehicle.applied[-1].throttle == 0.5
     assert bench.node.counts["commands_limited"] == 1
 
 
 def test_a_rejected_command_is_recorded_and_not_applied() -> None:
-    """The record of a refused command has its reason and no time of application, and the vehicle is not asked."""
+    """A rejected command is recorded with its reason, reported in the state and not applied."""
     bench = Bench().armed()
-    requested = len(bench.vehicle.accepted)
+    before = len(bench.vehicle.applied)
     admission = bench.drive(epoch=99)
-    assert (admission.verdict, admission.reason) == ("rejected", "not the epoch in force")
+    assert (admission.verdict, admission.reason) == ("rejected", RejectionReason.WRONG_EPOCH)
     assert admission.applied_mono_ns is None
-    assert len(bench.vehicle.accepted) == requested
+    assert len(bench.vehicle.applied) == before
     (state,) = [decode(State, payload) for payload in of(bench.go(TICK_NS), "state")]
-    assert state.rejected == "not the epoch in force"
+    assert state.rejected == RejectionReason.WRONG_EPOCH
 
 
 def test_a_command_is_judged_by_its_arrival() -> None:
-    """Time spent in the node's queue is not held against a command: its arrival on the host counts."""
+    """A command is judged by its arrival on the host; time in the node's queue does not count."""
     bench = Bench().armed()
     arrived = at(bench.mono_ns)
     stamp_ns = bench.picture()
@@ -167,8 +185,8 @@ def test_a_command_is_judged_by_its_arrival() -> None:
     assert (admission.received_mono_ns, admission.applied_mono_ns) == (arrived.mono_ns, at(bench.mono_ns).mono_ns)
 
 
-def test_nothing_moves_before_the_first_drive_command_and_silence_stops() -> None:
-    """Armed, the vehicle gets no throttle before a drive command; 300 ms later it degrades, after 500 ms it stops."""
+def test_without_drive_commands_the_vehicle_does_not_move_and_stops() -> None:
+    """Armed without drive commands, the vehicle gets no throttle, degrades at 300 ms and stops at 500 ms."""
     bench = Bench().armed()
     bench.go(299 * NS_PER_MS)
     assert bench.safety == "driving"
@@ -176,29 +194,29 @@ def test_nothing_moves_before_the_first_drive_command_and_silence_stops() -> Non
     assert bench.safety == "degraded"
     bench.go(200 * NS_PER_MS)
     assert bench.safety == "safe_stop"
-    assert all(requested.throttle == 0 and requested.brake > 0 for requested in bench.vehicle.accepted)
+    assert all(requested.throttle == 0 and requested.brake > 0 for requested in bench.vehicle.applied)
 
 
 def test_a_drive_begins_and_ends_exactly_once() -> None:
-    """A drive begins when armed and has one ending, the first: a stop after `completed` is not another one."""
+    """A drive begins when armed and has one ending: the first ending event."""
     bench = Bench().armed()
     bench.drive()
     bench.vehicle.speed_mps = 8.0
     bench.go(300 * NS_PER_MS)
     bench.drive()
     assert bench.safety == "driving"
-    bench.vehicle.happens = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
+    bench.vehicle.next_events = [VehicleEvent(1, "lane_invasion", "left"), VehicleEvent(2, "completed", "")]
     bench.go(TICK_NS)
     assert bench.safety == "safe_stop"
-    bench.vehicle.happens = [VehicleEvent(3, "collision", "")]
+    bench.vehicle.next_events = [VehicleEvent(3, "collision", "")]
     bench.vehicle.speed_mps = 0.0
     bench.go(NS_PER_S)
     assert (bench.events("drive_began"), bench.events("ending")) == ([""], ["completed"])
     assert bench.events("lane_invasion") == ["left"]
 
 
-def test_a_stop_is_the_ending_once_the_vehicle_stands() -> None:
-    """A safe stop is an ending, told when the vehicle stands; armed anew, a new drive begins."""
+def test_a_safe_stop_ends_the_drive_at_standstill() -> None:
+    """A safe stop ends the drive at standstill; arming again begins a new drive."""
     bench = Bench().armed()
     bench.vehicle.speed_mps = 8.0
     bench.go(NS_PER_S)
@@ -214,48 +232,50 @@ def test_a_stop_is_the_ending_once_the_vehicle_stands() -> None:
 def test_whether_a_collision_ends_the_drive_is_a_setting(
     after_collision: Literal["end", "continue"], endings: list[str]
 ) -> None:
-    """A vehicle that goes on after a collision has it told each time, and its drive ends by what comes then."""
+    """With `after_collision: continue`, collisions are reported and the drive ends by a later event."""
     bench = Bench(after_collision=after_collision).armed()
     happening: tuple[EventKind, ...] = ("collision", "collision", "completed")
     for mono_ns, kind in enumerate(happening):
         bench.drive()
-        bench.vehicle.happens = [VehicleEvent(mono_ns, kind, "")]
+        bench.vehicle.next_events = [VehicleEvent(mono_ns, kind, "")]
         bench.go(TICK_NS)
     assert bench.events("ending") == endings
     assert len(bench.events("collision")) == 2
 
 
-def test_an_end_before_the_drive_is_none() -> None:
-    """What happens to a vehicle that nobody drives is told but ends no drive."""
+def test_an_event_before_the_drive_ends_no_drive() -> None:
+    """An event before the drive is reported and ends no drive."""
     bench = Bench()
-    bench.vehicle.happens = [VehicleEvent(1, "collision", "somebody drove into it")]
+    bench.vehicle.next_events = [VehicleEvent(1, "collision", "hit from behind")]
     bench.go(TICK_NS)
-    assert bench.events("collision") == ["somebody drove into it"]
+    assert bench.events("collision") == ["hit from behind"]
     assert bench.events("ending") == []
 
 
 def test_the_token_goes_to_the_camera_when_it_changes() -> None:
-    """Held: the camera gets the token, once; released: it is told that there is none."""
+    """The camera gets a new token once when control is acquired, and none when it is released."""
     bench = Bench()
-    bench.ask("hold")
-    bench.ask("hold")
+    bench.request("hold")
+    bench.request("hold")
     assert of(bench.sends, "video_token") == [bytes(16)]
-    bench.ask("release")
+    bench.request("release")
     assert of(bench.sends, "video_token") == [bytes(16), None]
 
 
 def test_transitions_and_requests_are_events() -> None:
-    """Every transition of the safety state and every session request is a line in the record."""
+    """Each safety transition and each session request is recorded as an event."""
     bench = Bench().armed()
-    assert bench.ask("emergency_stop", 5).granted
+    assert bench.request("emergency_stop", 5).granted
     assert [detail.split(":")[0] for detail in bench.events("safety")] == [
-        "disarmed -> arming", "arming -> driving", "driving -> emergency_stop",
-    ]  # fmt: skip
+        "disarmed -> arming",
+        "arming -> driving",
+        "driving -> emergency_stop",
+    ]
     assert bench.events("session") == ["hold by alice granted", "emergency_stop by alice granted"]
 
 
-def test_frozen_pictures_stop_the_vehicle_though_they_thaw() -> None:
-    """Five equal pictures stop it also when a different one follows before the next wake."""
+def test_frozen_pictures_stop_the_vehicle_though_they_change_again() -> None:
+    """Five equal pictures stop the vehicle even if a different one follows before the next wake."""
     bench = Bench().armed()
     for number in range(6):
         stamp_ns = at(bench.mono_ns).wall_ns + number
@@ -264,8 +284,8 @@ def test_frozen_pictures_stop_the_vehicle_though_they_thaw() -> None:
     assert bench.safety == "safe_stop"
 
 
-def test_the_route_is_told_once() -> None:
-    """The road is written down once, at the start."""
+def test_the_route_is_recorded_once() -> None:
+    """The route is recorded once, at the start."""
     route = Route("a_key", 1.0, ((0.0, 0.0),))
     bench = Bench(route)
     bench.go(NS_PER_S)
@@ -273,69 +293,70 @@ def test_the_route_is_told_once() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_bytes_from_anybody_are_survived_and_counted(data: bytes) -> None:
-    """Bytes that are no command or request are counted, answered by nothing, and move nothing."""
+def test_unreadable_messages_are_counted(data: bytes) -> None:
+    """Unreadable commands and requests are counted, not answered, and do not move the vehicle."""
     bench = Bench()
     assert bench.take("control", data) == []
     assert bench.take("session", data, peer=3) == []
     counts = bench.node.counts
     assert (counts["commands_unreadable"], counts["session_requests_unreadable"]) == (1, 1)
-    assert bench.vehicle.accepted == []
+    assert bench.vehicle.applied == []
 
 
 def states(sends: list[Send]) -> list[State]:
     return [decode(State, payload) for payload in of(sends, "state")]
 
 
-def test_the_state_tells_who_holds_and_who_asks() -> None:
-    """Holder and asker are in every state; who has not asked for 3 s is in none."""
+def test_the_state_names_operator_and_requester() -> None:
+    """The state names the active operator and the client that requests control, until that request expires."""
     bench = Bench().armed()
     bench.take("session", encode(SessionRequest("ask", "bob", 7, 0)), peer="query")
-    told = states(bench.go(2 * NS_PER_S))
-    assert {(state.active_operator, state.requested_by) for state in told} == {("alice", "bob")}
+    reported = states(bench.go(2 * NS_PER_S))
+    assert {(state.active_operator, state.requested_by) for state in reported} == {("alice", "bob")}
     assert {state.requested_by for state in states(bench.go(NS_PER_S + TICK_NS))[-1:]} == {""}
 
 
-def test_a_rejection_is_told_for_a_second() -> None:
-    """The state names why a command was refused, and a second after the last refusal no more."""
+def test_a_rejection_is_reported_for_1_s() -> None:
+    """The state contains the last rejection reason for 1 s."""
     bench = Bench().armed()
     bench.drive(epoch=99)
-    assert {state.rejected for state in states(bench.go(NS_PER_S - TICK_NS))} == {"not the epoch in force"}
+    assert {state.rejected for state in states(bench.go(NS_PER_S - TICK_NS))} == {RejectionReason.WRONG_EPOCH}
     assert {state.rejected for state in states(bench.go(3 * TICK_NS))[-1:]} == {""}
 
 
-def test_a_server_that_ends_stops_the_vehicle() -> None:
-    """Told that the server ends, the vehicle brakes, nobody holds it, the video's path closes, the drive has ended."""
+def test_a_server_shutdown_stops_the_vehicle_and_ends_the_drive() -> None:
+    """A server shutdown stops the vehicle, ends control, closes the video path and ends the drive."""
     bench = Bench().armed()
     bench.vehicle.speed_mps = 5.0
     sends = bench.take("server_ends", None)
     assert of(sends, "video_token") == [None]
     last = states(bench.go(TICK_NS))[-1]
-    assert (last.safety, last.reason, last.active_operator) == ("safe_stop", "the server was told to end", "")
-    assert bench.vehicle.accepted[-1].brake > 0
+    assert (last.safety, last.active_operator) == ("safe_stop", "")
+    assert "shutting down" in last.reason
+    assert bench.vehicle.applied[-1].brake > 0
     bench.vehicle.speed_mps = 0.0
     bench.go(TICK_NS)
     assert bench.events("ending") == ["safe_stop"]
 
 
-def test_the_vehicle_is_engaged_while_it_is_needed() -> None:
-    """The vehicle is told that it is wanted from arming on, and no more once it stands after a stop."""
+def test_the_vehicle_is_engaged_from_arming_to_standstill() -> None:
+    """The vehicle is engaged from arming on, until it is stationary after a stop."""
     bench = Bench()
     bench.go(TICK_NS)
-    assert not bench.vehicle.wanted
+    assert not bench.vehicle.is_engage_requested
     bench.armed()
     bench.drive()
-    assert bench.vehicle.wanted
+    assert bench.vehicle.is_engage_requested
     bench.vehicle.speed_mps = 5.0
     bench.go(NS_PER_S)
-    assert (bench.safety, bench.vehicle.wanted) == ("safe_stop", True)
+    assert (bench.safety, bench.vehicle.is_engage_requested) == ("safe_stop", True)
     bench.vehicle.speed_mps = 0.0
     bench.go(TICK_NS)
-    assert not bench.vehicle.wanted
+    assert not bench.vehicle.is_engage_requested
 
 
-def test_what_reaches_the_wheels_is_told_by_command() -> None:
-    """Of what the vehicle saw reaching its wheels, what was a command is told once, with its sequence and stamp."""
+def test_commands_that_reached_the_wheels_are_recorded() -> None:
+    """Each command that reached the wheels is recorded once, with its sequence number and stamp."""
     bench = Bench().armed()
     first, second = bench.drive(), bench.drive(steering_rad=0.1)
     assert first.applied_mono_ns is not None
@@ -345,5 +366,5 @@ def test_what_reaches_the_wheels_is_told_by_command() -> None:
     assert of(bench.go(TICK_NS), "wheel") == []
     third = bench.drive()
     bench.vehicle.reached = [ReachedCommand(third.applied_mono_ns or 0, reached_ns)] * 2
-    told = of(bench.go(TICK_NS), "wheel")
-    assert told == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]
+    reported = of(bench.go(TICK_NS), "wheel")
+    assert reported == [AtWheel(third.sequence, third.stamp_ns, third.applied_mono_ns or 0, reached_ns)]

@@ -37,7 +37,7 @@ FRAME_NS = NS_PER_S // 30
 TOKEN = bytes(range(16))
 HOME, ELSEWHERE = ("198.51.100.2", 4000), ("203.0.113.9", 4000)
 REPORT = receiver_report(1, ReceptionReport(2, 1, 0.0, 0, 0), clock_ns=0)
-PLEASE = picture_loss(1, 2)
+KEYFRAME_REQUEST = picture_loss(1, 2)
 
 
 def node_with(camera: Camera | None = None, *, send_to: tuple[tuple[str, int], ...] = ()) -> CameraNode:
@@ -61,14 +61,14 @@ def wake(node: CameraNode, mono_ns: int, wall_ns: int | None = None) -> list[Sen
     return give(node, WAKE, None, at(mono_ns, wall_ns))
 
 
-def prove(node: CameraNode, address: tuple[str, int] = HOME, mono_ns: int = 0) -> None:
+def validate_path(node: CameraNode, address: tuple[str, int] = HOME, mono_ns: int = 0) -> None:
     client = PathClient(TOKEN)
     (challenge,) = of(give(node, "feedback", client.hello(0), at(mono_ns), address), "rtp")
     assert give(node, "feedback", client.answer(challenge), at(mono_ns), address) == []
 
 
-def test_a_frame_is_told_sent_and_kept() -> None:
-    """A frame leaves as packets that carry its stamp's time, with its stamp and size told to the safety."""
+def test_a_frame_is_sent_reported_and_recorded() -> None:
+    """A frame is sent as packets with its RTP timestamp and reported with its stamp and size."""
     node = node_with(send_to=(HOME,))
     sends = wake(node, 0, wall_ns=123_456_789)
     (frame,) = of(sends, "frame")
@@ -80,8 +80,8 @@ def test_a_frame_is_told_sent_and_kept() -> None:
     assert {parse_packet(packet).timestamp for packet in packets} == {rtp_timestamp(frame.stamp_ns)}
 
 
-def test_the_safety_is_told_of_a_frame_before_its_first_packet_leaves() -> None:
-    """A command made from a frame never comes before the safety knows the frame's stamp, however short the way."""
+def test_a_frame_is_reported_before_its_first_packet() -> None:
+    """A frame is reported to the safety gate before its first packet is sent."""
     sends = wake(node_with(send_to=(HOME,)), 0)
 
     assert sends[0].channel == "frame"
@@ -89,7 +89,7 @@ def test_the_safety_is_told_of_a_frame_before_its_first_packet_leaves() -> None:
 
 
 def test_a_late_wake_skips_frames_and_counts_them() -> None:
-    """Woken three periods late it takes one picture, the newest due, at the time that was due, and counts the rest."""
+    """A late wake captures the newest due frame at its due time, and counts the skipped ones."""
     camera = NoiseCamera(phase_ns=5)
     node = node_with(camera)
     assert node.next_wake_ns() == MONO_NS + 5
@@ -103,8 +103,8 @@ def test_a_late_wake_skips_frames_and_counts_them() -> None:
     assert node.next_wake_ns() == MONO_NS + 5 + round(5 * NS_PER_S / 30)
 
 
-def test_it_renders_the_newest_pose_at_or_before_the_capture() -> None:
-    """Of the poses told, the newest not after the capture's due time is taken, also when newer ones are there."""
+def test_the_newest_pose_before_the_capture_is_used() -> None:
+    """A frame is rendered from the newest pose that is not later than its due time."""
     camera = NoiseCamera()
     node = node_with(camera)
     poses = [Pose(MONO_NS + offset_ns, 0.0, 0.0, 0.0) for offset_ns in (-5, -1, 0, 1, 7)]
@@ -114,8 +114,8 @@ def test_it_renders_the_newest_pose_at_or_before_the_capture() -> None:
     assert camera.requested[0][2] is poses[2]
 
 
-def test_without_a_pose_in_time_there_is_none() -> None:
-    """Poses that are all later than the capture are not used."""
+def test_a_later_pose_is_not_used() -> None:
+    """Poses later than the due time are not used."""
     camera = NoiseCamera()
     node = node_with(camera)
     give(node, "pose", Pose(MONO_NS + 1, 0.0, 0.0, 0.0), at(2))
@@ -124,8 +124,8 @@ def test_without_a_pose_in_time_there_is_none() -> None:
 
 
 @pytest.mark.parametrize("walls_ns", [[7] * 6, [7, 7, 8, 7, 8, 9], [1000, 1001, 1002, 1000, 1001, 1002]])
-def test_no_stamp_is_written_twice(walls_ns: list[int]) -> None:
-    """Whether the wall clock stands still or is stepped back, every frame has a stamp of its own."""
+def test_no_stamp_is_issued_twice(walls_ns: list[int]) -> None:
+    """Each frame has its own stamp, also if the wall clock stands still or is stepped back."""
     node = node_with()
     stamps = [of(wake(node, i * 2 * FRAME_NS, wall_ns), "frame")[0].stamp_ns for i, wall_ns in enumerate(walls_ns)]
     assert len(set(stamps)) == len(stamps)
@@ -133,54 +133,54 @@ def test_no_stamp_is_written_twice(walls_ns: list[int]) -> None:
 
 
 @pytest.mark.parametrize(("stuck", "fault"), [(True, True), (False, False)])
-def test_the_same_buffer_again_and_again_is_seen(*, stuck: bool, fault: bool) -> None:
-    """A camera that gives one buffer, stamp of the last frame in it, is frozen at the fifth; a live one is not."""
+def test_a_repeated_buffer_is_frozen(*, stuck: bool, fault: bool) -> None:
+    """A camera that repeats the same buffer is frozen at the fifth frame."""
     node = node_with(NoiseCamera(stuck=noise(0) if stuck else None))
-    written = IssuedStamps(5 * NS_PER_S, 5)
+    stamps = IssuedStamps(5 * NS_PER_S, 5)
     for number in range(5):
-        assert not written.frozen
+        assert not stamps.is_frozen
         (frame,) = of(wake(node, number * FRAME_NS + NS_PER_MS), "frame")
-        written.note(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
-    assert written.frozen == fault
+        stamps.add(frame.stamp_ns, frame.number, frame.stamped_mono_ns, frame.pixel_crc)
+    assert stamps.is_frozen == fault
 
 
-def test_no_picture_is_counted_and_nothing_sent() -> None:
-    """A camera that gives nothing leaves a counted gap, and the next frame is asked for in time."""
+def test_a_missing_picture_is_counted_and_not_sent() -> None:
+    """A frame without a picture is counted and not sent, and the next frame is captured in time."""
     node = node_with(NoiseCamera(broken=True), send_to=(HOME,))
     assert wake(node, 0) == []
     assert node.counts["frames_missing"] == 1
     assert node.next_wake_ns() == MONO_NS + round(NS_PER_S / 30)
 
 
-def test_no_video_without_a_proven_path() -> None:
-    """Without a session or a proof no packet leaves; a proven address gets the video, and only while it reports."""
+def test_no_video_without_a_validated_path() -> None:
+    """Video is sent to a validated address only, and only while it sends reports."""
     node = node_with()
     assert of(wake(node, 0), "rtp") == []
     assert give(node, "feedback", PathClient(TOKEN).hello(0), at(1), HOME) == []
     give(node, "video_token", TOKEN, at(1))
     assert of(wake(node, FRAME_NS + 1), "rtp") == []
-    prove(node, mono_ns=FRAME_NS + 2)
+    validate_path(node, mono_ns=FRAME_NS + 2)
     assert {send.peer for send in wake(node, 2 * FRAME_NS + 1) if send.channel == "rtp"} == {HOME}
     assert of(wake(node, 3 * NS_PER_S), "rtp") == []
     assert node.counts["frames_without_receiver"] == 3
 
 
-def test_plain_receivers_named_in_the_config_get_video_unasked() -> None:
-    """`send_to` gets every frame, beside whoever has proven its path."""
+def test_configured_receivers_get_video_without_validation() -> None:
+    """`send_to` addresses get every frame, in addition to the validated address."""
     node = node_with(send_to=(ELSEWHERE,))
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     assert {send.peer for send in wake(node, 0) if send.channel == "rtp"} == {HOME, ELSEWHERE}
 
 
-def test_a_keyframe_on_request_is_rate_limited() -> None:
-    """However often the receiver asks, there is at most one extra keyframe in 100 ms."""
+def test_keyframe_requests_are_rate_limited() -> None:
+    """There is at most one requested keyframe in 100 ms."""
     node = node_with()
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     sizes = []
     for number in range(12):
-        give(node, "feedback", PLEASE, at(number * FRAME_NS + NS_PER_MS), HOME)
+        give(node, "feedback", KEYFRAME_REQUEST, at(number * FRAME_NS + NS_PER_MS), HOME)
         (unit,) = of(wake(node, number * FRAME_NS + 2 * NS_PER_MS), "video")
         sizes.append(any(unit.data[i : i + 4] == b"\x00\x00\x01\x65" for i in range(len(unit.data))))
     assert sizes[0]
@@ -188,11 +188,11 @@ def test_a_keyframe_on_request_is_rate_limited() -> None:
     assert sum(sizes) == node.counts["keyframes_on_request"]
 
 
-def test_changes_of_the_bit_rate_bring_no_flood_of_keyframes() -> None:
-    """Each change is a keyframe: of a receiver that asks for another with each frame, every one in 100 ms is heard."""
+def test_bit_rate_changes_are_rate_limited() -> None:
+    """There is at most one bit rate change, and its keyframe, in 100 ms."""
     node = node_with()
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     keyframes = 0
     for number in range(30):
         limit = max_bit_rate(1, 2, 500_000 + number * 10_000, overhead_bytes=0)
@@ -202,15 +202,15 @@ def test_changes_of_the_bit_rate_bring_no_flood_of_keyframes() -> None:
     assert 8 <= keyframes <= 11
 
 
-def test_strangers_move_nothing() -> None:
-    """RTCP and hellos from anywhere else bring no keyframe, keep no path open and take no video away."""
+def test_other_addresses_have_no_effect() -> None:
+    """RTCP and hellos from other addresses have no effect."""
     node = node_with()
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     wake(node, 0)
     forged = PathClient(bytes(16)).hello(0)
     for number in range(1, 90):
-        for datagram in (PLEASE, REPORT, forged, b"LAVT", b"\x80\xc9", b""):
+        for datagram in (KEYFRAME_REQUEST, REPORT, forged, b"LAVT", b"\x80\xc9", b""):
             assert give(node, "feedback", datagram, at(number * FRAME_NS), ELSEWHERE) == []
         sends = wake(node, number * FRAME_NS + NS_PER_MS)
         assert {send.peer for send in sends if send.channel == "rtp"} <= {HOME}
@@ -220,10 +220,10 @@ def test_strangers_move_nothing() -> None:
 
 
 def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
-    """A receiver that reports keeps its video; RTCP that cannot be read is counted and does no harm."""
+    """Receiver reports keep the video path open; unreadable RTCP is counted."""
     node = node_with()
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     for number in range(10):
         give(node, "feedback", REPORT, at(number * NS_PER_S // 2), HOME)
         give(node, "feedback", REPORT[:-3], at(number * NS_PER_S // 2), HOME)
@@ -234,17 +234,17 @@ def test_reports_keep_the_path_open_and_garbage_is_counted() -> None:
 
 
 def heavy_loss(node: CameraNode, at_ns: int) -> None:
-    """Let the receiver report that 30 of 100 packets were lost."""
+    """Report to the node that 30 of 100 packets were lost."""
     for highest, lost in ((1000, 0), (1100, 30)):
         report = receiver_report(1, ReceptionReport(2, highest, lost / 100, lost, 0), clock_ns=at_ns)
         give(node, "feedback", report, at(at_ns), HOME)
 
 
-def test_repair_packets_go_to_the_proven_receiver_only() -> None:
-    """Where the receiver reports loss, frames get repair packets; plain receivers get what every tool understands."""
+def test_repair_packets_go_to_the_validated_address_only() -> None:
+    """Repair packets are sent after reported loss, to the validated address only."""
     node = node_with(send_to=(ELSEWHERE,))
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
     heavy_loss(node, NS_PER_MS)
     kinds: dict[object, list[int]] = {HOME: [], ELSEWHERE: []}
     for send in wake(node, 2 * NS_PER_MS):
@@ -256,8 +256,8 @@ def test_repair_packets_go_to_the_proven_receiver_only() -> None:
     assert set(kinds[ELSEWHERE]) == {96}
 
 
-def test_a_sender_report_goes_with_a_frame_every_500_ms() -> None:
-    """Every receiver is told what was sent, and which wall time belongs to which RTP timestamp."""
+def test_a_sender_report_is_sent_every_500_ms() -> None:
+    """A sender report every 500 ms maps wall time to RTP timestamps."""
     node = node_with(send_to=(ELSEWHERE,))
     reports = []
     for number in range(46):
@@ -270,14 +270,14 @@ def test_a_sender_report_goes_with_a_frame_every_500_ms() -> None:
     assert reports == [(0, True), (15, True), (30, True), (45, True)]
 
 
-def test_the_receiver_may_ask_for_a_lower_bit_rate() -> None:
-    """A limit that the receiver asks for is kept to; one above the own rate, or of a stranger, changes nothing."""
+def test_the_receiver_may_request_a_lower_bit_rate() -> None:
+    """A requested lower bit rate is applied; a higher one, or one from another address, is not."""
     node = node_with()
     give(node, "video_token", TOKEN, at(0))
-    prove(node)
+    validate_path(node)
 
     def mean_bytes(begin: int) -> float:
-        """Of frames once the rate has settled; REPORT keeps the path open."""
+        """Return the mean frame size once the rate has settled; REPORT keeps the path open."""
         sizes: list[int] = []
         for number in range(begin, begin + 40):
             give(node, "feedback", REPORT, at(number * FRAME_NS), HOME)
@@ -293,8 +293,8 @@ def test_the_receiver_may_ask_for_a_lower_bit_rate() -> None:
     assert mean_bytes(141) == pytest.approx(own, rel=0.2)
 
 
-def test_what_a_device_sees_is_what_is_sent(tmp_path: Path) -> None:
-    """A picture of a device comes out of H.264 with its content and its frame's stamp, and none is sent twice."""
+def test_pictures_of_a_video_device_are_sent(tmp_path: Path) -> None:
+    """The pictures of a video device are sent once each, with their content and stamp."""
     path = write_video(tmp_path / "video.avi", rate_hz=30.0)
     receiver = VideoReceiver(Decoder(), (MOVING.height_px, MOVING.width_px))
     seen = []
@@ -309,11 +309,11 @@ def test_what_a_device_sees_is_what_is_sent(tmp_path: Path) -> None:
             assert received is not None
             assert receiver.read_stamp(received) == unit.stamp_ns
             seen.append(number_of(received.picture))
-    assert seen == sorted(set(seen))  # how many come in between depends on this machine
+    assert seen == sorted(set(seen))  # the number skipped depends on this machine
 
 
-def test_a_device_that_vanishes_sends_no_frames_and_is_counted(tmp_path: Path) -> None:
-    """A camera's last picture is sent once, with no time where none is known; when it is lost no frame follows."""
+def test_a_lost_video_device_is_counted(tmp_path: Path) -> None:
+    """A lost video device sends no further frames and is counted."""
     path = write_video(tmp_path / "short.avi", rate_hz=30.0, pictures=1)
     clock = MachineClock()
     device = VideoDevice(str(path), model=MOVING, rate_hz=30.0, clock=ManualClock(MONO_NS))

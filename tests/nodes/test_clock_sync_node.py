@@ -18,8 +18,8 @@ from lavt.transport.clock_sync.probe import (
 REPORT = ClockReport(5, 7, "kernel", "chrony", 0.25, 0.001)
 
 
-def test_it_asks_once_a_second() -> None:
-    """The host's source of time is asked at the start and every second from then on, without catching up."""
+def test_the_time_source_is_queried_once_a_second() -> None:
+    """The host's time source is queried at the start and every second, without catching up."""
     node = ClockSyncNode(MONO_NS)
     assert node.next_wake_ns() == MONO_NS
     assert give(node, WAKE, None, at(0)) == [Send("clock_query", None)]
@@ -28,22 +28,22 @@ def test_it_asks_once_a_second() -> None:
     assert node.next_wake_ns() == at(8 * NS_PER_S).mono_ns
 
 
-def test_being_late_does_not_add_up() -> None:
-    """A node that is woken late asks by the same grid of seconds as ever, and leaves out the ticks that it missed."""
+def test_lateness_does_not_accumulate() -> None:
+    """Late wakes keep the grid of seconds and skip missed ticks."""
     node = ClockSyncNode(MONO_NS)
     for late_ms, next_s in ((400, 1), (1_400, 2), (4_900, 5), (5_000, 6)):
         give(node, WAKE, None, at(late_ms * NS_PER_MS))
         assert node.next_wake_ns() == at(next_s * NS_PER_S).mono_ns
 
 
-def test_a_report_is_written_down_as_it_is() -> None:
-    """What the source says is written down with the reading of the clocks that it belongs to."""
+def test_a_report_is_recorded_unchanged() -> None:
+    """A clock report is recorded unchanged."""
     (send,) = give(ClockSyncNode(MONO_NS), "clock_report", REPORT, at(5, 99))
     assert send == Send("clock", REPORT)
 
 
 def test_the_client_probes_twice_a_second() -> None:
-    """The client sends a probe every 500 ms, with a number and its time, and asks its source every second time."""
+    """The client sends a numbered probe every 500 ms and queries its time source every second."""
     node = ProbingClockSyncNode(MONO_NS)
     sent = []
     for tick in range(10):
@@ -54,8 +54,8 @@ def test_the_client_probes_twice_a_second() -> None:
     assert requests == [(tick + 1, at(tick * NS_PER_S // 2 + 3).wall_ns) for tick in range(10)]
 
 
-def test_late_probes_are_not_made_up_for() -> None:
-    """A client that was held up sends one probe and asks its source once, and goes on by the same grid."""
+def test_missed_probes_are_skipped() -> None:
+    """After a stall the client sends one probe and one query, and keeps its grid."""
     node = ProbingClockSyncNode(MONO_NS)
     give(node, WAKE, None, at(0))
     sent = give(node, WAKE, None, at(3_700 * NS_PER_MS))
@@ -63,11 +63,11 @@ def test_late_probes_are_not_made_up_for() -> None:
     assert node.next_wake_ns() == at(4_000 * NS_PER_MS).mono_ns
 
 
-def test_the_server_answers_with_its_times_and_what_its_source_said_last() -> None:
-    """A reply goes to whoever asked, with the time of arrival, the time of the answer, correction and bound."""
+def test_a_reply_has_times_correction_and_bound() -> None:
+    """A reply has the times of arrival and answer, and the last correction and bound of the server."""
     node = ClockSyncNode(MONO_NS)
     message = Message("probe_request", encode_request(9, 1234), at(0), ("client", 1))
-    (stage,) = node.chains["probe_request"]
+    (stage,) = node.pipelines["probe_request"]
     (send,) = stage[1](message, at(400))
     assert (send.channel, send.peer) == ("probe_reply", ("client", 1))
     assert decode_reply(send.payload) == ProbeReply(9, 1234, at(0).wall_ns, at(400).wall_ns, None, None)
@@ -77,15 +77,15 @@ def test_the_server_answers_with_its_times_and_what_its_source_said_last() -> No
 
 
 def test_a_clock_that_is_set_back_between_arrival_and_answer() -> None:
-    """The server never says that it answered before it was asked: a client would take that for garbage."""
+    """If the clock is set back before the reply, the answer time is the arrival time, never an earlier one."""
     message = Message("probe_request", encode_request(9, 1234), at(0), ("client", 1))
-    (send,) = ClockSyncNode(MONO_NS).chains["probe_request"][0][1](message, at(400, -NS_PER_S))
+    (send,) = ClockSyncNode(MONO_NS).pipelines["probe_request"][0][1](message, at(400, -NS_PER_S))
     reply = decode_reply(send.payload)
     assert reply.answered_wall_ns == reply.received_wall_ns == at(0).wall_ns
 
 
-def test_an_exchange_is_written_down_with_all_four_times() -> None:
-    """The client writes down t1 to t4; the offset is half of both ways' difference, the round trip lacks t2 to t3."""
+def test_an_exchange_is_recorded_with_its_four_times() -> None:
+    """An exchange is recorded with its four times, which give offset and round trip."""
     node = ProbingClockSyncNode(MONO_NS)
     give(node, WAKE, None, at(0))
     sent_ns = at(0).wall_ns
@@ -97,8 +97,8 @@ def test_an_exchange_is_written_down_with_all_four_times() -> None:
     assert probe.round_trip_ns == 700
 
 
-def test_what_is_no_answer_is_counted() -> None:
-    """Garbage, a reply to nothing, a second reply and one with another t1 are counted and not written down."""
+def test_an_invalid_reply_is_counted() -> None:
+    """Garbage, unknown replies, repeated replies and replies with another t1 are counted and not recorded."""
     node = ProbingClockSyncNode(MONO_NS)
     give(node, WAKE, None, at(0))
     for data in (b"", bytes(48), encode_request(1, at(0).wall_ns)):
@@ -113,15 +113,15 @@ def test_what_is_no_answer_is_counted() -> None:
 
 
 def test_the_server_counts_garbage() -> None:
-    """What is no request is counted and not answered; nor is a reply, so that two servers keep still."""
+    """Garbage and replies sent to the server are counted and not answered."""
     node = ClockSyncNode(MONO_NS)
     for data in (b"", b"LC", bytes(48), encode_reply(ProbeReply(1, 2, 3, 4, None, None)), encode_request(1, 2) + b"x"):
         assert not give(node, "probe_request", data, at(0))
     assert node.counts["probes_rejected"] == 5
 
 
-def test_unanswered_probes_are_counted_and_forgotten() -> None:
-    """Where no answer comes the client remembers the last two seconds, and counts the rest as unanswered."""
+def test_unanswered_probes_are_counted() -> None:
+    """Probes older than two seconds without a reply are counted as unanswered."""
     node = ProbingClockSyncNode(MONO_NS)
     for tick in range(50):
         give(node, WAKE, None, at(tick * NS_PER_S // 2))

@@ -33,13 +33,13 @@ def packets(number: int = 3) -> list[list[bytes]]:
     return [packetizer.packetize(UNIT, 3000 * each) for each in range(number)]
 
 
-def test_it_is_silent_before_it_has_a_token() -> None:
-    """Without a session there is nobody to say hello to, and no wake is asked for."""
+def test_without_a_token_nothing_is_sent() -> None:
+    """Without a token the receiver sends nothing and requests no wake."""
     assert new_node(token=False).next_wake_ns() is None
 
 
-def test_hello_challenge_answer() -> None:
-    """It says hello at once and every 500 ms, answers the challenge, and so proves its path."""
+def test_path_validation_by_hello_and_challenge() -> None:
+    """The receiver sends a hello at once and every 500 ms, and answers the challenge."""
     node = new_node()
     server = PathServer(lambda: bytes(32))
     server.set_token(TOKEN)
@@ -55,7 +55,7 @@ def test_hello_challenge_answer() -> None:
 
 
 def test_the_same_token_again_changes_nothing() -> None:
-    """A session reply that repeats the token starts no new hello; a new token does."""
+    """A repeated token starts no new path validation; a new token does."""
     node = new_node()
     give(node, WAKE, None, at(0))
     give(node, "path_token", PathToken(TOKEN, PORT), at(1))
@@ -64,8 +64,8 @@ def test_the_same_token_again_changes_nothing() -> None:
     assert node.next_wake_ns() == 0
 
 
-def test_packets_become_access_units_with_their_arrival() -> None:
-    """Packets in order become access units, each with the arrival of its last packet on the socket."""
+def test_packets_become_access_units() -> None:
+    """Packets become access units with the arrival time of their last packet."""
     node = new_node()
     first, second, _ = packets()
     for packet in first:
@@ -78,8 +78,8 @@ def test_packets_become_access_units_with_their_arrival() -> None:
     assert unit.packet_mono_ns == at(11 * NS_PER_MS).mono_ns
 
 
-def test_reports_go_out_every_500_ms() -> None:
-    """From the first packet on there is a receiver report every 500 ms, with the share that was lost."""
+def test_a_receiver_report_is_sent_every_500_ms() -> None:
+    """A receiver report with the lost fraction is sent every 500 ms from the first packet on."""
     node = new_node()
     first, second, third = packets()
     reports = []
@@ -100,26 +100,26 @@ def test_reports_go_out_every_500_ms() -> None:
     assert reports[3][1].lost_fraction == 0
 
 
-def asks(sends: list[Send]) -> bool:
+def requests_keyframe(sends: list[Send]) -> bool:
     datagrams = [each for each in of(sends, "feedback") if not is_path_datagram(each)]
     return any(parse_feedback(each).picture_loss for each in datagrams)
 
 
-def test_a_loss_asks_for_a_keyframe() -> None:
-    """After a loss, and when the decoder has no picture, a keyframe is asked for, but once in 100 ms at most."""
+def test_a_loss_requests_a_keyframe() -> None:
+    """A loss or a missing picture requests a keyframe, at most once in 100 ms."""
     node = new_node()
     assert give(node, "picture_lost", None, at(0)) == []
     first, second, _ = packets()
     for packet in [*first, *second[1:]]:
         give(node, "rtp", packet, at(0))
-    assert asks(give(node, WAKE, None, at(10 * NS_PER_MS)))
+    assert requests_keyframe(give(node, WAKE, None, at(10 * NS_PER_MS)))
     times = [ms for ms in range(10, 400) if give(node, "picture_lost", None, at(ms * NS_PER_MS))]
     assert times == [110, 210, 310]
     assert node.counts["picture_loss_requests"] == 4
 
 
 def answered(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
-    """Let the node report, and the sender answer 30 ms after it heard."""
+    """Let the node send a report, and answer it 30 ms after its arrival."""
     (report,) = [each for each in of(give(node, WAKE, None, at(begin_ns)), "feedback") if not is_path_datagram(each)]
     (reference,) = parse_feedback(report).reference_times
     answer = ReferenceAnswer(reference.receiver_ssrc, reference.time, 30 * NS_PER_MS)
@@ -129,8 +129,8 @@ def answered(node: ReceiverNode, round_trip_ns: int, begin_ns: int = 0) -> None:
     assert give(node, "rtp", datagram, at(begin_ns + round_trip_ns + 30 * NS_PER_MS)) == []
 
 
-def test_it_asks_each_round_trip_until_the_keyframe_comes() -> None:
-    """Once the round trip is known, a request that brought no keyframe is made again after it and an encoding."""
+def test_a_keyframe_request_is_repeated_each_round_trip() -> None:
+    """With a known round trip, a keyframe request is repeated each round trip until the keyframe arrives."""
     node = new_node()
     first, second, third = packets()
     for packet in first:
@@ -138,16 +138,16 @@ def test_it_asks_each_round_trip_until_the_keyframe_comes() -> None:
     answered(node, 100 * NS_PER_MS)
     for packet in second[1:]:
         give(node, "rtp", packet, at(200 * NS_PER_MS))
-    times = [ms for ms in range(200, 700) if asks(give(node, WAKE, None, at(ms * NS_PER_MS)))]
+    times = [ms for ms in range(200, 700) if requests_keyframe(give(node, WAKE, None, at(ms * NS_PER_MS)))]
     assert times in ([210, 360, 510, 660], [210, 361, 512, 663]), "100 ms to 1/65536 s, and 50 ms"
     for packet in third:
         give(node, "rtp", packet, at(700 * NS_PER_MS))
-    assert not any(asks(give(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
+    assert not any(requests_keyframe(give(node, WAKE, None, at(ms * NS_PER_MS))) for ms in range(701, 1500))
     assert node.counts["picture_loss_requests"] == 4
 
 
-def test_a_round_trip_that_was_long_once_does_not_hold_requests_back() -> None:
-    """What counts is the round trip as it is known now, not as it was when the last keyframe was asked for."""
+def test_keyframe_requests_use_the_present_round_trip() -> None:
+    """Repeated requests use the present round trip, not that at the last request."""
     node = new_node()
     first, second, _ = packets()
     for packet in first:
@@ -155,13 +155,13 @@ def test_a_round_trip_that_was_long_once_does_not_hold_requests_back() -> None:
     answered(node, 3 * NS_PER_S)
     for packet in second[1:]:
         give(node, "rtp", packet, at(4 * NS_PER_S))
-    assert asks(give(node, WAKE, None, at(4 * NS_PER_S + 10 * NS_PER_MS)))
+    assert requests_keyframe(give(node, WAKE, None, at(4 * NS_PER_S + 10 * NS_PER_MS)))
     answered(node, 100 * NS_PER_MS, 4 * NS_PER_S + 600 * NS_PER_MS)
-    assert asks(give(node, WAKE, None, at(4 * NS_PER_S + 740 * NS_PER_MS)))
+    assert requests_keyframe(give(node, WAKE, None, at(4 * NS_PER_S + 740 * NS_PER_MS)))
 
 
-def test_a_repaired_loss_costs_nothing() -> None:
-    """A lost packet that a repair packet brings back leaves the access unit whole, and no keyframe is asked for."""
+def test_a_repaired_loss_requests_no_keyframe() -> None:
+    """A packet recovered by a repair packet completes its access unit without a keyframe request."""
     node = new_node()
     first, second, _ = packets()
     repairs = RepairSender(78, 0).repair(second, 1)
@@ -172,15 +172,15 @@ def test_a_repaired_loss_costs_nothing() -> None:
         assert of(give(node, "rtp", packet, at(20 * NS_PER_MS)), "access_unit") == []
     sends = give(node, "rtp", repairs[0], at(25 * NS_PER_MS))
     assert [(unit.data, unit.complete) for unit in of(sends, "access_unit")] == [(UNIT, True)]
-    assert not asks([*sends, *give(node, WAKE, None, at(50 * NS_PER_MS))])
+    assert not requests_keyframe([*sends, *give(node, WAKE, None, at(50 * NS_PER_MS))])
     assert [node.counts[f"packets_{name}"] for name in ("recovered", "lost", "of_repair")] == [1, 0, 1]
-    (report,) = [r for s in of(give(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(s)
-                 for r in parse_feedback(s).reports]  # fmt: skip
-    assert report.cumulative_lost == 1, "as it is before repair"
+    feedback = [each for each in of(give(node, WAKE, None, at(NS_PER_S)), "feedback") if not is_path_datagram(each)]
+    (report,) = [report for each in feedback for report in parse_feedback(each).reports]
+    assert report.cumulative_lost == 1, "losses are counted before repair"
 
 
-def test_each_second_is_written_down() -> None:
-    """The record has a line a second of how the stream arrived."""
+def test_reception_is_recorded_every_second() -> None:
+    """Reception statistics are recorded every second."""
     node = new_node()
     first, second, third = packets()
     samples = []
@@ -195,8 +195,8 @@ def test_each_second_is_written_down() -> None:
     assert [sample.lost_after_repair for sample in samples] == [0, 1, 0, 0]
 
 
-def test_a_bit_rate_is_requested_for_with_each_report() -> None:
-    """The highest bit rate that is configured goes out with every report."""
+def test_the_bit_rate_is_requested_with_each_report() -> None:
+    """The configured maximum bit rate is sent with every report."""
     node = ReceiverNode(JitterBuffer(), Depacketizer(), 700_000)
     give(node, "path_token", PathToken(TOKEN, PORT), at(0))
     first, *_ = packets()
@@ -211,7 +211,7 @@ def test_a_bit_rate_is_requested_for_with_each_report() -> None:
 
 @given(st.one_of(st.binary(max_size=80), st.binary(max_size=80).map(lambda tail: b"LAVT" + tail)))
 def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
-    """Whatever comes on the video's port is a packet, a challenge, or counted as unreadable."""
+    """Any datagram on the video port is a packet, a challenge, or counted as unreadable."""
     node = new_node()
     give(node, "rtp", datagram, at(0))
     give(node, WAKE, None, at(NS_PER_S))
@@ -224,7 +224,7 @@ def test_any_datagram_is_survived_and_counted(datagram: bytes) -> None:
 
 
 def test_a_challenge_without_a_session_is_counted() -> None:
-    """A challenge that nobody asked for is not answered."""
+    """A challenge without a session is counted and not answered."""
     node = new_node(token=False)
     assert give(node, "rtp", b"LAVT" + bytes(26), at(0)) == []
     assert node.counts["challenges_unreadable"] == 1

@@ -1,4 +1,4 @@
-"""Roads to look at: flat grey ground with painted lines, seen through the pinhole of `CameraModel`."""
+"""Pictures of roads: flat grey ground with painted lines, through the pinhole of `CameraModel`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Line:
     offset_m: float
     colour_bgr: tuple[int, int, int] = (225, 225, 225)
     dash_m: float = 9.0
-    """Painted length of each 9 m."""
+    """The painted length of each 9 m."""
     phase_m: float = 0.0
 
 
@@ -37,7 +37,7 @@ FOUR_LANES = (Line(8.75), Line(5.25, dash_m=3.0), *BROKEN_LANE, Line(-5.25))
 
 @dataclass(frozen=True)
 class Scene:
-    """Draws pictures of a straight or circular road from a place beside its centre."""
+    """A renderer of a straight or circular road from an offset to its centre."""
 
     model: CameraModel
 
@@ -48,7 +48,7 @@ class Scene:
         offset_m: float = 0.0,
         heading_rad: float = 0.0,
     ) -> Picture:
-        """Show the road from a car whose rear axle is `offset_m` left of the centre, turned left by `heading_rad`."""
+        """Return the picture from a car `offset_m` left of the centre and turned left by `heading_rad`."""
         places, x_m, y_m = fine_ground(self.model)
         along, across = on_road(x_m, y_m, curvature_per_m, offset_m, heading_rad)
         fine = bare_ground(self.model).copy()
@@ -63,19 +63,19 @@ class Scene:
 
 @cache
 def fine_depths(model: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return the ground (x, y) that each fine ray sees, infinite above the horizon."""
+    """Return the ground (x, y) of each fine ray, infinite above the horizon."""
     u = (np.arange(model.width_px * FINE) + 0.5) / FINE - 0.5
     v = (np.arange(model.height_px * FINE) + 0.5) / FINE - 0.5
     inverse = np.linalg.inv(ground_to_picture(calibrated(model)))
     rays = np.stack([*np.meshgrid(u, v), np.ones((len(v), len(u)))], axis=-1) @ inverse.T
-    below = rays[..., 2] > 1e-9  # the inverse's third row is the depth turned round: positive below the horizon
+    below = rays[..., 2] > 1e-9  # the inverse's third component is 1 / depth: positive below the horizon
     scale = np.where(below, rays[..., 2], 1.0)
     return np.where(below, rays[..., 0] / scale, np.inf), np.where(below, rays[..., 1] / scale, np.inf)
 
 
 @cache
 def fine_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Return which fine rays see ground that is near enough to have lines, and its x and y."""
+    """Return the fine rays that hit ground near enough to have lines, and the ground's x and y."""
     x_m, y_m = (each.ravel() for each in fine_depths(model))
     places = np.flatnonzero(x_m < 120)
     return places, x_m[places], y_m[places]
@@ -83,7 +83,7 @@ def fine_ground(model: CameraModel) -> tuple[NDArray[np.intp], FloatArray, Float
 
 @cache
 def bare_ground(model: CameraModel) -> NDArray[np.float32]:
-    """Return the fine picture of a road without lines."""
+    """Return the picture of a road without lines, with one pixel per fine ray."""
     x_m, _ = fine_depths(model)
     fine = np.full((*x_m.shape, 3), SKY_GREY, dtype=np.float32)
     fine[np.isfinite(x_m)] = ROAD_GREY
@@ -93,7 +93,7 @@ def bare_ground(model: CameraModel) -> NDArray[np.float32]:
 def on_road(
     x_m: FloatArray, y_m: FloatArray, curvature_per_m: float, offset_m: float, heading_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Take points of the vehicle's frame to (along, across) a road that starts straight ahead of the centre."""
+    """Return vehicle-frame points as (along, across) of a road that starts straight ahead."""
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     x, y = x_m * cosine - y_m * sine, offset_m + x_m * sine + y_m * cosine
     if curvature_per_m == 0:
@@ -104,7 +104,7 @@ def on_road(
 
 
 def centre_y_m(x_m: float, curvature_per_m: float) -> float:
-    """Give y of the centre of a road that starts along x at the rear axle."""
+    """Return y of the centre of a road that starts along x at the rear axle."""
     if curvature_per_m == 0:
         return 0.0
     radius = 1 / curvature_per_m

@@ -1,18 +1,15 @@
-"""The way back through a lens, from a pixel to the ground: an inverse by other means than what it checks."""
+"""The inverse projection through a lens, from a pixel to the ground, independent of the code under test."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from lavt.domain import FloatArray
-from lavt.perception.calibration import ALONG_RAY, CalibratedCamera, _bent, ground_to_camera
+from lavt.perception.calibration import RAY_STEPS, CalibratedCamera, _distort, ground_to_camera
 
 
 def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
-    """Tell which ground points the pixels (n, 2) of the distorted picture show.
-
-    (n, 2) in metres, NaN above the horizon.
-    """
+    """Return the ground points (n, 2) in metres of pixels (n, 2) of the distorted picture; NaN above the horizon."""
     rays = np.column_stack([straightened(camera, pixels), np.ones(len(pixels))])
     found = rays @ np.linalg.inv(ground_to_camera(camera)).T
     # The third component of the inverse is 1 / depth: positive where the ray meets the ground ahead of the camera.
@@ -20,16 +17,16 @@ def ground_points(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
 
 
 def straightened(camera: CalibratedCamera, pixels: FloatArray) -> FloatArray:
-    """Undo `_bent`: pixels (n, 2) to points of the plane one deep (n, 2), by Newton's method."""
+    """Invert `_distort` by Newton's method: pixels (n, 2) to points (n, 2) of the plane at depth 1."""
     straight = (pixels - camera.middle_px) / camera.focal_px
     if not camera.distortion:
         return straight
     rays, step = np.zeros_like(straight), 1e-6
-    for part in np.linspace(1 / ALONG_RAY, 1.0, ALONG_RAY):  # outwards from the axis, so that it finds the inner root
+    for part in np.linspace(1 / RAY_STEPS, 1.0, RAY_STEPS):  # outwards from the axis, to find the inner root
         target = camera.middle_px + part * (pixels - camera.middle_px)
         for _ in range(4):
-            here = _bent(camera, rays)
-            (a, c), (b, d) = (((_bent(camera, rays + each) - here) / step).T for each in np.eye(2) * step)
+            here = _distort(camera, rays)
+            (a, c), (b, d) = (((_distort(camera, rays + each) - here) / step).T for each in np.eye(2) * step)
             u, v = (here - target).T
             rays = rays - np.column_stack([d * u - b * v, a * v - c * u]) / (a * d - b * c)[:, None]
     return rays

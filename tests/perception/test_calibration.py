@@ -17,7 +17,7 @@ FISHEYE_LENS = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.03, 0.03), st.floats
 
 @st.composite
 def cameras(draw: st.DrawFn) -> CalibratedCamera:
-    """Cameras as people mount them, with the lenses people have."""
+    """Draw a camera with a common mounting and lens."""
     fisheye = draw(st.booleans())
     focal_px = draw(st.floats(250, 600))
     return CalibratedCamera(
@@ -47,8 +47,8 @@ def inside(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=60, derandomize=True)
 @given(cameras())
-def test_what_the_picture_shows_is_where_it_was(camera: CalibratedCamera) -> None:
-    """A ground point seen through any lens comes back from its pixel to its place, within 1 cm."""
+def test_projection_and_inverse_projection_agree(camera: CalibratedCamera) -> None:
+    """The inverse projection of a ground point's pixel is the point within 1 cm, through any lens."""
     pixels = picture_points(camera, GROUND)
     seen = inside(camera, pixels)
     assert np.abs(ground_points(camera, pixels[seen]) - GROUND[seen]).max(initial=0.0) < 0.01
@@ -56,18 +56,18 @@ def test_what_the_picture_shows_is_where_it_was(camera: CalibratedCamera) -> Non
 
 @settings(max_examples=20, derandomize=True)
 @given(cameras())
-def test_a_point_of_the_ground_lands_in_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
-    """Painted into the distorted picture where it is seen, a ground point comes out in its own bird's-eye cell."""
+def test_a_ground_point_maps_to_its_cell_through_any_lens(camera: CalibratedCamera) -> None:
+    """A spot in the distorted picture at a ground point's projection appears in that point's cell."""
     grid = GroundGrid()
-    view = bird_eye(camera, grid, stamped=False)
+    mapping = bird_eye(camera, grid, stamped=False)
     pixels = picture_points(camera, GROUND)
     for (x_m, y_m), (u, v) in zip(GROUND[inside(camera, pixels)], pixels[inside(camera, pixels)], strict=True):
         picture = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
         beside = round(60 / x_m)  # some 0.2 m: more than a cell
         picture[round(v) - 1 : round(v) + 2, round(u) - beside : round(u) + beside + 1] = 255
-        # How much ground the spot is decides how well its place can be known.
+        # The size of the spot on the ground limits the accuracy of its position.
         near, left = ground_points(camera, np.array([[u, v + 2], [u - beside, v]]))
-        rows, columns = np.nonzero(view.from_above(view.region(picture)))
+        rows, columns = np.nonzero(mapping.from_above(mapping.region(picture)))
         if len(rows) == 0:
             assert abs(x_m - near[0]) < 0.2 or x_m > 12  # three rows of pixels between two rows of cells
             continue
@@ -76,8 +76,8 @@ def test_a_point_of_the_ground_lands_in_its_cell_through_any_lens(camera: Calibr
         assert abs(off_y_m) < 0.05 + abs(y_m - left[1]) + abs(y_m - near[1])
 
 
-def test_the_angles_turn_as_they_say() -> None:
-    """Yaw looks to the left, pitch looks down, and roll lowers the right side."""
+def test_yaw_pitch_and_roll_have_their_signs() -> None:
+    """Positive yaw turns left, positive pitch turns down, and positive roll lowers the right side."""
     level = CalibratedCamera(640, 480, (320.0, 320.0), (319.5, 239.5), 0.0, 0.0, 1.4, 0.0, 0.0, 0.0)
 
     def turned(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
@@ -91,8 +91,8 @@ def test_the_angles_turn_as_they_say() -> None:
     assert np.linalg.det(turned(0.3, -0.2, 0.4)) == pytest.approx(1.0)
 
 
-def test_a_lens_that_folds_the_edge_back_shows_nothing_there() -> None:
-    """Far aside of a strong barrel lens the polynomial turns back; what it puts into the picture is not seen there."""
+def test_points_beyond_the_lens_models_field_are_invisible() -> None:
+    """A point beyond the angle where a barrel lens's polynomial folds back is not in the picture."""
     camera = CalibratedCamera(
         640, 480, (320.0, 320.0), (319.5, 239.5), 1.6, 0.0, 1.4, 0.0, 0.0, 0.0, (-0.3, 0.0, 0.0, 0.0, 0.0)
     )

@@ -26,7 +26,7 @@ def detect(picture: Picture) -> Lane:
 @pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 87, -1 / 87, 1 / 42, -1 / 42])
 @pytest.mark.parametrize("lines", [LANE, BROKEN_LANE, FOUR_LANES], ids=["solid", "broken", "four lanes"])
 def test_the_centre_is_found_on_every_curve(scene: Scene, lines: tuple[Line, ...], curvature_per_m: float) -> None:
-    """Out of one picture the centre is right within 5 cm from 4 to 18 m, down to a radius of 42 m."""
+    """In one picture the centre is right within 5 cm from 4 to 18 m, down to a radius of 42 m."""
     lane = detect(scene.picture(lines, curvature_per_m))
     for x_m in (4.0, 8.0, 12.0, 18.0):
         assert at(lane, x_m) == pytest.approx(centre_y_m(x_m, curvature_per_m), abs=0.05)
@@ -36,24 +36,24 @@ def test_the_centre_is_found_on_every_curve(scene: Scene, lines: tuple[Line, ...
 @pytest.mark.parametrize(
     ("offset_m", "heading_rad"), [(0.25, 0.026), (-0.25, -0.026), (0.8, 0.0), (-0.8, 0.1), (0.0, 0.2)]
 )
-def test_the_lane_is_told_in_the_vehicles_frame(scene: Scene, offset_m: float, heading_rad: float) -> None:
-    """A car left of the centre, turned left, sees the centre on its right and leading away to the right."""
+def test_the_lane_is_in_the_vehicles_frame(scene: Scene, offset_m: float, heading_rad: float) -> None:
+    """For a car left of the centre and turned left, the centre is on the right and leads to the right."""
     lane = detect(scene.picture(FOUR_LANES, offset_m=offset_m, heading_rad=heading_rad))
     for x_m in (5.0, 9.0):
         assert at(lane, x_m) == pytest.approx(-offset_m / np.cos(heading_rad) - x_m * np.tan(heading_rad), abs=0.05)
     assert lane.width_m == pytest.approx(3.5, abs=0.06)
 
 
-def test_a_mirrored_picture_gives_the_mirrored_lane(scene: Scene) -> None:
-    """Left and right are told by the picture alone: mirrored, a left curve is a right one."""
+def test_a_mirrored_picture_has_the_mirrored_lane(scene: Scene) -> None:
+    """The lane in a mirrored picture is the mirrored lane."""
     picture = scene.picture(BROKEN_LANE, 1 / 42, offset_m=0.2)
     seen, mirrored = detect(picture), detect(np.ascontiguousarray(picture[:, ::-1]))
     assert mirrored.centre == pytest.approx([-value for value in seen.centre], abs=0.01)
 
 
 @pytest.mark.parametrize("phase_m", np.arange(0.0, 9.0, 1.5))
-def test_dashes_that_run_alike_are_enough(scene: Scene, phase_m: float) -> None:
-    """With both lines broken in the same places the lane is found wherever the dashes are."""
+def test_aligned_dashes_are_enough(scene: Scene, phase_m: float) -> None:
+    """A lane whose two broken lines have their gaps side by side is found, wherever the dashes are."""
     lines = [Line(side * 1.75, dash_m=3.0, phase_m=phase_m) for side in (1, -1)]
     lane = detect(scene.picture(lines, 1 / 87))
     assert at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
@@ -61,40 +61,40 @@ def test_dashes_that_run_alike_are_enough(scene: Scene, phase_m: float) -> None:
 
 
 @pytest.mark.parametrize("light", [0.45, 1.1])
-def test_the_light_does_not_matter(scene: Scene, light: float) -> None:
-    """In half the light, or in more of it, the lane is found in the same place and as surely."""
+def test_the_lane_does_not_depend_on_the_light(scene: Scene, light: float) -> None:
+    """In darker or brighter light the lane is the same and the confidence remains high."""
     picture = scene.picture(FOUR_LANES, 1 / 87)
     bright, other = detect(picture), detect((picture * light).astype(np.uint8))
     assert other.centre == pytest.approx(bright.centre, abs=0.02)
     assert other.confidence > 0.8
 
 
-def test_yellow_lines_are_lines(scene: Scene) -> None:
-    """A lane between a yellow and a white line is a lane."""
+def test_a_yellow_line_is_a_line(scene: Scene) -> None:
+    """A lane between a yellow and a white line is found."""
     yellow = (60, 170, 200)
     assert detect(scene.picture((Line(1.75, yellow), Line(-1.75)))).confidence > 0.9
 
 
-def test_a_grey_picture_gives_no_confidence(scene: Scene) -> None:
-    """A picture with nothing in it gives confidence 0 at the start and after a lane, and keeps the lane seen last."""
+def test_an_empty_picture_has_no_confidence(scene: Scene) -> None:
+    """An empty picture has confidence 0, at the start and after a lane, and keeps the last lane."""
     detector = LaneDetector(MODEL)
     assert detector.detect(GREY).confidence == 0
     seen = detector.detect(scene.picture(LANE, 1 / 87))
     for _ in range(FORGET_AFTER + 2):
-        blind = detector.detect(GREY)
-        assert blind.confidence == 0
-        assert blind.centre == seen.centre
+        empty = detector.detect(GREY)
+        assert empty.confidence == 0
+        assert empty.centre == seen.centre
     assert detector.detect(scene.picture(LANE, -1 / 42)).centre == detect(scene.picture(LANE, -1 / 42)).centre
 
 
-def test_noise_alone_is_not_driven_on() -> None:
-    """Black and white noise is not taken for a lane."""
+def test_noise_is_not_a_lane() -> None:
+    """Black and white noise has too little confidence to drive by."""
     noise = np.random.Generator(np.random.Philox(5)).integers(0, 2, (120, 160, 1)).astype(np.uint8) * 255
     assert detect(noise.repeat(4, 0).repeat(4, 1).repeat(3, 2)).confidence < TRACK_CONFIDENCE
 
 
-def test_the_first_lane_stands_alone_and_later_ones_are_averaged(scene: Scene) -> None:
-    """The average starts with the first lane itself; then the newest picture has its weight."""
+def test_lanes_are_averaged_after_the_first(scene: Scene) -> None:
+    """The average starts with the first lane, and each newer lane has the weight `SMOOTHING`."""
     detector = LaneDetector(MODEL)
     first_picture, second_picture = scene.picture(), scene.picture(offset_m=0.3)
     first, second = detector.detect(first_picture), detector.detect(second_picture)
@@ -102,8 +102,8 @@ def test_the_first_lane_stands_alone_and_later_ones_are_averaged(scene: Scene) -
     assert second.centre[0] == pytest.approx((1 - SMOOTHING) * first.centre[0] + SMOOTHING * -0.3, abs=0.01)
 
 
-def test_the_lane_is_kept_when_the_car_leaves_it(scene: Scene) -> None:
-    """A car that drifts into the next lane is still told about the lane it came from."""
+def test_the_lane_is_kept_while_the_car_leaves_it(scene: Scene) -> None:
+    """While a car drifts into the next lane, the detector follows the lane it came from."""
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.01, 0.3):
         lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))
@@ -111,8 +111,8 @@ def test_the_lane_is_kept_when_the_car_leaves_it(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_a_lane_left_by_its_whole_width_is_given_up(scene: Scene, direction: int) -> None:
-    """A car that has got as far as the middle of the next lane is told about that one, as it stands in it."""
+def test_a_lane_is_dropped_one_width_away(scene: Scene, direction: int) -> None:
+    """When a car reaches the middle of the next lane, the detector changes to that lane."""
     detector = LaneDetector(MODEL)
     seen = [
         detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m))).centre[0]
@@ -125,11 +125,12 @@ def test_a_lane_left_by_its_whole_width_is_given_up(scene: Scene, direction: int
 
 
 @pytest.mark.parametrize(
-    "offset_m", [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0]
-)  # on a line either lane is right
+    "offset_m",
+    [-3.0, -2.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.5, 3.0],  # on a line either lane would be right
+)
 @pytest.mark.parametrize("curvature_per_m", [0.0, 1 / 42])
-def test_after_a_gap_the_nearest_lane_is_the_lane(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
-    """Wherever the car has got to while it saw nothing, the lane told next is the one that it stands in."""
+def test_after_a_gap_the_nearest_lane_is_found(scene: Scene, offset_m: float, curvature_per_m: float) -> None:
+    """After a gap without pictures the detector finds the lane that the car is then in."""
     six_lanes = (*FOUR_LANES, Line(-8.75, dash_m=3.0))
     detector = LaneDetector(MODEL)
     detector.detect(scene.picture(six_lanes))
@@ -139,16 +140,16 @@ def test_after_a_gap_the_nearest_lane_is_the_lane(scene: Scene, offset_m: float,
     assert at(lane, 5.0) == pytest.approx(expected_m + centre_y_m(5.0, curvature_per_m), abs=0.15)
 
 
-def test_the_sight_says_what_was_done(scene: Scene) -> None:
-    """The first picture is searched with windows, the next is followed without; both leave their steps to look at."""
+def test_the_trace_contains_the_steps(scene: Scene) -> None:
+    """The trace of a searched picture contains windows, that of a followed picture does not."""
     detector = LaneDetector(MODEL)
     detector.detect(scene.picture())
-    assert detector.sight is not None
-    assert detector.sight.windows
+    assert detector.trace is not None
+    assert detector.trace.windows
     detector.detect(scene.picture())
-    assert not detector.sight.windows
-    assert detector.sight.fit is not None
-    assert detector.sight.mask.shape == (164, 280)
+    assert not detector.trace.windows
+    assert detector.trace.fit is not None
+    assert detector.trace.mask.shape == (164, 280)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +162,7 @@ def test_the_sight_says_what_was_done(scene: Scene) -> None:
     ids=["barrel", "fisheye", "askew"],
 )
 def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
-    """Through a lens that bends lines, or from a camera mounted askew, the centre is right within 10 cm."""
+    """With a distorting lens or a tilted camera the centre is right within 10 cm."""
     camera = replace(calibrated(CameraModel(320, 240)), **lens)
     picture = distorted(camera, 1 / 87, 0.4)
     lane = LaneDetector(camera, stamped=False).detect(picture)
@@ -171,7 +172,7 @@ def test_the_lane_is_found_through_any_lens(lens: dict[str, Any]) -> None:
 
 
 def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float) -> Picture:
-    """Draw a road of four lanes as a calibrated camera sees it, pixel by pixel."""
+    """Return the picture of a road of four lanes in a calibrated camera, computed per pixel."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     ground = ground_points(camera, np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64))
     seen = np.isfinite(ground).all(axis=1) & (np.hypot(*np.nan_to_num(ground).T) < 60)
@@ -184,8 +185,8 @@ def distorted(camera: CalibratedCamera, curvature_per_m: float, offset_m: float)
     return shades.reshape(camera.height_px, camera.width_px, 3)
 
 
-def test_the_stamp_changes_nothing(scene: Scene) -> None:
-    """Whatever stands in the top left corner, the lane is the same."""
+def test_the_time_stamp_does_not_affect_the_lane(scene: Scene) -> None:
+    """The lane does not depend on the content of the top left corner."""
     picture = scene.picture(FOUR_LANES)
     stamped = picture.copy()
     stamped[:STAMP_SIDE_PX, :STAMP_SIDE_PX] = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((8, 8)))[..., None] * 255
@@ -193,20 +194,20 @@ def test_the_stamp_changes_nothing(scene: Scene) -> None:
 
 
 def test_a_picture_of_another_size_is_an_error() -> None:
-    """A picture that is not the camera's cannot be understood and is a programming error."""
-    with pytest.raises(ValueError, match="not \\(480, 640, 3\\)"):
+    """A picture of another size than the camera's raises `ValueError`."""
+    with pytest.raises(ValueError, match="480, 640, 3"):
         detect(np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_a_small_camera_sees_the_lane_too() -> None:
+def test_a_small_camera_finds_the_lane() -> None:
     """At 320 x 240 the centre is right within 10 cm."""
     model = CameraModel(320, 240)
     lane = LaneDetector(model).detect(Scene(model).picture(FOUR_LANES, 1 / 87))
     assert at(lane, 8.0) == pytest.approx(centre_y_m(8.0, 1 / 87), abs=0.1)
 
 
-def test_a_detector_that_forgets_takes_the_nearest_lane(scene: Scene) -> None:
-    """A car that has slid into the next lane is told of its old one, until the detector is made to forget it."""
+def test_forget_makes_the_detector_take_the_nearest_lane(scene: Scene) -> None:
+    """After a car has slid into the next lane the detector follows the old lane until `forget` is called."""
     detector = LaneDetector(MODEL)
     for offset_m in np.arange(0.0, 3.51, 0.25):
         lane = detector.detect(scene.picture(FOUR_LANES, offset_m=float(offset_m)))

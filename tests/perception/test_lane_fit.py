@@ -19,7 +19,7 @@ CURVE = (0.2, -0.03, 0.012)
 
 
 def lines(centre: tuple[float, float, float], offsets_m: tuple[float, ...], x_m: np.ndarray | None = None) -> Points:
-    """Paint parallels of a centre, exactly along its normal."""
+    """Return points on exact parallels of a centre."""
     x = np.arange(3.65, 20.0, 0.1) if x_m is None else x_m
     slope = centre[1] + 2 * centre[2] * x
     y = centre[0] + centre[1] * x + centre[2] * x * x
@@ -44,8 +44,8 @@ def error_m(fit: LaneFit | None, centre: tuple[float, float, float]) -> float:
     return float(np.max(np.abs(np.polyval(fit.centre[::-1], x) - np.polyval(centre[::-1], x))))
 
 
-def test_mask_cells_become_points_on_the_ground() -> None:
-    """The first row is the farthest, the first column the leftmost."""
+def test_mask_cells_are_converted_to_ground_points() -> None:
+    """The first cell of a mask is the farthest and leftmost point on the ground."""
     mask = np.zeros((GRID.rows, GRID.columns), dtype=np.uint8)
     mask[0, 0] = 255
     points = mark_points(mask, GRID)
@@ -54,7 +54,7 @@ def test_mask_cells_become_points_on_the_ground() -> None:
 
 
 def test_a_curved_lane_is_found_and_fitted() -> None:
-    """From nothing, the windows follow a curve of 42 m radius and the fit lies within 3 cm of its centre."""
+    """Windows follow a curve of 42 m radius, and the fit is within 3 cm of its centre."""
     _, fit = follow(lines(CURVE, (1.75, -1.75)))
     assert error_m(fit, CURVE) < 0.03
     assert fit is not None
@@ -62,32 +62,32 @@ def test_a_curved_lane_is_found_and_fitted() -> None:
     assert fit.confidence > 0.95
 
 
-def test_marks_of_the_lanes_beside_are_nobodys() -> None:
-    """Of six lines the windows take the two beside the car, also when it stands 0.6 m off the centre."""
+def test_marks_of_adjacent_lanes_are_ignored() -> None:
+    """Of six lines the windows take the two beside the car, also when it is 0.6 m off the centre."""
     points = lines((0.6, 0.0, 0.0), (8.75, 5.25, 1.75, -1.75, -5.25, -8.75))
     sides, fit = follow(points)
     assert error_m(fit, (0.6, 0.0, 0.0)) < 0.02
     assert set(np.round(points.y_m[sides > 0] - 0.6, 1)) == {1.7, 1.8}
 
 
-def test_points_near_a_known_lane_are_its_own() -> None:
-    """Half a metre off the line expected belongs to it, a metre off does not."""
+def test_points_near_a_known_lane_are_assigned_to_it() -> None:
+    """A point half a metre off an expected line belongs to it, a point a metre off does not."""
     points = Points(np.full(4, 10.0), np.array([2.25, 2.75, -1.3, -0.75]))
     assert sides_near(points, (0.0, 0.0, 0.0), 3.5).tolist() == [1, 0, -1, 0]
 
 
 def test_one_line_is_enough() -> None:
-    """With one line only, the centre is half the expected width beside it, and the confidence about half."""
+    """With one line the centre is half the expected width beside it, and the confidence is about half."""
     points = lines(CURVE, (-1.75,))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert error_m(fit, CURVE) < 0.03
     assert fit is not None
-    assert fit.left_seen == 0
+    assert fit.left_visible == 0
     assert fit.confidence == pytest.approx(0.5, abs=0.05)
 
 
-def test_lines_that_are_not_a_lane_apart_are_not_averaged() -> None:
-    """When the width measured is no lane's, only the line of which more is seen counts."""
+def test_an_implausible_width_is_not_used() -> None:
+    """When two lines are not a lane's width apart, only the line with more points is used."""
     long, short = lines((0.0, 0.0, 0.0), (1.75,)), lines((0.0, 0.0, 0.0), (-0.5,), np.arange(4, 9, 0.1))
     points = Points(np.concatenate([long.x_m, short.x_m]), np.concatenate([long.y_m, short.y_m]))
     sides = np.concatenate([np.full(len(long.x_m), 1), np.full(len(short.x_m), -1)]).astype(np.int8)
@@ -96,7 +96,7 @@ def test_lines_that_are_not_a_lane_apart_are_not_averaged() -> None:
 
 
 def test_a_short_stretch_is_fitted_straight() -> None:
-    """Less than 6 m of road give a line: their curvature would be noise."""
+    """Less than 6 m of visible lane is fitted without curvature."""
     points = lines(CURVE, (1.75, -1.75), np.arange(5.0, 10.0, 0.1))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert fit is not None
@@ -104,18 +104,18 @@ def test_a_short_stretch_is_fitted_straight() -> None:
 
 
 def test_a_patch_beside_the_line_does_not_bend_the_fit() -> None:
-    """Spots half a metre off a line are left out by the second pass, and lower the confidence."""
+    """Spots half a metre off a line do not bend the fit, but lower the share of paint on the lines."""
     clean = lines(CURVE, (1.75, -1.75))
     spots = lines(CURVE, (1.2,), np.arange(12.0, 14.0, 0.1))
     points = Points(np.concatenate([clean.x_m, spots.x_m]), np.concatenate([clean.y_m, spots.y_m]))
     fit = fit_lane(points, sides_near(points, CURVE, 3.5), GRID, 3.5)
     assert error_m(fit, CURVE) < 0.04
     assert fit is not None
-    assert fit.fitting < 0.97
+    assert fit.on_line_share < 0.97
 
 
 def test_too_few_points_are_no_lane() -> None:
-    """Nothing, or a handful of points, gives no fit and no error."""
+    """No points, or a handful of points, have no fit and raise no error."""
     nothing = Points(np.empty(0), np.empty(0))
     assert start_line(nothing, GRID, 3.5) is None
     assert fit_lane(nothing, np.empty(0, dtype=np.int8), GRID, 3.5) is None
@@ -123,8 +123,8 @@ def test_too_few_points_are_no_lane() -> None:
     assert fit_lane(few, sides_near(few, (0.0, 0.0, 0.0), 3.5), GRID, 3.5) is None
 
 
-def test_speckle_is_hardly_believed() -> None:
-    """Points all over the place give no lane to follow: as many lie on the lines as by chance."""
+def test_speckle_has_little_confidence() -> None:
+    """Random points have no lane, or one with very little confidence."""
     generator = stream(1, "speckle")
     points = Points(generator.uniform(3.6, 20, 3000), generator.uniform(-7, 7, 3000))
     fit = fit_lane(points, sides_near(points, (0.0, 0.0, 0.0), 3.5), GRID, 3.5)

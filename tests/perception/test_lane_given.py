@@ -11,15 +11,15 @@ def seen(offset_m: float, confidence: float = 1.0) -> SeenLane:
     return SeenLane(1, 2, Lane((offset_m, 0.0, 0.0), 3.5, 3.6, 20.0, confidence))
 
 
-def test_it_averages_as_the_detector_of_pixels() -> None:
-    """The first lane stands alone; each next one moves the average by the weight that the theory reckons with."""
+def test_given_lanes_are_averaged_as_by_the_lane_detector() -> None:
+    """The average starts with the first lane, and each newer lane has the weight `SMOOTHING`."""
     given = GivenLane()
     assert given.detect(seen(1.0)).centre[0] == 1.0
     assert given.detect(seen(2.0)).centre[0] == pytest.approx(1.0 + SMOOTHING)
 
 
-def test_without_a_lane_it_keeps_the_last_and_says_so() -> None:
-    """What is hardly seen changes the confidence only; after some of these, or when told, the next lane is a first."""
+def test_the_last_lane_is_kept_with_low_confidence() -> None:
+    """A lane of low confidence changes only the confidence; after several, or `forget`, the average restarts."""
     given = GivenLane()
     given.detect(seen(1.0))
     lost = [given.detect(seen(5.0, confidence=0.1)) for _ in range(FORGET_AFTER)]

@@ -9,8 +9,8 @@ def road() -> Mask:
     return np.full((40, 640, 3), ROAD, dtype=np.uint8)
 
 
-def test_a_white_mark_is_found_and_nothing_else() -> None:
-    """A white stripe across the rows gives its own pixels, not those of the road beside it."""
+def test_only_the_white_mark_is_found() -> None:
+    """A white stripe across the rows is found without the road beside it."""
     picture = road()
     picture[:, 300:308] = 220
     mask = lane_pixels(picture)
@@ -20,36 +20,36 @@ def test_a_white_mark_is_found_and_nothing_else() -> None:
 
 
 def test_a_yellow_mark_is_found() -> None:
-    """Yellow counts as paint though it is hardly brighter than the road."""
+    """A yellow mark is found although it is hardly brighter than the road."""
     picture = road()
     picture[:, 300:308] = (30, 95, 130)
     assert not white_pixels(np.asarray(picture @ np.array([0.114, 0.587, 0.299])).astype(np.uint8)).any()
     assert lane_pixels(picture)[:, 301:307].all()
 
 
-def test_grain_in_glaring_light_is_not_paint() -> None:
-    """Stripes that are 40 levels brighter than a bright road, but only by a fifth, are its own texture."""
+def test_grain_in_bright_light_is_not_paint() -> None:
+    """Stripes 40 levels brighter than a bright road, but only by a fifth, are not paint."""
     picture = road() + np.uint8(115)
     picture[:, 300:308] += np.uint8(40)
     assert not lane_pixels(picture).any()
 
 
-def test_brighter_light_is_not_paint() -> None:
-    """A road that becomes bright gradually has no edges, so none of it is paint."""
+def test_a_brightness_gradient_is_not_paint() -> None:
+    """A road that becomes brighter gradually has no edges and no paint."""
     picture = road()
     picture[:] = np.linspace(60, 250, 640).astype(np.uint8)[None, :, None]
     assert not lane_pixels(picture).any()
 
 
-def test_a_bright_field_is_not_paint_inside() -> None:
-    """What is bright over more than a mark's width is paint at its rim at most."""
+def test_a_bright_area_is_not_paint_inside() -> None:
+    """A bright area wider than a mark is paint at its rim at most."""
     picture = road()
     picture[:, 200:440] = 220
     assert not lane_pixels(picture)[:, 260:380].any()
 
 
 def test_a_stripe_along_the_rows_is_not_paint() -> None:
-    """A bar across the road, as at a stop line, has no upright edges."""
+    """A bar across the road, such as a stop line, has no vertical edges and is not paint."""
     picture = road()
     picture[20:23] = 220
     assert not lane_pixels(picture).any()

@@ -1,4 +1,4 @@
-"""What all tests in real time share: they are marked, they wait with a limit, and the lightest drive that they need."""
+"""Fixtures of the real-time tests: their marks, waiting with a time limit, and the drives of the demo."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from lavt.recording.record import read_record
 
 HERE = Path(__file__).parent
 POLL_NS = 50 * NS_PER_MS
-LONGEST_S = 900
-"""A test may have to drive several times, on a host that is busy."""
+TIMEOUT_S = 900
+"""A test may have to drive several times on a busy host."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.realtime)
-            item.add_marker(pytest.mark.timeout(LONGEST_S))
+            item.add_marker(pytest.mark.timeout(TIMEOUT_S))
 
 
 @pytest.fixture(scope="session")
 def wait_until() -> Callable[[str, Callable[[], bool], float], None]:
-    def wait(what: str, holds: Callable[[], bool], limit_s: float) -> None:
+    def wait(expectation: str, condition: Callable[[], bool], limit_s: float) -> None:
         clock = MachineClock()
         limit_ns = clock.now().mono_ns + round(limit_s * NS_PER_S)
-        while not holds():
-            assert clock.now().mono_ns < limit_ns, f"waited {limit_s:g} s in vain until {what}"
+        while not condition():
+            assert clock.now().mono_ns < limit_ns, f"not within {limit_s:g} s: {expectation}"
             pause(POLL_NS)
 
     return wait
@@ -52,7 +52,7 @@ def wait_until() -> Callable[[str, Callable[[], bool], float], None]:
 
 @pytest.fixture(scope="session")
 def planned() -> Callable[..., PlannedRun]:
-    """Plan a real run as `lavt demo` drives it, with changes of its config."""
+    """Plan a run in real time as in `lavt demo`, with changes of its config."""
 
     def plan(*changes: str, repetition: int = 0) -> PlannedRun:
         sets = ["time=real", f"repetition={repetition}", *changes]
@@ -63,62 +63,62 @@ def planned() -> Callable[..., PlannedRun]:
 
 @dataclass(frozen=True)
 class RealDrive:
-    """One drive in real time: its records, its result, what the relay says against itself, and the closure."""
+    """One drive in real time: its directory, its result, the relay's invalid reasons, and the closure error."""
 
     out: Path
     result: dict[str, Any]
-    relay_says: list[str]
+    relay_reasons: list[str]
     closure_p95_ms: float | None
 
 
-def real_drive_in(out: Path, result: dict[str, Any]) -> RealDrive:
-    relay_says = relay_reasons(json.loads((out / "relay.json").read_text()))
+def read_drive(out: Path, result: dict[str, Any]) -> RealDrive:
+    reasons = relay_reasons(json.loads((out / "relay.json").read_text()))
     server, client = read_record(out / "server.mcap"), read_record(out / "client.mcap")
-    return RealDrive(out, result, relay_says, measure(server, client).closure_p95_ms)
+    return RealDrive(out, result, reasons, measure(server, client).closure_p95_ms)
 
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo left and what it said on a terminal, and when it ran."""
+    """A finished demo: its directory, exit code, terminal output and times."""
 
     out: Path
     code: int
-    said: str
+    output: str
     since_ns: int
     until_ns: int
 
     @cached_property
     def summary(self) -> dict[str, Any]:
-        """Return what summary.json had at the end."""
+        """Return the content of summary.json."""
         summary: dict[str, Any] = json.loads((self.out / "summary.json").read_text())
         return summary
 
     @cached_property
     def injected(self) -> dict[str, RealDrive]:
-        """Return its drives in real time, by condition."""
+        """Return the drives in real time by condition."""
         drives = {}
         for name in ("L0", "L5"):
             out = self.out / "runs" / f"real_a_key_{name}_00"
-            drives[name] = real_drive_in(out, json.loads((out / "result.json").read_text()))
+            drives[name] = read_drive(out, json.loads((out / "result.json").read_text()))
         return drives
 
 
-def at_a_terminal(arguments: list[str]) -> tuple[int, str]:
-    """Run a program with a terminal for its standard output and error."""
+def run_at_a_terminal(arguments: list[str]) -> tuple[int, str]:
+    """Run a program with a terminal as standard output and error; return its exit code and output."""
     terminal, end = pty.openpty()
     program = subprocess.Popen(arguments, stdout=end, stderr=end, stdin=subprocess.DEVNULL)
     os.close(end)
-    said = bytearray()
+    output = bytearray()
     while True:
         try:
             piece = os.read(terminal, 65536)
-        except OSError:  # Linux's way to say that the program has closed the terminal
+        except OSError:  # on Linux: the program has closed the terminal
             break
         if not piece:
             break
-        said += piece
+        output += piece
     os.close(terminal)
-    return program.wait(), said.decode(errors="replace")
+    return program.wait(), output.decode(errors="replace")
 
 
 @pytest.fixture(scope="session")
@@ -127,14 +127,14 @@ def demos(tmp_path_factory: pytest.TempPathFactory, stalls: Stalls) -> Shared[De
 
     def run() -> Demo:
         out, since_ns = tmp_path_factory.mktemp("demo") / "out", clock.now().mono_ns
-        code, said = at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
-        assert code == 0, said
-        return Demo(out, code, said, since_ns, clock.now().mono_ns)
+        code, output = run_at_a_terminal([sys.executable, "-m", "lavt", "demo", "--out", str(out)])
+        assert code == 0, output
+        return Demo(out, code, output, since_ns, clock.now().mono_ns)
 
     return Shared(stalls, run)
 
 
 @pytest.fixture
 def demo(demos: Shared[Demo]) -> Demo:
-    """Give the demo, run once where the host lets it."""
+    """Return the demo, run once per session unless the host stalled it."""
     return demos.get()

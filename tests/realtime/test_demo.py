@@ -1,4 +1,4 @@
-"""The main job, as a person at a terminal sees it."""
+"""`lavt demo` as a user at a terminal sees it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,86 @@ from tests.realtime.conftest import Demo
 from tests.support.stalls import LONG_STALL_MS, Stalls
 
 RUN_KEYS = {
-    "run", "time", "injection", "inherent", "route", "condition", "controller", "preset", "driver", "participant",
-    "block", "order", "repetition", "seed", "digest", "ending", "valid", "invalid_reasons", "distance_m", "duration_s",
-    "mae_m", "rms_m", "p95_m", "max_m", "heading_rms_rad", "steering_rms_rad", "steering_reversals_per_s", "collisions",
-    "lane_invasions", "loop_ms", "picture_age_ms", "tau_v_ms", "tau_c_ms", "frames_sent", "frames_decoded",
-    "frames_unreadable", "route_length_m", "heading_mae_rad", "heading_p95_rad", "steering_rate_rms_radps",
-    "steering_reversals_per_km", "oscillation_hz", "collisions_per_km", "lane_invasions_per_km", "p95_by_10m",
-    "age_at_actuation_ms", "stages_ms",
-}  # fmt: skip
+    "run",
+    "time",
+    "injection",
+    "inherent",
+    "route",
+    "condition",
+    "controller",
+    "preset",
+    "driver",
+    "participant",
+    "block",
+    "order",
+    "repetition",
+    "seed",
+    "digest",
+    "ending",
+    "valid",
+    "invalid_reasons",
+    "distance_m",
+    "duration_s",
+    "mae_m",
+    "rms_m",
+    "p95_m",
+    "max_m",
+    "heading_rms_rad",
+    "steering_rms_rad",
+    "steering_reversals_per_s",
+    "collisions",
+    "lane_invasions",
+    "loop_ms",
+    "picture_age_ms",
+    "tau_v_ms",
+    "tau_c_ms",
+    "frames_sent",
+    "frames_decoded",
+    "frames_unreadable",
+    "route_length_m",
+    "heading_mae_rad",
+    "heading_p95_rad",
+    "steering_rate_rms_radps",
+    "steering_reversals_per_km",
+    "oscillation_hz",
+    "collisions_per_km",
+    "lane_invasions_per_km",
+    "p95_by_10m",
+    "age_at_actuation_ms",
+    "stages_ms",
+}
 CONDITION_KEYS = {
-    "runs", "completed", "completion_rate", "completion_interval", "collisions_per_run", "lane_invasions_per_run",
-    "p95_m", "p95_interval", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms", "completion_such_roads", "endings",
-    "routes", "p95_common_m", "p95_common_interval", "p95_worst_rank_m", "collisions_per_km", "lane_invasions_per_km",
-    "mae_m", "rms_m", "max_m", "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz", "picture_age_ms",
-    "age_at_actuation_ms", "stages_ms", "survival",
-}  # fmt: skip
+    "runs",
+    "completed",
+    "completion_rate",
+    "completion_interval",
+    "collisions_per_run",
+    "lane_invasions_per_run",
+    "p95_m",
+    "p95_interval",
+    "injected_ms",
+    "tau_v_ms",
+    "tau_c_ms",
+    "loop_ms",
+    "completion_such_roads",
+    "endings",
+    "routes",
+    "p95_common_m",
+    "p95_common_interval",
+    "p95_worst_rank_m",
+    "collisions_per_km",
+    "lane_invasions_per_km",
+    "mae_m",
+    "rms_m",
+    "max_m",
+    "heading_rms_rad",
+    "steering_reversals_per_s",
+    "oscillation_hz",
+    "picture_age_ms",
+    "age_at_actuation_ms",
+    "stages_ms",
+    "survival",
+}
 VIRTUAL = ["L0", "L1", "L2", "L3", "L4", "L5"]
 
 
@@ -38,7 +103,7 @@ def test_the_demo_drives_in_real_and_in_virtual_time(demo: Demo) -> None:
 
 
 def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
-    """Every run, condition and group in summary.json has the keys that others rely on."""
+    """Every run, condition and group in summary.json has the documented keys."""
     assert set(demo.summary) == {
         "schema",
         "speed",
@@ -57,8 +122,8 @@ def test_the_summary_has_the_agreed_keys(demo: Demo) -> None:
     assert demo.summary["groups"]
 
 
-def test_the_delay_shows(demo: Demo, stalls: Stalls) -> None:
-    """At L0 the lane is kept within 0.3 m; at L5 it is left, in real as in virtual time."""
+def test_delay_degrades_lane_keeping(demo: Demo, stalls: Stalls) -> None:
+    """At L0 the P95 cross-track error is below 0.3 m; at L5 the car leaves the lane, in real and in virtual time."""
     for run in demo.summary["runs"]:
         if run["condition"] == "L0":
             with stalls.judging(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
@@ -69,14 +134,14 @@ def test_the_delay_shows(demo: Demo, stalls: Stalls) -> None:
 
 
 def test_the_terminal_shows_the_drive(demo: Demo) -> None:
-    """On a terminal the demo shows speed, tau_v, tau_c and cross-track error, then a table and the report's place."""
+    """On a terminal the demo shows speed, tau_v, tau_c and cross-track error, then a table and the report's path."""
     for text in ("km/h", "tau_v", "tau_c", "cross-track", "225 + 100", "the report is"):
-        assert text in demo.said
+        assert text in demo.output
     assert (demo.out / "report" / "index.html").is_file()
 
 
 def test_every_run_can_be_computed_again(demo: Demo) -> None:
-    """`lavt report` makes the same summary again from the records alone."""
+    """`lavt report` computes the same summary from the records alone."""
     before = demo.summary
     subprocess.run([sys.executable, "-m", "lavt", "report", str(demo.out)], check=True, capture_output=True)
     after = json.loads((demo.out / "summary.json").read_text())

@@ -23,22 +23,22 @@ from lavt.streams import stream
 from lavt.transport.messages import encode
 
 DATAGRAMS = 6_000
-"""At each of the four UDP ports: each side has one for the video and one for the probe of the clocks."""
+"""Per UDP port; each side has one port for the video and one for the clock probe."""
 SENT_AT_ONCE = 30
 ROUNDS = DATAGRAMS // SENT_AT_ONCE
 ROUND_NS = 25 * NS_PER_MS
 GARBAGE_PER_ROUND = 5
-"""On each of the three keys: 200 Hz."""
+"""Per round on each of the three keys, which is 200 Hz."""
 ENDED_WITHIN_S = 5.0
 
 COMMAND = Command(1, 2**40, 0, 0, 0, 0.1, 1.0, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
-BEGINNINGS = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x01")
-"""Of nothing, of RTP, of a receiver report, of a picture-loss request, of a hello."""
+PREFIXES = (b"", b"\x80\x60", b"\x80\xc9\x00\x01", b"\x81\xce\x00\x02", b"LAVT\x01\x01")
+"""Nothing, and the first bytes of RTP, a receiver report, a picture-loss indication and a hello."""
 REQUEST = SessionRequest("hold", "stranger", 7, 0)
 
 
 def udp_ports(process: Process) -> set[int]:
-    """Ports of the UDP sockets of a process (proc(5)): those of the video and of the probe."""
+    """Return the UDP ports of a process (proc(5)), which are those of the video and of the probe."""
     files = Path(f"/proc/{process.popen.pid}/fd").iterdir()
     sockets = {str(file.readlink()).removeprefix("socket:[").rstrip("]") for file in files}
     lines = (line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:])
@@ -47,8 +47,8 @@ def udp_ports(process: Process) -> set[int]:
     return ports
 
 
-class Hostile:
-    """Somebody who can reach all ports and the client's router, and who listens to what he may not answer."""
+class Attacker:
+    """An attacker that can reach all UDP ports and the client's router, and that records commands for replays."""
 
     def __init__(self, router: str, ports: set[int]) -> None:
         self._chance = stream(1, "hostile")
@@ -59,50 +59,50 @@ class Hostile:
         config = zenoh.Config.from_file(str(shipped("zenoh-configs/session.json5")))
         config.insert_json5("connect/endpoints", f'["{router}"]')
         self._session = zenoh.open(config)
-        self._heard: list[bytes] = []
+        self._recorded: list[bytes] = []
         listener: Any = zenoh.handlers.Callback(
-            lambda sample: self._heard.append(sample.payload.to_bytes()), indirect=False
+            lambda sample: self._recorded.append(sample.payload.to_bytes()), indirect=False
         )
-        self._listening = self._session.declare_subscriber("lavt/vehicle-1/control", listener)
+        self._subscriber = self._session.declare_subscriber("lavt/vehicle-1/control", listener)
 
     def attack(self) -> None:
-        """Send one round of everything."""
+        """Send one round of datagrams, commands and queries."""
         for port in self._ports:
             for _ in range(SENT_AT_ONCE):
                 self.socket.sendto(self._datagram(), ("127.0.0.1", port))
         for _ in range(GARBAGE_PER_ROUND):
             self._session.put("lavt/vehicle-1/control", self._garbage(COMMAND))
-            nobody: Any = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
+            ignore: Any = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
             for query in ("session", "netem"):
-                self._session.get(f"lavt/vehicle-1/{query}", nobody, payload=self._garbage(REQUEST), timeout=1.0)
+                self._session.get(f"lavt/vehicle-1/{query}", ignore, payload=self._garbage(REQUEST), timeout=1.0)
         self._count_received()
 
     def close(self) -> None:
-        """Leave."""
+        """Count the last replies and close the sockets."""
         pause(NS_PER_S // 2)
         self._count_received()
         self.socket.close()
         self._session.close()
 
     def _datagram(self) -> bytes:
-        """Random bytes, which begin as RTP, as RTCP, as a hello or as nothing."""
-        begin = BEGINNINGS[self._chance.integers(len(BEGINNINGS))]
-        return begin + self._chance.bytes(int(self._chance.choice([0, 8, 32, 200, 1200])))
+        """Return random bytes that begin like RTP, RTCP, a hello, or nothing known."""
+        prefix = PREFIXES[self._chance.integers(len(PREFIXES))]
+        return prefix + self._chance.bytes(int(self._chance.choice([0, 8, 32, 200, 1200])))
 
     def _garbage(self, message: Command | SessionRequest) -> bytes:
-        """Random bytes, a cut message, one with a flipped bit, or a real command once more.
+        """Return random bytes, a truncated message, one with a flipped bit, or a replayed command.
 
-        A command whose flipped bit is in the last byte would ask for an emergency stop, and get it.
+        The last byte is never flipped: that would be a valid emergency stop.
         """
         data = bytearray(encode(message))
         at = int(self._chance.integers(1, len(data) - 1))
-        kind = self._chance.choice(["random", "cut", "flipped", "again"])
+        kind = self._chance.choice(["random", "truncated", "flipped", "replayed"])
         if kind == "random":
             return self._chance.bytes(at)
-        if kind == "cut":
+        if kind == "truncated":
             return bytes(data[:at])
-        if kind == "again" and isinstance(message, Command) and self._heard:
-            return self._heard[-1 - int(self._chance.integers(min(100, len(self._heard))))]
+        if kind == "replayed" and isinstance(message, Command) and self._recorded:
+            return self._recorded[-1 - int(self._chance.integers(min(100, len(self._recorded))))]
         data[at] ^= 1 << int(self._chance.integers(8))
         return bytes(data)
 
@@ -128,24 +128,26 @@ def drives(
         work = tmp_path_factory.mktemp("attacked")
         with Processes(work) as processes:
             loop = start_loop(processes, planned("vehicle.scenery=none"), work, work, once=False)
-            wait_until("somebody drives", lambda: loop.server.latest.get("status", {}).get("safety") == "driving", 60.0)
-            hostile = Hostile(loop.router, udp_ports(loop.server) | udp_ports(loop.client))
+            wait_until(
+                "the vehicle is driven", lambda: loop.server.latest.get("status", {}).get("safety") == "driving", 60.0
+            )
+            attacker = Attacker(loop.router, udp_ports(loop.server) | udp_ports(loop.client))
             began_ns = clock.now().mono_ns
             for number in range(ROUNDS):
-                hostile.attack()
+                attacker.attack()
                 pause(began_ns + (number + 1) * ROUND_NS - clock.now().mono_ns)
             ended_ns = clock.now().mono_ns
-            hostile.close()
+            attacker.close()
             status = loop.server.latest["status"]
             took_s = {}
             for process in (loop.client, loop.server):
-                told_ns = clock.now().mono_ns
+                interrupted_ns = clock.now().mono_ns
                 process.end()
-                took_s[process.name] = (clock.now().mono_ns - told_ns) / NS_PER_S
+                took_s[process.name] = (clock.now().mono_ns - interrupted_ns) / NS_PER_S
             return SimpleNamespace(
                 began_ns=began_ns,
                 ended_ns=ended_ns,
-                received=hostile.received,
+                received=attacker.received,
                 status=status,
                 took_s=took_s,
                 codes=[each.popen.returncode for each in (loop.client, loop.server)],
@@ -158,7 +160,7 @@ def drives(
 
 @pytest.fixture
 def attacked(drives: Shared[SimpleNamespace]) -> SimpleNamespace:
-    """Give a drive that was attacked for some seconds, and then ended by Ctrl-C on both sides."""
+    """Return a drive that was attacked for some seconds and then ended by Ctrl-C on both sides."""
     return drives.get()
 
 
@@ -168,9 +170,9 @@ def counted(record: Record, name: str) -> int:
 
 
 def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """Under 6000 random datagrams at each port and garbage at 200 Hz on all keys the vehicle is driven on.
+    """During 6000 random datagrams per port and garbage at 200 Hz on all keys, the drive continues.
 
-    At least half of the pictures give a command: room for a machine that others use too.
+    At least half of the pictures lead to a command, which leaves room for other load on the machine.
     """
     admissions = attacked.server.table("admission")
     accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
@@ -187,7 +189,7 @@ def test_a_drive_goes_on_under_attack(attacked: SimpleNamespace, stalls: Stalls)
 
 
 def test_nothing_of_a_stranger_is_accepted(attacked: SimpleNamespace) -> None:
-    """No command of another epoch and no command a second time is obeyed, and no stranger gets the vehicle."""
+    """No command of another epoch and no replayed command is accepted, and no stranger gets control."""
     admissions = attacked.server.table("admission")
     accepted = admissions.where(np.array(admissions.texts("verdict")) == "accepted")
     sessions = [detail for detail in attacked.server.table("event").texts("detail") if "stranger" in detail]
@@ -198,27 +200,25 @@ def test_nothing_of_a_stranger_is_accepted(attacked: SimpleNamespace) -> None:
     assert all("rejected" in detail for detail in sessions)
 
 
-def test_pictures_are_not_spoilt_by_strangers(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """Nothing that a stranger sends to the client's video port gets into the pictures: none is lost or in doubt."""
+def test_strangers_do_not_damage_pictures(attacked: SimpleNamespace, stalls: Stalls) -> None:
+    """Datagrams of strangers at the client's video port cause no lost or doubtful pictures."""
     pictures = attacked.client.table("picture")
     at_ns = pictures.ints("read_mono_ns")
     meanwhile = pictures.where((at_ns > attacked.began_ns) & (at_ns < attacked.ended_ns))
 
-    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # a side that is stalled loses what strangers drown
+    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # the sockets of a stalled side overflow
         assert np.mean(meanwhile.flags("readable")) > 0.99
         assert np.mean(meanwhile.flags("in_doubt")) < 0.05
 
 
-def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """The counters of both sides tell of the datagrams and messages that were refused."""
+def test_rejected_messages_are_counted_in_the_record(attacked: SimpleNamespace, stalls: Stalls) -> None:
+    """The records of both sides have the numbers of rejected datagrams and messages."""
     server, client = attacked.server, attacked.client
-    at_the_server = sum(
-        counted(server, name) for name in ("feedback_from_strangers", "path_malformed", "path_wrong_token")
-    )
+    at_server = sum(counted(server, name) for name in ("feedback_from_strangers", "path_malformed", "path_wrong_token"))
 
     netem = counted(server, "netem_requests_unreadable") + counted(server, "netem_requests_screened_out")
-    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # the sockets of a side that is stalled overflow
-        assert at_the_server > 0.9 * DATAGRAMS
+    with stalls.judging(attacked.began_ns, attacked.ended_ns):  # the sockets of a stalled side overflow
+        assert at_server > 0.9 * DATAGRAMS
         assert counted(client, "datagrams_from_strangers") > 0.9 * 2 * DATAGRAMS
         assert counted(server, "probes_rejected") > 0.9 * DATAGRAMS
         assert counted(server, "commands_unreadable") > 0.3 * ROUNDS * GARBAGE_PER_ROUND
@@ -227,12 +227,12 @@ def test_what_strangers_sent_is_counted_in_the_record(attacked: SimpleNamespace,
 
 
 def test_no_stranger_gets_video(attacked: SimpleNamespace) -> None:
-    """Whoever knows no token gets not a single datagram back."""
+    """An attacker without a token gets no datagram back."""
     assert attacked.received == 0
 
 
-def test_ctrl_c_ends_both_sides_in_order(attacked: SimpleNamespace, stalls: Stalls) -> None:
-    """SIGINT in the middle of a drive ends `lavt server` and `lavt client` soon, with 0 and with complete records."""
+def test_ctrl_c_ends_both_sides(attacked: SimpleNamespace, stalls: Stalls) -> None:
+    """SIGINT during a drive ends `lavt server` and `lavt client` within 5 s, with exit code 0 and complete records."""
     assert attacked.codes == [0, 0]
     with stalls.judging(attacked.ended_ns, stall_ms=LONG_STALL_MS):
         assert max(attacked.took_s.values()) < ENDED_WITHIN_S

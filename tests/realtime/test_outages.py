@@ -25,30 +25,30 @@ STOP_AFTER_NS = 500 * NS_PER_MS
 STOP_MPS2 = 4.0
 STANDSTILL_MPS = 0.05
 BRAKE_AFTER_NS = 300 * NS_PER_MS
-ASK_FOR_STOP_AFTER_NS = 2500 * NS_PER_MS
-"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+REQUEST_STOP_AFTER_NS = 2500 * NS_PER_MS
+"""The design's limits, repeated here so that a change in the code fails a test."""
 
 OUTAGE_S = 3.0
 STALL_S = 1.2
-"""Shorter than the routers' lease of 2 s: what was sent meanwhile is kept and comes all at once."""
+"""Shorter than the routers' lease of 2 s: messages sent in the meantime are kept and arrive in a burst."""
 SLOW_MPS = 2.5
-"""Stops from here need little of the straight at the beginning of the road."""
+"""Low enough to stop within the straight at the beginning of the road."""
 FAST_MPS = 8.0
 """Nearly the 30 km/h that the controller keeps."""
-AT_ALL_MPS = 0.5
-AGAIN_S = 60.0
-"""Routers find each other, the client asks, arms and speeds up: about 8 s on a quiet machine."""
+MOVING_MPS = 0.5
+DRIVING_WITHIN_S = 60.0
+"""Routers find each other, the client gets control, arms and speeds up: about 8 s on a quiet machine."""
 MARGIN_S = 0.5
-"""For brakes that build up."""
+"""Time for the brake pressure to build up."""
 LIGHT = ("vehicle.scenery=none", "controller.preset=designed")
 LATE_STATE = ("network.condition=L1", "network.state_delay=with_video")
-"""The client hears 75 ms late that the vehicle has stopped: until then it commands on under the old epoch."""
+"""The client learns 75 ms late that the vehicle has stopped, and sends commands of the old epoch until then."""
 ACCEPTS_EVERYTHING = Path(__file__).with_name("server_that_accepts_everything.py")
 
 
 @dataclass
 class Drive:
-    """A loop that is driven and broken, and when it was; server and test read the same clocks."""
+    """A running loop, and the times at which it was broken; server and test read the same clocks."""
 
     processes: Processes
     work: Path
@@ -60,93 +60,98 @@ class Drive:
     clock: MachineClock = field(default_factory=MachineClock)
 
     def start(self) -> None:
-        """Start everything; the client arms again by itself."""
+        """Start all processes, with a client that arms again by itself."""
         self.loop = start_loop(
-            self.processes, self.planned, self.work, self.work,
-            rearm=True, once=False, server_program=self.server_program,
-        )  # fmt: skip
+            self.processes,
+            self.planned,
+            self.work,
+            self.work,
+            rearm=True,
+            once=False,
+            server_program=self.server_program,
+        )
         self.client = self.loop.client
         self.client_router = self.loop.client_router
 
     def reach(self, speed_mps: float) -> None:
-        """Wait until the vehicle is driven, and this fast."""
+        """Wait until the vehicle is driven and has reached a speed."""
 
         def reached() -> bool:
-            told = self.loop.server.latest.get("status", {})
+            status = self.loop.server.latest.get("status", {})
             phase = self.client.latest.get("status", {}).get("phase")
-            return (told.get("safety"), phase) == ("driving", "driving") and bool(told["speed_mps"] >= speed_mps)
+            return (status.get("safety"), phase) == ("driving", "driving") and bool(status["speed_mps"] >= speed_mps)
 
         assert self.loop.server.running, self.loop.server.said()
-        self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, AGAIN_S)
+        self.wait_until(f"the vehicle is driven with {speed_mps} m/s", reached, DRIVING_WITHIN_S)
 
-    def breaks(self, name: str) -> None:
-        """Note that an outage begins."""
+    def note_outage(self, name: str) -> None:
+        """Note the time at which an outage begins."""
         self.broken[name] = self.clock.now()
 
     def suspend(self, name: str, process: Process, duration_s: float) -> None:
-        """Let a process stand still for a while."""
-        self.breaks(name)
+        """Suspend a process for a while."""
+        self.note_outage(name)
         process.popen.send_signal(signal.SIGSTOP)
         pause(round(duration_s * NS_PER_S))
         process.popen.send_signal(signal.SIGCONT)
 
     def kill(self, name: str, process: Process) -> None:
         """End a process with SIGKILL."""
-        self.breaks(name)
+        self.note_outage(name)
         process.popen.kill()
 
-    def restart_the_router(self, after_s: float) -> None:
+    def restart_router(self, after_s: float) -> None:
         """Start the client's router again, on the same port."""
         pause(round(after_s * NS_PER_S))
         self.client_router, _ = start_client_router(self.processes, self.loop.dialled, self.loop.router)
 
     def start_another_client(self) -> None:
-        """Start a new client, as somebody would after a crash."""
+        """Start a new client, as after a crash."""
         pause(NS_PER_S)
         self.client = self.processes.start(
             "client-2", "client", str(self.work / "client.yaml"), "--out", str(self.work / "client-2")
         )
 
     def end(self) -> None:
-        """Press Ctrl-C on both sides."""
+        """Interrupt both sides."""
         for name, process in (("client", self.client), ("server", self.loop.server)):
             process.end()
             self.codes[name] = process.popen.returncode
 
     @cached_property
     def record(self) -> Record:
-        """Return what the server recorded, once it has ended."""
+        """Return the record of the server, once it has ended."""
         return read_record(self.work / "server" / "server.mcap")
 
 
-def what_the_network_does(drive: Drive) -> None:
+def break_network(drive: Drive) -> None:
     relay = drive.loop.relay
     assert relay is not None
     drive.reach(SLOW_MPS)
     drive.kill("router killed", drive.client_router)
-    drive.restart_the_router(OUTAGE_S)
+    drive.restart_router(OUTAGE_S)
     drive.reach(SLOW_MPS)
     drive.suspend("network stalled", relay, STALL_S)
 
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan, stalls: Stalls) -> Shared[Drive]:
-    """One drive with all outages, one after the other, the server's death last."""
+    """Drive through all outages in turn, the killed server last."""
 
     def drive_with_outages() -> Drive:
         work = tmp_path_factory.mktemp("outages")
         with Processes(work) as processes:
             drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE))
             drive.start()
-            what_the_network_does(drive)
+            break_network(drive)
             drive.reach(FAST_MPS)
             drive.kill("client killed", drive.client)
             drive.start_another_client()
             drive.reach(SLOW_MPS)
             drive.suspend("client suspended", drive.client, OUTAGE_S)
-            drive.reach(AT_ALL_MPS)
+            drive.reach(MOVING_MPS)
             drive.kill("server killed", drive.loop.server)
-            pause(ASK_FOR_STOP_AFTER_NS + NS_PER_S)
+            pause(REQUEST_STOP_AFTER_NS + NS_PER_S)
             drive.end()
         return drive
 
@@ -160,13 +165,13 @@ def drive(drives: Shared[Drive]) -> Drive:
 
 @pytest.fixture(scope="module")
 def unguarded(tmp_path_factory: pytest.TempPathFactory, wait_until: Wait, planned: Plan) -> Drive:
-    """The same outages of the network, with a server that obeys whatever it can read."""
+    """Drive through the same network outages with a server that accepts every command."""
     work = tmp_path_factory.mktemp("unguarded")
     with Processes(work) as processes:
         drive = Drive(processes, work, wait_until, planned(*LIGHT, *LATE_STATE), (str(ACCEPTS_EVERYTHING),))
         drive.start()
-        what_the_network_does(drive)
-        drive.reach(AT_ALL_MPS)
+        break_network(drive)
+        drive.reach(MOVING_MPS)
         drive.end()
     return drive
 
@@ -187,18 +192,18 @@ def accepted(record: Record) -> Table:
 
 
 def transition(record: Record, into: str, after_ns: int) -> Now:
-    """First change of the safety state into `into` after a time, on both clocks."""
+    """Return the first transition into a safety state after a time, on both clocks."""
     events = record.table("event")
     for kind, detail, mono_ns, wall_ns in zip(
         events.texts("kind"), events.texts("detail"), events.ints("mono_ns"), events.wall_ns, strict=True
     ):
         if kind == "safety" and f"-> {into}:" in detail and mono_ns > after_ns:
             return Now(int(mono_ns), int(wall_ns))
-    raise AssertionError(f"the vehicle never came to {into!r} after {after_ns}")
+    raise AssertionError(f"no transition to {into!r} after {after_ns}")
 
 
 def last_fresh_ns(record: Record, before_ns: int) -> int:
-    """When the last command came that was made from a picture newer than those of all before it."""
+    """Return when the last command from a newer picture than any before was received."""
     commands = accepted(record)
     commands = commands.where(commands.ints("received_mono_ns") < before_ns)
     stamps_ns = commands.ints("stamp_ns")
@@ -206,8 +211,8 @@ def last_fresh_ns(record: Record, before_ns: int) -> int:
     return int(commands.ints("received_mono_ns")[fresh][-1])
 
 
-def stale(record: Record, stop: Now) -> int:
-    """How many commands were obeyed after `stop` that belong before it: by epoch, by send time or by picture."""
+def count_stale(record: Record, stop: Now) -> int:
+    """Count the commands accepted after `stop` whose epoch, send time or picture is from before it."""
     commands = accepted(record)
     before = commands.ints("received_mono_ns") <= stop.mono_ns
     old_epochs = set(commands.where(before).objects("epoch"))
@@ -221,17 +226,15 @@ OUTAGES = ("router killed", "network stalled", "client killed", "client suspende
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
-def test_the_vehicle_stands_within_the_limits_of_the_design(
-    drive: Drive, server: Record, stalls: Stalls, outage: str
-) -> None:
-    """500 ms after the last fresh command comes the safe stop, and with 4 m/s2 standstill: 2.6 s from 30 km/h."""
+def test_the_vehicle_stops_within_the_limits(drive: Drive, server: Record, stalls: Stalls, outage: str) -> None:
+    """The safe stop begins 500 ms after the last fresh command and decelerates with 4 m/s2: 2.6 s from 30 km/h."""
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     truth = server.table("truth")
     at_ns, speed_mps = truth.ints("mono_ns"), truth.floats("speed_mps")
     since_command_ns = stop.mono_ns - last_fresh_ns(server, stop.mono_ns)
     speed_at_stop_mps = speed_mps[np.searchsorted(at_ns, stop.mono_ns)]
-    stands = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
-    stopping_s = (at_ns[stands][0] - stop.mono_ns) / NS_PER_S
+    is_stationary = (at_ns > stop.mono_ns) & (speed_mps < STANDSTILL_MPS)
+    stopping_s = (at_ns[is_stationary][0] - stop.mono_ns) / NS_PER_S
 
     assert since_command_ns >= STOP_AFTER_NS
     with stalls.judging(stop.mono_ns - since_command_ns, stop.mono_ns):
@@ -240,8 +243,8 @@ def test_the_vehicle_stands_within_the_limits_of_the_design(
 
 
 @pytest.mark.parametrize("outage", OUTAGES)
-def test_the_vehicle_stays_where_it_stopped_until_it_is_armed_anew(drive: Drive, server: Record, outage: str) -> None:
-    """From the stop on the vehicle never gets faster until somebody has armed it again."""
+def test_the_vehicle_stays_stationary_until_it_is_armed_again(drive: Drive, server: Record, outage: str) -> None:
+    """After a safe stop the vehicle does not accelerate until it is armed again."""
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     armed = transition(server, "driving", stop.mono_ns)
     truth = server.table("truth")
@@ -254,29 +257,29 @@ def test_the_vehicle_stays_where_it_stopped_until_it_is_armed_anew(drive: Drive,
 
 @pytest.mark.parametrize("outage", OUTAGES)
 def test_nothing_from_before_a_stop_is_accepted_after_it(drive: Drive, server: Record, outage: str) -> None:
-    """After a safe stop no command of an old epoch is obeyed, none sent before it, none made from an older picture."""
+    """After a safe stop no command with an epoch, send time or picture from before the stop is accepted."""
     stop = transition(server, "safe_stop", drive.broken[outage].mono_ns)
     armed = transition(server, "driving", stop.mono_ns)
 
-    assert stale(server, stop) == 0
+    assert count_stale(server, stop) == 0
     assert np.sum(accepted(server).ints("received_mono_ns") > armed.mono_ns) > 20
 
 
 @pytest.mark.parametrize("outage", ["router killed", "network stalled"])
-def test_a_server_that_accepts_everything_would_accept_what_is_stale(
+def test_a_server_without_checks_accepts_stale_commands(
     unguarded: Drive, unguarded_server: Record, outage: str
 ) -> None:
-    """Without the server's checks an outage of the network ends with stale commands obeyed: the tests above can fail.
+    """Without the server's checks stale commands are accepted after a network outage, so the tests above can fail.
 
-    A client that was suspended is not among them: whether it hears of the stop before it commands again is a race.
+    A suspended client is not tested here: whether it learns of the stop before its next command is a race.
     """
     stop = transition(unguarded_server, "safe_stop", unguarded.broken[outage].mono_ns)
 
-    assert stale(unguarded_server, stop) > 0
+    assert count_stale(unguarded_server, stop) > 0
 
 
-def test_what_was_recorded_before_a_process_died_can_be_read(drive: Drive, server: Record, stalls: Stalls) -> None:
-    """The record of a side that was killed is not complete, and reaches to within half a second of its end."""
+def test_the_record_of_a_killed_process_can_be_read(drive: Drive, server: Record, stalls: Stalls) -> None:
+    """The record of a killed side is not complete and ends at most half a second before the process."""
     first_client = read_record(drive.work / "client" / "client.mcap")
 
     for record, died in ((server, "server killed"), (first_client, "client killed")):
@@ -287,19 +290,19 @@ def test_what_was_recorded_before_a_process_died_can_be_read(drive: Drive, serve
             assert abs(last_ns - died_ns) < NS_PER_S // 2
 
 
-def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive, stalls: Stalls) -> None:
-    """When the server is gone the client brakes after 300 ms, asks for a stop after 2.5 s, and ends on Ctrl-C."""
+def test_a_client_without_pictures_brakes_and_then_requests_a_stop(drive: Drive, stalls: Stalls) -> None:
+    """Without a server the client brakes after 300 ms, requests a stop after 2.5 s, and ends on Ctrl-C."""
     record = read_record(drive.work / "client-2" / "client.mcap")
     last_ns = int(record.table("lane").mono_ns.max())
     commands = record.table("control")
     since_ns = commands.mono_ns - last_ns
     slack_ns = 50 * NS_PER_MS
-    braking = commands.where((since_ns > BRAKE_AFTER_NS + slack_ns) & (since_ns < ASK_FOR_STOP_AFTER_NS - slack_ns))
-    stopping = commands.where(since_ns > ASK_FOR_STOP_AFTER_NS + slack_ns)
+    braking = commands.where((since_ns > BRAKE_AFTER_NS + slack_ns) & (since_ns < REQUEST_STOP_AFTER_NS - slack_ns))
+    stopping = commands.where(since_ns > REQUEST_STOP_AFTER_NS + slack_ns)
 
     assert drive.codes["client"] == 0
     assert record.complete
-    with stalls.judging(last_ns, last_ns + ASK_FOR_STOP_AFTER_NS + NS_PER_S):
+    with stalls.judging(last_ns, last_ns + REQUEST_STOP_AFTER_NS + NS_PER_S):
         assert len(braking) > 50
         assert np.all(braking.floats("brake") >= 0.6)
         assert np.all(braking.floats("throttle") == 0)
@@ -309,7 +312,7 @@ def test_a_client_without_pictures_brakes_and_then_asks_for_a_stop(drive: Drive,
 
 
 def test_ctrl_c_leaves_complete_records(unguarded: Drive, unguarded_server: Record) -> None:
-    """After SIGINT in the middle of a drive both sides have ended with 0, and their records are complete."""
+    """SIGINT during a drive ends both sides with exit code 0 and complete records."""
     assert unguarded.codes == {"client": 0, "server": 0}
     assert unguarded_server.complete
     assert read_record(unguarded.work / "client" / "client.mcap").complete

@@ -1,4 +1,4 @@
-"""The demo's drives at L0 and L5: what virtual time computes is what real time shows."""
+"""Compare the demo's drives at L0 and L5 in real time with those in virtual time."""
 
 from __future__ import annotations
 
@@ -26,17 +26,15 @@ def test_the_same_drive_has_the_same_seed(demo: Demo, condition: str) -> None:
 
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("latency", ["tau_v_ms", "tau_c_ms", "loop_ms"])
-def test_latencies_in_virtual_time_are_those_of_real_time(
-    demo: Demo, stalls: Stalls, condition: str, latency: str
-) -> None:
+def test_latencies_agree_in_real_and_virtual_time(demo: Demo, stalls: Stalls, condition: str, latency: str) -> None:
     """The medians of video, control and loop latency in real and in virtual time are within 5 ms."""
     real, virtual = pair(demo, condition)
     with stalls.judging(demo.since_ns, demo.until_ns, share=BUSY_SHARE):
         assert abs(real[latency]["p50"] - virtual[latency]["p50"]) < 5
 
 
-def test_the_car_keeps_its_lane_as_well_in_virtual_time(demo: Demo, stalls: Stalls) -> None:
-    """Without delay a drive ends the same way, and its P95 cross-track in virtual time is within 30 % of real time."""
+def test_lane_keeping_agrees_in_real_and_virtual_time(demo: Demo, stalls: Stalls) -> None:
+    """Without delay a drive ends the same way, and its P95 cross-track error is within 30 % of that in real time."""
     real, virtual = pair(demo, "L0")
     with stalls.judging(demo.since_ns, demo.until_ns, stall_ms=LONG_STALL_MS):
         assert real["ending"] == virtual["ending"]

@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from lavt.domain import Lane, Now
-from lavt.errors import WorkError
+from lavt.errors import UserError, WorkError
 from lavt.nodes.payloads import VideoUnit
 from lavt.recording.json_payload import json_schema, to_json
-from lavt.recording.record import RecordWriter, read_record
+from lavt.recording.mcap_writer import McapFile
+from lavt.recording.record import FORMAT_VERSION, RecordWriter, read_record
 from lavt.recording.table import MISSING
 
 WALL_NS = 1_700_000_000_000_000_123
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""What compressed data begins with (RFC 8878, section 3.1.1)."""
+"""The magic number of compressed data (RFC 8878, section 3.1.1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +51,8 @@ def write_samples(path: Path, count: int) -> None:
     writer.close()
 
 
-def test_values_come_back(tmp_path: Path) -> None:
-    """What was written is read back exactly: whole numbers, floats, truth values, bytes as base64, both times."""
+def test_values_are_read_back_exactly(tmp_path: Path) -> None:
+    """Integers, floats, booleans, bytes (as base64) and both times are read back exactly as they were written."""
     write_samples(tmp_path / "a.mcap", 4)
     record = read_record(tmp_path / "a.mcap")
     table = record.table("frame")
@@ -67,15 +68,15 @@ def test_values_come_back(tmp_path: Path) -> None:
 
 
 def test_a_channel_without_messages_is_empty(tmp_path: Path) -> None:
-    """A channel on which nothing was recorded has no rows, and its columns can be asked for all the same."""
+    """The table of a channel without messages is empty, and so are its columns."""
     write_samples(tmp_path / "a.mcap", 1)
     table = read_record(tmp_path / "a.mcap").table("nothing")
     assert len(table) == 0
     assert table.ints("stamp_ns").tolist() == []
 
 
-def test_whole_numbers_are_never_rounded(tmp_path: Path) -> None:
-    """A column of whole numbers that do not fit into 64 bits keeps every digit, as objects."""
+def test_large_integers_are_never_rounded(tmp_path: Path) -> None:
+    """A column of integers that do not fit into 64 bits keeps every digit, as objects."""
     writer = RecordWriter(tmp_path / "a.mcap", "server")
     for index, number in enumerate((WALL_NS, 2**64)):
         writer.write("counts", {"number": number}, now(index))
@@ -84,7 +85,7 @@ def test_whole_numbers_are_never_rounded(tmp_path: Path) -> None:
 
 
 def test_not_a_number_becomes_null(tmp_path: Path) -> None:
-    """NaN and infinity are written as null, because JSON has no word for them, and read as NaN."""
+    """NaN and infinity, which JSON cannot represent, are written as null and read as NaN."""
     assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}
     writer = RecordWriter(tmp_path / "a.mcap", "server")
     writer.write("frame", sample(0, float("nan")), now(0))
@@ -95,8 +96,8 @@ def test_not_a_number_becomes_null(tmp_path: Path) -> None:
     assert speed_mps[1] == 2.5
 
 
-def test_a_step_of_the_wall_clock_changes_no_order(tmp_path: Path) -> None:
-    """Messages come back in the order they were written, also when the wall clock was set back between them."""
+def test_a_step_of_the_wall_clock_does_not_reorder_messages(tmp_path: Path) -> None:
+    """Messages are read in the order in which they were written, even if the wall clock was set back between them."""
     writer = RecordWriter(tmp_path / "a.mcap", "client")
     for index, wall_ns in enumerate((5_000, 6_000, 1_000)):
         writer.write("clock", {"number": index}, Now(index, wall_ns))
@@ -106,7 +107,7 @@ def test_a_step_of_the_wall_clock_changes_no_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [0.3, 0.7, 0.999])
 def test_an_unfinished_file_is_recovered(tmp_path: Path, kept: float) -> None:
-    """A file cut anywhere gives every message of its whole chunks, and says that it is not complete."""
+    """From a file that was cut anywhere, every message of its whole chunks is read, and `complete` is False."""
     path = tmp_path / "a.mcap"
     writer = RecordWriter(path, "server")
     noise = np.random.Generator(np.random.Philox(1))
@@ -123,7 +124,7 @@ def test_an_unfinished_file_is_recovered(tmp_path: Path, kept: float) -> None:
 
 
 def test_a_file_that_was_never_closed_is_recovered(tmp_path: Path) -> None:
-    """What a process had written when it died can be read up to the last whole chunk."""
+    """The record of a process that died can be read up to the last whole chunk."""
     path = tmp_path / "a.mcap"
     writer = RecordWriter(path, "server")
     for index in range(3_000):
@@ -134,8 +135,8 @@ def test_a_file_that_was_never_closed_is_recovered(tmp_path: Path) -> None:
     assert 1_500 < len(record.table("frame")) < 3_000
 
 
-def test_damage_is_noticed(tmp_path: Path) -> None:
-    """A record with a flipped byte in a chunk gives what came before it, and says that it is not complete."""
+def test_damage_is_detected(tmp_path: Path) -> None:
+    """A record with a flipped byte in a chunk is read up to that chunk, and `complete` is False."""
     path = tmp_path / "a.mcap"
     write_samples(path, 3_000)
     content = bytearray(path.read_bytes())
@@ -147,14 +148,49 @@ def test_damage_is_noticed(tmp_path: Path) -> None:
     assert len(record.table("frame")) < 3_000
 
 
-def test_a_missing_record_is_told(tmp_path: Path) -> None:
-    """A record that is not there is an error that names the file."""
+def test_a_missing_record_is_an_error(tmp_path: Path) -> None:
+    """Reading a missing record is an error that names the file."""
     with pytest.raises(WorkError, match=r"server\.mcap"):
         read_record(tmp_path / "server.mcap")
 
 
-def test_video_is_kept_and_playable(tmp_path: Path) -> None:
-    """Access units come back byte for byte with their stamps, under the schema that players know."""
+@pytest.mark.parametrize("version", [None, "1", "3"])
+@pytest.mark.parametrize("complete", [True, False])
+def test_another_format_version_is_an_error(tmp_path: Path, version: str | None, complete: bool) -> None:
+    """Reading a record of another format version, or without one, is one sentence that names the readable version."""
+    path = tmp_path / "server.mcap"
+    file = McapFile(path, library="lavt server", chunk_bytes=0)
+    if version is not None:
+        file.add_metadata("format", {"version": version})
+    channel = file.add_channel("/event", "json", file.add_schema("object", "jsonschema", b"{}"))
+    file.add_messages([(channel, 1, 1, b"{}")])
+    file.close()
+    if not complete:
+        path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(UserError, match=rf"server\.mcap.*version {version or 1}.*version {FORMAT_VERSION}") as error:
+        read_record(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_record_has_its_format_version(tmp_path: Path) -> None:
+    """The format version is in the metadata of a record, also before its writer has finished the file."""
+    writer = RecordWriter(tmp_path / "a.mcap", "server")
+    for index in range(3_000):
+        writer.write("frame", sample(index), now(index))
+    assert read_record(tmp_path / "a.mcap").annotations["format"] == {"version": str(FORMAT_VERSION)}
+    writer.close()
+
+
+def test_an_empty_file_is_an_empty_record(tmp_path: Path) -> None:
+    """A file that was cut before its first message is read as an incomplete record without messages."""
+    (tmp_path / "a.mcap").write_bytes(b"")
+    record = read_record(tmp_path / "a.mcap")
+    assert not record.complete
+    assert not record.tables
+
+
+def test_video_is_recorded_for_players(tmp_path: Path) -> None:
+    """Access units are read back byte for byte with their stamps, and have the schema that players know."""
     path = tmp_path / "a.mcap"
     writer = RecordWriter(path, "server")
     units = [(WALL_NS + index, bytes([0, 0, 0, 1, index])) for index in range(3)]
@@ -171,8 +207,8 @@ def test_video_is_kept_and_playable(tmp_path: Path) -> None:
     assert json.loads(message.data)["format"] == "h264"
 
 
-def test_other_readers_find_their_way(tmp_path: Path) -> None:
-    """The file has the counts and indexes by which a reader finds the messages of a topic."""
+def test_other_readers_can_seek(tmp_path: Path) -> None:
+    """The file has the counts and indexes with which other readers find the messages of a topic."""
     path = tmp_path / "a.mcap"
     write_samples(path, 3_000)
     with path.open("rb") as stream:
@@ -187,7 +223,7 @@ def test_other_readers_find_their_way(tmp_path: Path) -> None:
 
 
 def test_schemas_describe_the_payload() -> None:
-    """The JSON Schema of a dataclass names its fields, which may be null, and how bytes are written."""
+    """The JSON Schema of a dataclass has its fields, allows null for optional ones, and gives the encoding of bytes."""
     schema = json.loads(json_schema(Sample))
     assert set(schema["properties"]) == {"number", "applied_mono_ns", "speed_mps", "keyframe", "data", "nested"}
     assert schema["properties"]["data"] == {"type": "string", "contentEncoding": "base64"}
@@ -195,8 +231,8 @@ def test_schemas_describe_the_payload() -> None:
     assert json.loads(json_schema(dict)) == {"type": "object"}
 
 
-def test_the_digest_holds_everything_in_order(tmp_path: Path) -> None:
-    """Equal messages on both sides give equal digests; another order, time, side or value gives another."""
+def test_the_digest_covers_content_and_order(tmp_path: Path) -> None:
+    """Equal messages on both sides have equal digests; another order, time, side or value changes the digest."""
 
     def digest(order: list[int], shift_ns: int = 0, side_of_last: str = "client", note: str = "") -> str:
         sha = hashlib.sha256()
@@ -217,8 +253,8 @@ def test_the_digest_holds_everything_in_order(tmp_path: Path) -> None:
     assert len({first, digest([1, 0]), digest([0, 1], 1), digest([0, 1], 0, "server"), digest([0, 2])}) == 5
 
 
-def test_annotations_come_back(tmp_path: Path) -> None:
-    """Versions and the machine are kept beside the messages."""
+def test_annotations_are_read_back(tmp_path: Path) -> None:
+    """Annotations, such as versions, are read back as they were written."""
     writer = RecordWriter(tmp_path / "a.mcap", "server")
     writer.annotate("versions", {"lavt": "0.1.0"})
     writer.close()
@@ -232,6 +268,6 @@ def test_annotations_come_back(tmp_path: Path) -> None:
         max_size=6,
     )
 )
-def test_any_payload_survives(payload: dict[str, object]) -> None:
-    """Whatever finite numbers and texts a payload has, its JSON says exactly them."""
+def test_json_preserves_any_payload(payload: dict[str, object]) -> None:
+    """Any payload of finite numbers and texts is equal to its parsed JSON."""
     assert json.loads(to_json(payload)) == payload

@@ -10,31 +10,31 @@ import pytest
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.runtime.realtime import RealRuntime
 from lavt.transport.clock_sync.clock_report import ClockReport
 
 pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("own_switch_interval")]
 
 
-class Kept:
-    """A recorder and a link that keep what they get."""
+class ListRecorder:
+    """A recorder and link that stores its entries and messages."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[str, Any]] = []
         self.sent: list[Send] = []
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
-        """Write one entry."""
+        """Store one entry."""
         self.entries.append((topic, payload))
 
     def send(self, *sends: Send) -> None:
-        """Carry messages."""
+        """Store messages."""
         self.sent += sends
 
 
 class Ticker:
-    """A node that wakes every 10 ms and notes by how much it was late; a message of b"break" breaks it."""
+    """A node that wakes every 10 ms and stores its lateness; the message b"break" makes it fail."""
 
     name = "driver"
 
@@ -43,10 +43,13 @@ class Ticker:
         self.late_ns: list[int] = []
         self.threads: set[str] = set()
         self._next_ns = start_ns
-        self.chains: Mapping[str, Sequence[Hop]] = {WAKE: (("tick", self._tick),), "state": (("hear", self._hear),)}
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
+            WAKE: (("tick", self._tick),),
+            "state": (("receive", self._receive),),
+        }
 
     def next_wake_ns(self) -> int:
-        """When it wakes next."""
+        """Return when the next tick is due."""
         return self._next_ns
 
     def _tick(self, _message: Message, now: Now) -> list[Send]:
@@ -55,24 +58,24 @@ class Ticker:
         self.threads.add(threading.current_thread().name)
         return [Send("control", b"")]
 
-    def _hear(self, message: Message, _now: Now) -> None:
-        self.counts["heard"] += 1
+    def _receive(self, message: Message, _now: Now) -> None:
+        self.counts["received"] += 1
         if message.payload == b"break":
-            raise ValueError("broken on purpose")
+            raise ValueError("failed on purpose")
 
 
-def start() -> tuple[RealRuntime, Ticker, Kept]:
-    clock, kept = MachineClock(), Kept()
+def start() -> tuple[RealRuntime, Ticker, ListRecorder]:
+    clock, recorded = MachineClock(), ListRecorder()
     node = Ticker(clock.now().mono_ns)
-    runtime = RealRuntime(clock, [node], kept, lambda: ClockReport(0, 0, "host", "none"))
-    runtime.start({"zenoh": kept})
-    return runtime, node, kept
+    runtime = RealRuntime(clock, [node], recorded, lambda: ClockReport(0, 0, "host", "none"))
+    runtime.start({"zenoh": recorded})
+    return runtime, node, recorded
 
 
 @pytest.mark.judges_times
 def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
-    """A node wakes within 20 ms in the median, hears what is delivered, sends over its link; stop ends its thread."""
-    runtime, node, kept = start()
+    """A node wakes within 20 ms in the median, gets messages and sends over its link; stop ends its thread."""
+    runtime, node, recorded = start()
     pause(NS_PER_S // 3)
     runtime.deliver("state", b"hello", runtime.now())
     pause(NS_PER_S // 10)
@@ -80,15 +83,15 @@ def test_nodes_are_woken_in_time_and_messages_delivered() -> None:
     assert len(node.late_ns) > 5
     assert min(node.late_ns) >= 0
     assert statistics.median(node.late_ns) < 20 * NS_PER_MS
-    assert node.counts["heard"] == 1
-    assert len(kept.sent) == len(node.late_ns)
+    assert node.counts["received"] == 1
+    assert len(recorded.sent) == len(node.late_ns)
     assert node.threads == {"driver"}
     assert "driver" not in {thread.name for thread in threading.enumerate()}
-    assert ("counts", {"node": "driver", "heard": 1}) in kept.entries
+    assert ("counts", {"node": "driver", "received": 1}) in recorded.entries
 
 
 def test_a_failing_node_ends_the_run() -> None:
-    """An error in a node stops the runtime, which says why, and it can still be stopped in order."""
+    """A node that fails ends the run with its error, and the runtime can still be stopped."""
     runtime, _, _ = start()
     runtime.deliver("state", b"break", runtime.now())
     assert runtime.stopped.wait(5)
@@ -97,18 +100,18 @@ def test_a_failing_node_ends_the_run() -> None:
     assert "driver" not in {thread.name for thread in threading.enumerate()}
 
 
-class NeverSays(Ticker):
-    """A node that breaks where it is asked when it wants to be woken."""
+class FailingWake(Ticker):
+    """A node whose `next_wake_ns` fails."""
 
     def next_wake_ns(self) -> int:
-        """Break."""
+        """Raise an error."""
         raise ValueError("broken")
 
 
-def test_a_node_that_breaks_between_messages_ends_the_run() -> None:
-    """No half of a node stays alive, wherever it broke."""
+def test_a_node_that_fails_between_messages_ends_the_run() -> None:
+    """A node that fails between messages ends the run."""
     clock = MachineClock()
-    runtime = RealRuntime(clock, [NeverSays(0)], Kept(), lambda: None)
+    runtime = RealRuntime(clock, [FailingWake(0)], ListRecorder(), lambda: None)
     runtime.start({})
     assert runtime.stopped.wait(5)
     assert isinstance(runtime.failed, ValueError)

@@ -1,6 +1,6 @@
-"""A node in a process of its own, both ends here: what goes through the pipe, and what is kept out of it."""
+"""A node in its own process; the tests run both ends in one process."""
 
-# ruff: noqa: D102 (helpers of tests: short methods say themselves what they do)
+# ruff: noqa: D102 (test helpers with short methods)
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ import pytest
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, Now
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.errors import WorkError
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import StationaryStatus
 from lavt.runtime.pipe import CAPACITY, Pipe
 from lavt.runtime.realtime import RealRuntime
@@ -27,16 +28,16 @@ pytestmark = pytest.mark.usefixtures("own_switch_interval")
 CLOCK = MachineClock()
 
 
-def wait_until(what: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     for _ in range(2000):
-        if what():
+        if condition():
             return
         pause(5 * NS_PER_MS)
-    raise AssertionError("it did not come true within 10 s")
+    raise AssertionError("the condition was not met within 10 s")
 
 
-class Notes:
-    """A recorder, or a link, that keeps what it gets."""
+class FakeOutputs:
+    """A recorder and link that stores its entries and messages."""
 
     def __init__(self) -> None:
         self.written: list[tuple[str, Any]] = []
@@ -54,24 +55,24 @@ class Notes:
 
 @dataclass
 class Echo:
-    """An "actuator" that answers what it is asked, and tells its neighbours."""
+    """An "actuator" node that answers requests and sends to its neighbours."""
 
     name: str = "actuator"
     counts: Counter[str] = field(default_factory=Counter)
-    heard: list[Message] = field(default_factory=list)
+    received: list[Message] = field(default_factory=list)
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
-        return {"control": (("hear", self._hear),), "session": (("answer", self._answer),), WAKE: ()}
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
+        return {"control": (("receive", self._receive),), "session": (("answer", self._answer),), WAKE: ()}
 
     def next_wake_ns(self) -> int | None:
         return None
 
-    def _hear(self, message: Message, _now: Now) -> list[Send]:
-        self.heard.append(message)
+    def _receive(self, message: Message, _now: Now) -> list[Send]:
+        self.received.append(message)
         if message.payload == b"break":
-            raise RuntimeError("broken on purpose")
-        return [Send("rest", StationaryStatus(at_rest=True, active_operator=None)), Send("event", "heard")]
+            raise RuntimeError("failed on purpose")
+        return [Send("rest", StationaryStatus(at_rest=True, active_operator=None)), Send("event", "received")]
 
     def _answer(self, message: Message, _now: Now) -> list[Send]:
         return [Send("session_reply", message.payload, message.peer)]
@@ -79,15 +80,15 @@ class Echo:
 
 @dataclass
 class Neighbour:
-    """The node beside it, at the other end."""
+    """Another node of the same side, in the server's process."""
 
     name: str = "injection"
     counts: Counter[str] = field(default_factory=Counter)
-    heard: list[Any] = field(default_factory=list)
+    received: list[Any] = field(default_factory=list)
 
     @property
-    def chains(self) -> Mapping[str, Sequence[Hop]]:
-        return {"rest": (("hear", lambda message, _now: self.heard.append(message.payload)),), WAKE: ()}
+    def pipelines(self) -> Mapping[str, Sequence[Stage]]:
+        return {"rest": (("receive", lambda message, _now: self.received.append(message.payload)),), WAKE: ()}
 
     def next_wake_ns(self) -> int | None:
         return None
@@ -99,143 +100,144 @@ class Rig:
 
     node: Echo
     neighbour: Neighbour
-    notes: Notes
-    there: RemoteNodeProxy
+    outputs: FakeOutputs
+    proxy: RemoteNodeProxy
     main: RealRuntime
-    here: NodeHost
-    parted: threading.Event
+    host: NodeHost
+    disconnected: threading.Event
     number: list[int]
 
 
 @contextmanager
 def rig() -> Iterator[Rig]:
     ours, theirs = multiprocessing.Pipe()
-    node, neighbour, notes, parted, number = Echo(), Neighbour(), Notes(), threading.Event(), [0]
-    there = RemoteNodeProxy("actuator", ours)
-    main = RealRuntime(CLOCK, [neighbour], notes, lambda: None, {"actuator": there})
-    here = NodeHost(theirs, CLOCK, node, note=lambda: number[0], parted=parted.set)
-    main.start({"zenoh": notes})
-    there.start(main)
-    here.start()
-    both = Rig(node, neighbour, notes, there, main, here, parted, number)
+    node, neighbour, outputs, disconnected, number = Echo(), Neighbour(), FakeOutputs(), threading.Event(), [0]
+    proxy = RemoteNodeProxy("actuator", ours)
+    main = RealRuntime(CLOCK, [neighbour], outputs, lambda: None, {"actuator": proxy})
+    host = NodeHost(theirs, CLOCK, node, get_status=lambda: number[0], on_disconnect=disconnected.set)
+    main.start({"zenoh": outputs})
+    proxy.start(main)
+    host.start()
+    both = Rig(node, neighbour, outputs, proxy, main, host, disconnected, number)
     try:
         yield both
     finally:
-        here.close()
-        there.close(5)
+        host.close()
+        proxy.close(5)
         main.stop()
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
-def test_a_node_elsewhere_hears_and_is_heard() -> None:
-    """Messages reach the node with their time of arrival; what it tells reaches neighbours, links and the record."""
+def test_a_remote_node_receives_and_sends() -> None:
+    """Messages reach the remote node with their arrival time; its sends reach nodes, links and the record."""
     with rig() as both:
         arrived = CLOCK.now()
         both.main.deliver("control", b"drive", arrived)
-        wait_until(lambda: bool(both.neighbour.heard))
-        assert [(each.payload, each.arrived) for each in both.node.heard] == [(b"drive", arrived)]
-        assert both.neighbour.heard == [StationaryStatus(at_rest=True, active_operator=None)]
-        assert both.notes.of("control") == [b"drive"], "written down once, where the links are"
-        wait_until(lambda: both.notes.of("event") == ["heard"])
+        wait_until(lambda: bool(both.neighbour.received))
+        assert [(each.payload, each.arrived) for each in both.node.received] == [(b"drive", arrived)]
+        assert both.neighbour.received == [StationaryStatus(at_rest=True, active_operator=None)]
+        assert both.outputs.of("control") == [b"drive"], "recorded once, in the process with the links"
+        wait_until(lambda: both.outputs.of("event") == ["received"])
 
 
-def test_an_answer_finds_who_requested() -> None:
-    """A peer, which nothing but its link understands, stays in its process; the answer is for it."""
+def test_a_reply_goes_to_its_peer() -> None:
+    """A reply of the remote node goes to the peer of its request."""
     with rig() as both:
         alice, bob = object(), object()
         both.main.deliver("session", b"of alice", CLOCK.now(), alice)
         both.main.deliver("session", b"of bob", CLOCK.now(), bob)
-        wait_until(lambda: len(both.notes.sent) == 2)
-        assert [(send.payload, send.peer) for send in both.notes.sent] == [(b"of alice", alice), (b"of bob", bob)]
+        wait_until(lambda: len(both.outputs.sent) == 2)
+        assert [(send.payload, send.peer) for send in both.outputs.sent] == [(b"of alice", alice), (b"of bob", bob)]
 
 
-def test_what_is_in_force_is_known_before_its_answer_leaves() -> None:
-    """What the node notes is told before whatever it sends by a link."""
+def test_the_status_is_reported_before_messages() -> None:
+    """The remote node's status is reported before its messages are sent."""
     with rig() as both:
         both.number[0] = 7
         both.main.deliver("session", b"?", CLOCK.now(), object())
-        wait_until(lambda: bool(both.notes.sent))
-        assert both.there.noted == 7
+        wait_until(lambda: bool(both.outputs.sent))
+        assert both.proxy.status == 7
 
 
 @pytest.mark.realtime
-def test_a_command_that_was_late_between_the_processes_is_dropped() -> None:
-    """A command that came more than 60 ms ago is counted and not handed to the node; a query is, as if it came now."""
+def test_a_late_command_between_the_processes_is_dropped() -> None:
+    """A command delayed by more than 60 ms between the processes is dropped and counted; a request is not."""
     with rig() as both:
         long_ago = CLOCK.now().later(-LATE_NS - NS_PER_MS)
         both.main.deliver("control", b"stale", long_ago)
         both.main.deliver("session", b"late", long_ago, "alice")
-        wait_until(lambda: bool(both.notes.sent))
-        assert both.node.heard == []
-    (counted,) = [each for each in both.notes.of("counts") if each["node"] == "actuator's process"]
+        wait_until(lambda: bool(both.outputs.sent))
+        assert both.node.received == []
+    (counted,) = [each for each in both.outputs.of("counts") if each["node"] == "actuator's process"]
     assert (counted["control_late"], counted["session_late"], counted["record_overflow"]) == (1, 1, 0)
 
 
 def test_the_end_of_the_other_process_is_noticed() -> None:
-    """When the server's process closes or ends, the node's is told that they have parted."""
+    """The node's process is notified when the server's process closes the pipe."""
     with rig() as both:
-        both.there._pipe.close(1)
-        assert both.parted.wait(10)
+        both.proxy._pipe.close(1)
+        assert both.disconnected.wait(10)
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times
-def test_a_node_that_fails_elsewhere_ends_the_run_here() -> None:
-    """What broke in the node's process is why the server's runtime failed."""
+def test_a_failing_remote_node_ends_the_run() -> None:
+    """An error of the remote node ends the server's run with that error."""
     with rig() as both:
         both.main.deliver("control", b"break", CLOCK.now())
-        wait_until(lambda: both.here.runtime.failed is not None)
-        both.here.close()
+        wait_until(lambda: both.host.runtime.failed is not None)
+        both.host.close()
         wait_until(lambda: both.main.failed is not None)
-        assert str(both.main.failed) == "actuator: broken on purpose"
+        assert "failed on purpose" in str(both.main.failed)
 
 
-def test_a_process_that_vanishes_ends_the_run_here() -> None:
-    """A node's process that ends without a word ends the server's run, with a sentence."""
+def test_the_end_of_the_nodes_process_ends_the_run() -> None:
+    """The end of the node's process ends the server's run with an error."""
     with rig() as both:
-        both.here._pipe.close(1)
+        both.host._pipe.close(1)
         wait_until(lambda: both.main.failed is not None)
-        assert str(both.main.failed) == "the process of the actuator has ended"
+        assert isinstance(both.main.failed, WorkError)
+        assert "ended" in str(both.main.failed)
 
 
-@pytest.mark.parametrize("where", ["sent", "read", "taken"])
-def test_a_pipe_that_works_by_half_is_gone(where: str) -> None:
-    """An entry that cannot be sent, read or taken ends the pipe at both ends: neither process goes on by itself."""
+@pytest.mark.parametrize("where", ["sent", "read", "received"])
+def test_an_error_in_one_direction_closes_the_pipe(where: str) -> None:
+    """An entry that cannot be sent, read or received closes the pipe at both ends."""
     ours, theirs = multiprocessing.Pipe()
-    gone, told = threading.Event(), threading.Event()
+    closed, other_closed = threading.Event(), threading.Event()
 
-    def take(_entry: object) -> None:
-        raise LookupError("broken on purpose")
+    def fail(_entry: object) -> None:
+        raise LookupError("failed on purpose")
 
-    one, other = Pipe(ours, lambda _: None, gone.set), Pipe(theirs, take, told.set)
+    one, other = Pipe(ours, lambda _: None, closed.set), Pipe(theirs, fail, other_closed.set)
     one.start()
     other.start()
     if where == "read":
         ours.send_bytes(b"no entry")
     else:
         one.send(threading.Lock() if where == "sent" else "an entry")
-    assert told.wait(10)
+    assert other_closed.wait(10)
     other.close(1)
-    assert gone.wait(10)
+    assert closed.wait(10)
     one.close(1)
 
 
-def test_a_server_that_never_began_lets_the_process_end() -> None:
-    """A server that fails before it hands anything over closes the pipe all the same: the node's process ends."""
+def test_a_server_that_never_started_ends_the_nodes_process() -> None:
+    """A server that fails before its start ends the node's process."""
     ours, theirs = multiprocessing.Pipe()
-    parted = threading.Event()
-    there = RemoteNodeProxy("actuator", ours)
-    here = NodeHost(theirs, CLOCK, Echo(), note=lambda: 0, parted=parted.set)
-    here.start()
-    there.close(5)
-    assert parted.wait(10)
-    here.close()
+    disconnected = threading.Event()
+    proxy = RemoteNodeProxy("actuator", ours)
+    host = NodeHost(theirs, CLOCK, Echo(), get_status=lambda: 0, on_disconnect=disconnected.set)
+    host.start()
+    proxy.close(5)
+    assert disconnected.wait(10)
+    host.close()
 
 
 @pytest.mark.realtime
-def test_nobody_waits_for_a_process_that_does_not_read() -> None:
-    """With nobody reading at the other end, all that does not fit is counted, and sending never waits."""
+def test_sending_without_a_reader_does_not_block() -> None:
+    """Without a reader, sending does not block, and entries that do not fit are counted."""
     ours, _theirs = multiprocessing.Pipe()
     pipe = Pipe(ours, lambda _entry: None, lambda: None)
     pipe.start()
@@ -245,10 +247,10 @@ def test_nobody_waits_for_a_process_that_does_not_read() -> None:
 
 
 def test_a_pipe_that_was_never_started_closes() -> None:
-    """A server that ends before its runtime began lets go of the other process, which notices."""
+    """A pipe that was never started can be closed, which the other end notices."""
     ours, theirs = multiprocessing.Pipe()
-    there = RemoteNodeProxy("actuator", ours)
-    there.close(1)
+    proxy = RemoteNodeProxy("actuator", ours)
+    proxy.close(1)
     with pytest.raises(EOFError):
         theirs.recv_bytes()
     theirs.close()

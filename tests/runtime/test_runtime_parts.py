@@ -1,4 +1,4 @@
-"""Inbox, chain and recording."""
+"""Inbox, pipeline and recording."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from lavt.channels import CHANNELS
 from lavt.domain import Now, SessionReply
 from lavt.node import Message, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
-from lavt.runtime.recorder import UNRECORDED, WIRE, QueuedRecorder, record
+from lavt.runtime.pipeline import run_stages
+from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, QueuedRecorder, record
 from lavt.transport.messages import encode
 
 NOW = Now(1000, 5000)
@@ -24,19 +24,19 @@ def message(channel: str, payload: object = None) -> Message:
     return Message(channel, payload, NOW)
 
 
-class Kept:
-    """A recorder that keeps its entries in a list."""
+class ListRecorder:
+    """A recorder that stores its entries in a list."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[str, Any, Now]] = []
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Write one entry."""
+        """Store one entry."""
         self.entries.append((topic, payload, now))
 
 
-def test_what_queues_comes_before_what_is_replaced() -> None:
-    """Queued messages come in order and first, then the newest of the others."""
+def test_queued_messages_come_first() -> None:
+    """Queued messages come first and in order, then the newest of the other channels."""
     inbox = Inbox()
     for channel, payload in (("state", 1), ("access_unit", 2), ("view", 3), ("access_unit", 4), ("state", 5)):
         inbox.put(message(channel, payload))
@@ -45,8 +45,8 @@ def test_what_queues_comes_before_what_is_replaced() -> None:
     assert inbox.counts == {"state_replaced": 1}
 
 
-def test_packets_that_had_arrived_come_before_a_wake() -> None:
-    """Packets that came by the time of a wake can be taken first, in order; later ones and other channels stay."""
+def test_packets_that_arrived_before_a_wake_come_first() -> None:
+    """Packets that arrived before a wake can be taken first; later ones and other channels stay."""
     inbox = Inbox()
     for at_ns, channel in ((900, "control"), (1000, "rtp"), (1001, "rtp")):
         inbox.put(Message(channel, at_ns, Now(at_ns, 0)))
@@ -56,8 +56,8 @@ def test_packets_that_had_arrived_come_before_a_wake() -> None:
     assert [each.payload for each in iter(inbox.take, None)] == [900, 1001]
 
 
-def test_a_full_queue_drops_its_oldest_and_counts() -> None:
-    """Beyond its length a channel loses its oldest message, and says so; a flood on one loses nothing of another."""
+def test_a_full_queue_drops_its_oldest_message() -> None:
+    """A full queue drops and counts its oldest message, and loses nothing of other channels."""
     inbox = Inbox()
     inbox.put(message("session", "first"))
     length = CHANNELS["control"].length
@@ -77,7 +77,7 @@ class Stamped:
 
 
 def test_each_stage_gets_the_time_after_the_one_before() -> None:
-    """Hop after hop is called with the value and the end of the hop before, and the timeline lists all ends."""
+    """Each stage gets the result and end time of the one before, and the timeline has all end times."""
     seen = []
 
     def stage(result: object) -> Callable[[Any, Now], object]:
@@ -90,7 +90,7 @@ def test_each_stage_gets_the_time_after_the_one_before() -> None:
     first = message("control")
     sends = [Send("event", 1)]
     stages = [("a", stage(Stamped(42))), ("b", stage("bare")), ("c", stage(sends))]
-    outcome = walk("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
+    outcome = run_stages("node", stages, first, Now(1010, 5010), map(Now(1010, 5010).later, count(7, 7)))
     assert seen == [(first, 1010), (Stamped(42), 1017), ("bare", 1024)]
     assert (outcome.sends, outcome.end) == (sends, Now(1031, 5031))
     assert outcome.timeline is not None
@@ -98,46 +98,46 @@ def test_each_stage_gets_the_time_after_the_one_before() -> None:
     assert outcome.timeline.stages == (("wait", 1010), ("a", 1017), ("b", 1024), ("c", 1031))
 
 
-def test_none_ends_a_chain() -> None:
-    """A hop that returns None is the last one called; nothing is sent, and without a stamp there is no timeline."""
+def test_none_ends_a_pipeline() -> None:
+    """A stage that returns None ends the pipeline; without a stamp there is no timeline."""
     stages = [("a", lambda _value, _now: None), ("b", lambda _value, _now: pytest.fail("called"))]
-    outcome = walk("node", stages, message("control"), NOW, repeat(NOW.later(1)))
+    outcome = run_stages("node", stages, message("control"), NOW, repeat(NOW.later(1)))
     assert (outcome.sends, outcome.end.mono_ns, outcome.timeline) == ([], 1001, None)
 
 
 def test_the_token_is_never_recorded() -> None:
-    """Of a session reply everything is written down but the token, and channels that carry it are not recorded."""
-    kept, token = Kept(), bytes(range(100, 116))
-    record(kept, "session_reply", encode(SessionReply(True, "", 5, token, 1, "host", 0)), NOW)
+    """A session reply is recorded without its token, and token channels are not recorded."""
+    recorded, token = ListRecorder(), bytes(range(100, 116))
+    record(recorded, "session_reply", encode(SessionReply(True, "", 5, token, 1, "host", 0)), NOW)
     for channel in ("path_token", "video_token"):
         assert channel in UNRECORDED
-        record(kept, channel, token, NOW)
-    ((topic, reply, _),) = kept.entries
+        record(recorded, channel, token, NOW)
+    ((topic, reply, _),) = recorded.entries
     assert (topic, reply.epoch, reply.token) == ("session_reply", 5, b"")
 
 
-@pytest.mark.parametrize("channel", sorted(WIRE))
+@pytest.mark.parametrize("channel", sorted(WIRE_DECODERS))
 @pytest.mark.parametrize("data", [b"", b"\xc1", bytes(300)])
-def test_garbage_is_recorded_as_what_it_is(channel: str, data: bytes) -> None:
-    """Bytes from the network that cannot be read are written down with their size, and raise nothing."""
-    kept = Kept()
-    record(kept, channel, data, NOW)
-    ((_, payload, _),) = kept.entries
-    said = payload if isinstance(payload, dict) else asdict(payload)
-    assert said["size_bytes"] == len(data)
+def test_unreadable_bytes_are_recorded(channel: str, data: bytes) -> None:
+    """Unreadable network bytes are recorded with their size."""
+    recorded = ListRecorder()
+    record(recorded, channel, data, NOW)
+    ((_, payload, _),) = recorded.entries
+    fields = payload if isinstance(payload, dict) else asdict(payload)
+    assert fields["size_bytes"] == len(data)
     if channel not in ("rtp", "feedback"):
         assert payload["unreadable"] == data[:64].hex()
 
 
-def test_every_channel_across_the_network_has_a_way_into_the_record() -> None:
-    """What crosses the network is bytes, so each such channel says how they are written down."""
-    assert {name for name, row in CHANNELS.items() if row.carrier in ("video", "zenoh")} == set(WIRE)
+def test_every_network_channel_has_a_decoder() -> None:
+    """Each network channel has a decoder for the record."""
+    assert {name for name, row in CHANNELS.items() if row.carrier in ("video", "zenoh")} == set(WIRE_DECODERS)
 
 
-def test_a_full_disk_ends_the_record_and_nothing_else() -> None:
-    """When an entry cannot be written, that and all later ones are counted as lost; nobody is stopped by it."""
+def test_a_full_disk_ends_the_record_only() -> None:
+    """An entry that cannot be written ends the record; it and all later ones are counted as lost."""
 
-    class FullDisk(Kept):
+    class FullDisk(ListRecorder):
         def write(self, topic: str, payload: Any, now: Now) -> None:
             if len(self.entries) == 2:
                 raise OSError("no space left on device")
@@ -152,16 +152,16 @@ def test_a_full_disk_ends_the_record_and_nothing_else() -> None:
     assert recorder.overflow == 3
 
 
-def test_a_full_record_queue_loses_and_counts() -> None:
-    """When the disk cannot follow, entries are lost, counted, and the count is in the record; nobody waits."""
+def test_a_full_record_queue_counts_lost_entries() -> None:
+    """A full record queue loses and counts entries without blocking."""
     import threading
 
-    kept, go = Kept(), threading.Event()
+    recorded, go = ListRecorder(), threading.Event()
 
-    class Slow(Kept):
+    class Slow(ListRecorder):
         def write(self, topic: str, payload: Any, now: Now) -> None:
             go.wait()
-            kept.write(topic, payload, now)
+            recorded.write(topic, payload, now)
 
     recorder = QueuedRecorder(Slow(), capacity=3)
     for number in range(20):
@@ -169,7 +169,7 @@ def test_a_full_record_queue_loses_and_counts() -> None:
     assert recorder.overflow >= 16
     go.set()
     recorder.close(NOW)
-    written = [payload for topic, payload, _ in kept.entries if topic == "event"]
+    written = [payload for topic, payload, _ in recorded.entries if topic == "event"]
     assert written == list(range(len(written)))
     assert 3 <= len(written) <= 4
-    assert kept.entries[-1][:2] == ("counts", {"record_overflow": 20 - len(written)})
+    assert recorded.entries[-1][:2] == ("counts", {"record_overflow": 20 - len(written)})

@@ -1,6 +1,6 @@
-"""A safety gate on a bench: a vehicle whose state the test sets, a camera that writes stamps, a holder who commands."""
+"""A test rig for the safety gate: a vehicle whose state the test sets, a camera that issues stamps, and a client."""
 
-# ruff: noqa: D102 (a helper of tests: short methods say themselves what they do)
+# ruff: noqa: D102 (a test helper with short methods)
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def vehicle_at(speed_mps: float = 0.0, steering_rad: float = 0.0) -> VehicleStat
 
 
 class Rig:
-    """The gate with all that surrounds it; `now_ns` is the server's monotonic clock and moves by `go` only."""
+    """A safety gate with its surroundings; `now_ns` is the server's monotonic clock and is advanced by `go` only."""
 
     def __init__(self, limits: Limits = LIMITS) -> None:
         epochs, tokens = count(1000), count(1)
@@ -53,31 +53,31 @@ class Rig:
         self.wall_step_ns = 0
 
     def go(self, duration_ns: int) -> None:
-        """Let time pass, and the gate look at the clock whenever it asked to."""
+        """Let time pass, and call `check_timeouts` whenever it is due."""
         end_ns = self.now_ns + duration_ns
-        while (wake_ns := self.gate.next_wake_ns()) is not None and wake_ns <= end_ns:
+        while (wake_ns := self.gate.watchdog.next_wake_ns()) is not None and wake_ns <= end_ns:
             self.now_ns = max(self.now_ns, wake_ns)
-            self.gate.watch(self.now_ns)
-            assert self.gate.next_wake_ns() != wake_ns, "the gate asks for the same wake again and again"
+            self.gate.watchdog.check_timeouts(self.now_ns)
+            assert self.gate.watchdog.next_wake_ns() != wake_ns, "the gate requests the same wake repeatedly"
         self.now_ns = end_ns
-        self.gate.watch(end_ns)
+        self.gate.watchdog.check_timeouts(end_ns)
 
     def picture(self, crc: int | None = None) -> int:
-        """Write the stamp of a new picture, let the gate look at it, and tell the stamp."""
+        """Issue the stamp of a new picture and return it."""
         self.frame += 1
         self.stamp_ns = WALL_NS + self.now_ns + self.wall_step_ns
-        self.gate.written.note(self.stamp_ns, self.frame, self.now_ns, self.frame if crc is None else crc)
-        self.gate.watch(self.now_ns)
+        self.gate.issued_stamps.add(self.stamp_ns, self.frame, self.now_ns, self.frame if crc is None else crc)
+        self.gate.watchdog.check_timeouts(self.now_ns)
         return self.stamp_ns
 
-    def ask(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
-        reply = self.gate.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
+    def request(self, operation: Operation, who: str = "alice", instance: int = 1, number: int = 0) -> SessionReply:
+        reply = self.gate.session.answer(SessionRequest(operation, who, instance, number), self.vehicle, self.now_ns)
         if who == "alice" and reply.epoch:
             self.epoch = reply.epoch
         return reply
 
     def command(self, **changes: Any) -> Command:
-        """Make a sound command from the newest picture; "arm" with the brake on unless told otherwise."""
+        """Return a valid command from the newest picture: "arm" with the brake applied, changed by `changes`."""
         self.sequence += 1
         command = Command(
             self.epoch, self.sequence, self.now_ns, self.stamp_ns, self.now_ns, 0.0, 0.0, 1.0, (0.0,) * 10, "arm", 0
@@ -90,12 +90,12 @@ class Rig:
     def drive(self, **changes: Any) -> CommandVerdict:
         return self.send(**{"mode": "drive", "throttle": 0.5, "brake": 0.0, **changes})
 
-    def hold(self) -> Rig:
-        assert self.ask("hold").granted
+    def acquire(self) -> Rig:
+        assert self.request("hold").granted
         return self
 
     def arm_for(self, duration_ns: int) -> None:
-        """Ask for arming with a new picture every tick, the last time at the very end of `duration_ns`."""
+        """Send an arm command from a new picture every tick, the last one at the very end of `duration_ns`."""
         self.picture()
         self.send()
         for _ in range(duration_ns // TICK_NS):
@@ -104,26 +104,26 @@ class Rig:
             self.send()
 
     def armed(self) -> Rig:
-        """Take the vehicle and arm it."""
-        self.hold()
+        """Acquire control and arm the vehicle."""
+        self.acquire()
         self.arm_for(NS_PER_S)
         assert self.gate.state == "driving"
         return self
 
     def driving(self, **changes: Any) -> Rig:
-        """Arm it and have one drive command obeyed, now."""
+        """Arm the vehicle and send one drive command, now."""
         self.armed()
         self.picture()
         assert self.drive(**changes).accepted
         return self
 
     def clear(self, who: str = "alice", instance: int = 1, number: int | None = None) -> SessionReply:
-        """Ask to clear the emergency stop that the vehicle told of last, or the one named."""
-        last = self.ask("hold", who, instance).emergency_stop
-        return self.ask("clear_emergency_stop", who, instance, last if number is None else number)
+        """Request to clear the last emergency stop that the vehicle reported, or the given one."""
+        last = self.request("hold", who, instance).emergency_stop
+        return self.request("clear_emergency_stop", who, instance, last if number is None else number)
 
     def actuation(self) -> Actuation:
-        return self.gate.actuation(self.vehicle, self.now_ns)
+        return self.gate.watchdog.actuation(self.vehicle, self.now_ns)
 
     @property
     def state(self) -> str:

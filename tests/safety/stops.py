@@ -1,9 +1,9 @@
-"""Safe stops from every metre of the curves of a route: the last command there, and nothing after it.
+"""Safe stops from every metre of a route's curves: the last command arrives there.
 
-A route is driven once in virtual time at L0. The car begins with 30 km/h, because the curves of the key routes come
-before it could reach that. The pictures are rendered and the lane is found in them (`fidelity: pixels`), so that the
-paths in the commands are as wrong as they really are; the codec is left out for half the time. At each metre the
-vehicle's side is copied, with its car, and lives on without a command until it stands.
+A route is driven once in virtual time at L0. The car starts at 30 km/h, because the curves of the key routes come
+before it could reach that speed. Pictures are rendered and the lane is detected in them (`fidelity: pixels`), so that
+the paths in the commands have realistic errors; leaving out the codec halves the time. At each metre the vehicle's side
+is copied, with its car, and continues without commands until it is stationary.
 """
 
 from __future__ import annotations
@@ -23,50 +23,50 @@ from lavt.experiment.runs.plan import plan_run
 from lavt.experiment.runs.virtual_run import VirtualLoop, build_loop
 from lavt.node import WAKE, Message
 from lavt.nodes.actuator import ActuatorNode
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.vehicle.sim.road.road import Road
 from lavt.vehicle.sim.simulator import Simulator
 
 ROUTES = ("a", "a_key", "b", "b_key", "c", "c_key")
 SPEED_MPS = 30 / 3.6
 BEFORE_M = 16.0
-"""From so far before a curve a stop ends in it: the car covers 14 m from its last command on."""
+"""A stop that begins this far before a curve ends in it: the car covers 14 m after its last command."""
 FIRST_M = 5.0
-"""A drive begins up to 2 m into its route, and 3 m later has a command from a picture that was taken at 30 km/h."""
+"""A drive begins up to 2 m into its route, and 3 m later has a command from a picture taken at 30 km/h."""
 ALLOWED_M = 0.3
-"""So far beyond the lane's edge a corner of the body may get."""
+"""Allowed distance of a corner of the body beyond the lane's edge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A piece of a route that bends to one side."""
+    """A piece of a route that bends to one side only."""
 
     route: str
     from_m: float
     to_m: float
     radius_m: float
-    """The smallest; left positive."""
+    """The smallest radius; left positive."""
     first_m: float
-    """Where the first of its stops begins: so far before it that the stop ends in it, but not in the curve before."""
+    """Station of the first stop: before the curve, so that it ends in it, but not in the previous curve."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """What became of the car after its last command."""
+    """The course of the car after its last command."""
 
     at_m: float
-    """Station of the rear axle when the last command was obeyed."""
+    """Station of the rear axle when the last command was accepted."""
     speed_mps: float
-    """There."""
+    """Speed at that station."""
     beyond_m: float
-    """How far a corner of the body got beyond the edge of its lane, at most; less than 0: it stayed so far inside."""
+    """Largest distance of a corner of the body beyond the lane's edge; negative inside the lane."""
     covered_m: float
     ended: str
     """Safety state at standstill."""
 
 
 def curves(route: str, road: Road) -> list[Curve]:
-    """Find the curves of a route: pieces of its centre that are not straight, joined where they bend alike."""
+    """Return the curves of a route: its segments that are not straight, joined if they bend to the same side."""
     found: list[Curve] = []
     s_m, before_m = road.first_m, FIRST_M
     for bend, pieces in groupby(
@@ -84,12 +84,12 @@ def curves(route: str, road: Road) -> list[Curve]:
 
 
 def metres(curve: Curve) -> range:
-    """Give the stations where the last command comes, a metre apart."""
+    """Return the stations of the last command, a metre apart."""
     return range(math.ceil(curve.first_m), math.floor(curve.to_m) + 1)
 
 
 def stops(route: str, condition: str = "L0") -> Iterator[tuple[Curve, Stop, Stop]]:
-    """Drive a route, and give for each metre of each curve the stop that follows the path and the one that does not."""
+    """Drive a route, and yield for each metre of each curve the stop with and without path following."""
     config = {
         "vehicle": {"route": route, "scenery": "none"},
         "network": {"inherent": "paper_wifi5", "condition": condition},
@@ -101,56 +101,58 @@ def stops(route: str, condition: str = "L0") -> Iterator[tuple[Curve, Stop, Stop
         car = actuator_of(loop).vehicle
         assert isinstance(car, Simulator)
         gate = actuator_of(loop).gate
-        assert loop.runtime.run(10 * NS_PER_S, lambda: gate.state == "driving" and gate._command is not None)
+        assert loop.runtime.run(10 * NS_PER_S, lambda: gate.state == "driving" and gate.epoch.command is not None)
         car._car.motion.speed_mps, car._car.motion.brake = SPEED_MPS, 0.0
-        for curve in curves(route, car._judge._road):
+        for curve in curves(route, car._route_monitor._road):
             for metre in metres(curve):
                 _drive_to(loop, car, metre)
                 node = _copied(actuator_of(loop))
                 held = _copied(node)
-                held.gate._path.forget()  # all that a gate knows that cannot follow
+                held.gate.watchdog._path.clear_path()  # disables path following
                 yield curve, _stopped(node), _stopped(held)
         for writer in loop.writers:
             writer.close()
 
 
 def actuator_of(loop: VirtualLoop) -> ActuatorNode:
-    """Give the actuator, which is in the same process in virtual time."""
+    """Return the actuator node, which is in the same process in virtual time."""
     assert loop.server.actuator is not None
     return loop.server.actuator
 
 
 def _drive_to(loop: VirtualLoop, car: Simulator, metre: int) -> None:
-    """Drive on to the first command that is obeyed beyond a metre."""
+    """Drive on to the first accepted command beyond a metre."""
     gate = actuator_of(loop).gate
-    before = gate.applied_sequence
+    before = gate.epoch.sequence
 
     def accepted_there() -> bool:
-        return gate.applied_sequence != before and car.ground_truth().progress_m >= metre
+        return gate.epoch.sequence != before and car.ground_truth().progress_m >= metre
 
     assert loop.runtime.run(loop.runtime.true_ns + 20 * NS_PER_S, accepted_there)
 
 
 def _copied(node: ActuatorNode) -> ActuatorNode:
-    """Copy the vehicle's side: gate, odometry and car; the road, which nobody changes, is shared."""
+    """Return a copy of gate, odometry and car; the road, which never changes, is shared."""
     assert isinstance(node.vehicle, Simulator)
-    road, fixes = node.vehicle._judge._road, node.gate._path._odometry._fixes
+    road, fixes = node.vehicle._route_monitor._road, node.gate.watchdog._path._odometry._fixes
     other = copy.deepcopy(node, {id(road): road, id(fixes): fixes.copy()})
-    other._endings = {}  # at the end of the route it goes on as anywhere
+    other._endings = {}  # the end of the route does not end the drive
     return other
 
 
 def _stopped(node: ActuatorNode) -> Stop:
-    """Let the vehicle's side live on, woken when it asks to be and told nothing, until the car stands."""
+    """Run the vehicle's side, woken when due and without messages, until the car is stationary."""
     car = node.vehicle
     assert isinstance(car, Simulator)
-    judge, motion = car._judge, car._car.motion
-    begin, half_m = car.ground_truth(), judge._road.lanes.widths_m[judge._road.lanes.driven] / 2
+    monitor, motion = car._route_monitor, car._car.motion
+    begin, half_m = car.ground_truth(), monitor._road.lanes.widths_m[monitor._road.lanes.driven] / 2
     beyond_m, covered_m = -math.inf, 0.0
     while motion.speed_mps > 0:
         now = Now(node.next_wake_ns(), 0)
         before = (motion.x_m, motion.y_m)
-        walk(node.name, node.chains[WAKE], Message(WAKE, None, now), now, repeat(now))
+        run_stages(node.name, node.pipelines[WAKE], Message(WAKE, None, now), now, repeat(now))
         covered_m += math.dist(before, (motion.x_m, motion.y_m))
-        beyond_m = max(beyond_m, *(abs(place[1]) - half_m for place in judge._places(motion, judge._corners)))
+        beyond_m = max(
+            beyond_m, *(abs(place[1]) - half_m for place in monitor._project_points(motion, monitor._corners))
+        )
     return Stop(begin.progress_m, begin.speed_mps, beyond_m, covered_m, node.gate.state)

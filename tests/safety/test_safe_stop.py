@@ -1,9 +1,9 @@
-"""Does a car without commands stop in its lane, wherever it is when the last one comes?
+"""Safe stops without commands stay in the lane, wherever the last command arrives.
 
-Inside the lane plus 0.3 m means: from the last command until standstill, no corner of the body is more than 0.3 m
-beyond the edge of the lane, the middle of the line that bounds it. The corners of the car are those of the judge
-(`sim/route_monitor.py`): 3.89 m ahead of the rear axle or 1.04 m behind it, 0.93 m to each side. That is stricter than
-to ask it of the rear axle, because the front swings out.
+"In the lane plus 0.3 m" means that from the last command until standstill, no corner of the body is more than 0.3 m
+beyond the edge of the lane, which is the middle of its line. The corners are those of `sim/route_monitor.py`: 3.89 m
+ahead of the rear axle or 1.04 m behind it, 0.93 m to each side. This is stricter than a limit for the rear axle,
+because the front swings out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tests.safety.stops import ALLOWED_M, ROUTES, SPEED_MPS, Curve, Stop, curves
 from lavt.config import RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import PATH_POINTS, PATH_STEP_M
-from lavt.experiment.runs.monitored_run import watch_drive
+from lavt.experiment.runs.monitored_run import drive_monitored
 from lavt.experiment.runs.plan import plan_run
 from lavt.safety.limiter import stopping_speed_limit_mps
 from lavt.safety.limits import LIMITS
@@ -27,24 +27,34 @@ pytestmark = pytest.mark.full
 
 @cache
 def stops_of(route: str) -> list[tuple[Curve, Stop, Stop]]:
-    """Drive each route once for all tests."""
+    """Return the stops of a route, which is driven once for all tests."""
     return list(stops(route))
 
 
-def test_every_bend_of_the_six_routes_is_a_curve() -> None:
-    """Whatever of a route's centre line is not straight is a curve of the test: ten, down to a radius of 42 m."""
-    found = [(each.route, round(each.from_m), round(each.to_m), round(each.radius_m))
-             for route in ROUTES for each in curves(route, load_road(route))]  # fmt: skip
+def test_all_curves_of_the_six_routes_are_tested() -> None:
+    """All bends of the six routes are tested: ten curves, with radii down to 42 m."""
+    found = [
+        (each.route, round(each.from_m), round(each.to_m), round(each.radius_m))
+        for route in ROUTES
+        for each in curves(route, load_road(route))
+    ]
     assert found == [
-        ("a", 26, 92, -42), ("a_key", 14, 80, -42),
-        ("b", 10, 144, 87), ("b", 236, 248, -488), ("b", 266, 282, 512), ("b", 290, 591, 192), ("b_key", 10, 144, 87),
-        ("c", 7, 13, 512), ("c", 34, 248, -135), ("c_key", 19, 164, -135),
-    ]  # fmt: skip
+        ("a", 26, 92, -42),
+        ("a_key", 14, 80, -42),
+        ("b", 10, 144, 87),
+        ("b", 236, 248, -488),
+        ("b", 266, 282, 512),
+        ("b", 290, 591, 192),
+        ("b_key", 10, 144, 87),
+        ("c", 7, 13, 512),
+        ("c", 34, 248, -135),
+        ("c_key", 19, 164, -135),
+    ]
 
 
 @pytest.mark.parametrize("route", ROUTES)
-def test_the_last_command_comes_at_every_metre(route: str) -> None:
-    """The stops begin a metre apart, from 16 m before each curve to its end, at 30 km/h within 1 km/h."""
+def test_the_stops_begin_at_every_metre(route: str) -> None:
+    """The stops begin a metre apart, from 16 m before each curve to its end, at 30 km/h +- 1 km/h."""
     done = stops_of(route)
     expected = [metre for curve in curves(route, load_road(route)) for metre in metres(curve)]
     assert [int(stop.at_m) for _, stop, _ in done] == expected
@@ -53,7 +63,7 @@ def test_the_last_command_comes_at_every_metre(route: str) -> None:
 
 @pytest.mark.parametrize("route", ROUTES)
 def test_a_safe_stop_stays_in_the_lane(route: str) -> None:
-    """From 30 km/h, the last command anywhere in a curve, the car stays inside its lane plus 0.3 m until it stands."""
+    """A safe stop from 30 km/h anywhere in a curve stays in the lane plus 0.3 m."""
     followed = [stop for _, stop, _ in stops_of(route)]
     assert {stop.ended for stop in followed} == {"safe_stop"}
     assert max(stop.beyond_m for stop in followed) <= ALLOWED_M
@@ -61,30 +71,30 @@ def test_a_safe_stop_stays_in_the_lane(route: str) -> None:
 
 
 @pytest.mark.parametrize("route", ["a", "a_key", "b"])
-def test_with_the_wheel_held_it_does_not(route: str) -> None:
-    """The same stops with the wheel held leave the lane plus 0.3 m where the bend is tight, so following is needed."""
+def test_a_stop_with_the_wheel_held_leaves_the_lane(route: str) -> None:
+    """With the wheel held, stops in tight bends leave the lane plus 0.3 m, so path following is needed."""
     done = stops_of(route)
     assert {held.ended for _, _, held in done} == {"safe_stop"}
     assert max(held.beyond_m for _, _, held in done) > ALLOWED_M
 
 
-def test_under_delay_the_path_lies_where_its_picture_was_taken() -> None:
-    """At L3, its pictures 2.5 m old, the car stops 0.1 m inside its lane; with the wheel held, 1 m out of it."""
+def test_a_safe_stop_under_delay_stays_in_the_lane() -> None:
+    """At L3, with pictures 2.5 m old, the car stops 0.1 m inside its lane; with the wheel held, 1 m outside."""
     _, followed, held = zip(*stops("a", "L3"), strict=True)
-    assert max(stop.beyond_m for stop in followed) < -0.1  # + 0.02 m where a path is taken to begin at its command
+    assert max(stop.beyond_m for stop in followed) < -0.1  # it is + 0.02 m if the path begins where its command arrived
     assert max(stop.beyond_m for stop in held) > 1.0
 
 
-def test_with_old_pictures_the_car_is_slower() -> None:
-    """With 0.9 s of delay the car keeps within 0.1 m/s to what its sight allows, which is below 30 km/h."""
+def test_with_old_pictures_the_car_drives_slower() -> None:
+    """At 0.9 s of delay the car keeps the stopping speed limit, below 30 km/h, within 0.1 m/s."""
     config = {
         "vehicle": {"route": "straight"},
         "network": {"inherent": "paper_wifi5", "condition": "L0", "video": {"delay_ms": 900.0}},
-        "controller": {"lookahead_s": 2.4},  # bears so much delay
+        "controller": {"lookahead_s": 2.4},  # stable at this delay
         "safety": {"picture_age_limit_ms": 2000.0},
         "fidelity": "geometry",
     }
-    seen = watch_drive(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
+    seen = drive_monitored(plan_run(parse_config(RunConfig, config, "the test")), limit_s=25)
     speeds_mps = seen.speed_mps[seen.time_s > 10]
     allowed_mps = stopping_speed_limit_mps(seen.total_delay_ms / 1000, LIMITS)
     assert allowed_mps < SPEED_MPS - 0.2

@@ -1,4 +1,4 @@
-"""How the vehicle is armed, and how an emergency stop holds it."""
+"""Arming and emergency stops."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import pytest
 from tests.safety.rig import TICK_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.safety.gate import LARGEST_STORED_NUMBER
+from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
+from lavt.safety.session import LARGEST_STORED_NUMBER
 
 
 def test_arming_takes_a_full_second() -> None:
-    """All conditions held for 1 s arm the vehicle; a nanosecond less does not."""
-    rig = Rig().hold()
+    """The vehicle is armed when all conditions were met for 1 s, and not a nanosecond earlier."""
+    rig = Rig().acquire()
     rig.picture()
     rig.send()
     begun_ns = rig.now_ns
@@ -69,15 +70,15 @@ BREAKS: dict[str, Callable[[Rig], object]] = {
     "frozen pictures": freezes,
     "no newer pictures": no_new_pictures,
     "no commands": lambda rig: rig.go(300 * NS_PER_MS),
-    "release": lambda rig: (rig.ask("release"), rig.hold()),
-    "emergency stop": lambda rig: (rig.ask("emergency_stop", "bob", 3, number=1), rig.clear()),
+    "release": lambda rig: (rig.request("release"), rig.acquire()),
+    "emergency stop": lambda rig: (rig.request("emergency_stop", "bob", 3, number=1), rig.clear()),
 }
 
 
 @pytest.mark.parametrize("name", sorted(BREAKS))
-def test_each_broken_condition_starts_the_second_anew(name: str) -> None:
-    """Whatever breaks a condition 0.6 s into arming, only a whole further second arms the vehicle."""
-    rig = Rig().hold()
+def test_an_unmet_condition_restarts_arming(name: str) -> None:
+    """A condition that fails 0.6 s into arming restarts the second."""
+    rig = Rig().acquire()
     rig.arm_for(600 * NS_PER_MS)
     assert rig.state == "arming"
     BREAKS[name](rig)
@@ -89,9 +90,9 @@ def test_each_broken_condition_starts_the_second_anew(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["throttle", "brake eased", "steering to the left", "frozen pictures"])
-def test_arming_does_not_even_begin_without_its_conditions(name: str) -> None:
-    """A command that asks for arming with a condition missing leaves the vehicle disarmed."""
-    rig = Rig().hold()
+def test_arming_does_not_begin_with_an_unmet_condition(name: str) -> None:
+    """An arm command with an unmet condition leaves the vehicle disarmed."""
+    rig = Rig().acquire()
     rig.picture()
     BREAKS[name](rig)
     assert rig.state == "disarmed"
@@ -108,16 +109,16 @@ def test_arming_does_not_even_begin_without_its_conditions(name: str) -> None:
     ids=str,
 )
 def test_arming_begins_at_the_bounds_of_its_conditions(changes: dict[str, Any]) -> None:
-    """The lightest brake, the largest steering input to either side and the first sequence number are enough."""
-    rig = Rig().hold()
+    """The lightest brake, the largest steering input and the first sequence number suffice for arming."""
+    rig = Rig().acquire()
     rig.picture()
     assert rig.send(**changes).accepted
     assert rig.state == "arming"
 
 
-def test_arming_begins_from_the_first_picture_of_all() -> None:
-    """A picture with frame number 0 is newer than none."""
-    rig = Rig().hold()
+def test_arming_begins_from_the_first_picture() -> None:
+    """A picture with frame number 0 is fresh if it is the first."""
+    rig = Rig().acquire()
     rig.frame = -1
     rig.picture()
     rig.send()
@@ -125,8 +126,8 @@ def test_arming_begins_from_the_first_picture_of_all() -> None:
 
 
 def test_arming_does_not_begin_with_a_picture_already_used() -> None:
-    """Pictures must be fresh when arming begins: one that was used 300 ms ago is not, though young enough to obey."""
-    rig = Rig().hold()
+    """A picture used 300 ms ago is not fresh enough to begin arming, though its command is accepted."""
+    rig = Rig().acquire()
     rig.picture()
     rig.send()
     rig.go(300 * NS_PER_MS)
@@ -136,7 +137,7 @@ def test_arming_does_not_begin_with_a_picture_already_used() -> None:
 
 
 def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
-    """Armed, the brake stays on and the wheel where it is, until a drive command comes; without one it stops again."""
+    """Armed without a drive command, the vehicle stays braked with its wheel still, and stops at the timeout."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.2)
     rig.armed()
@@ -152,12 +153,12 @@ def test_the_vehicle_does_not_move_before_the_first_drive_command() -> None:
     assert rig.state == "safe_stop"
 
 
-def test_armed_anew_the_last_drives_command_is_forgotten() -> None:
-    """Armed again after a stop, the vehicle keeps its brake on and its wheel where it is until a new drive command."""
+def test_arming_again_drops_the_last_command() -> None:
+    """Armed again after a stop, the vehicle ignores the command of the drive before."""
     rig = Rig().driving(steering_rad=0.05)
     rig.go(LIMITS.stop_after_ns)
     assert rig.state == "safe_stop"
-    rig.ask("hold")
+    rig.request("hold")
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     actuation = rig.actuation()
@@ -165,12 +166,12 @@ def test_armed_anew_the_last_drives_command_is_forgotten() -> None:
     assert actuation.brake >= LIMITS.arming_brake
 
 
-def test_the_first_steering_target_is_where_the_wheel_is() -> None:
-    """From the moment of arming the wheel is turned from where it stands, at most at the rate allowed."""
+def test_the_first_steering_target_is_the_present_angle() -> None:
+    """From arming on, the wheel turns from its present angle, at most at the allowed rate."""
     rig = Rig()
     rig.vehicle = vehicle_at(0.0, steering_rad=0.0)
     rig.actuation()
-    rig.vehicle = vehicle_at(0.0, steering_rad=0.2)  # somebody turned the wheel since
+    rig.vehicle = vehicle_at(0.0, steering_rad=0.2)  # the wheel was turned since
     rig.armed()
     rig.go(10 * NS_PER_MS)
     rig.picture()
@@ -180,8 +181,8 @@ def test_the_first_steering_target_is_where_the_wheel_is() -> None:
 
 @pytest.mark.parametrize("start", ["disarmed", "arming", "driving", "degraded", "safe_stop"])
 def test_an_emergency_stop_works_in_every_state(start: str) -> None:
-    """From every state the query leads to the latched emergency stop: full brake, new epoch, nothing obeyed."""
-    rig = Rig().hold()
+    """In every state an emergency stop latches full brake under a new epoch, and no command is accepted."""
+    rig = Rig().acquire()
     if start == "arming":
         rig.arm_for(NS_PER_S // 2)
     elif start != "disarmed":
@@ -189,11 +190,11 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
         rig.go({"driving": 0, "degraded": 300, "safe_stop": 500}[start] * NS_PER_MS)
     assert rig.state == start
     rig.vehicle = vehicle_at(5.0)
-    assert rig.ask("emergency_stop", "bob", 4, number=17).granted
+    assert rig.request("emergency_stop", "bob", 4, number=17).granted
     assert rig.state == "emergency_stop"
     assert (rig.actuation().throttle, rig.actuation().brake) == (0.0, 1.0)
     rig.picture()
-    assert rig.drive().reason == "not the epoch in force"
+    assert rig.drive().reason == RejectionReason.WRONG_EPOCH
     rig.go(NS_PER_S)
     assert rig.state == "emergency_stop"
 
@@ -203,63 +204,63 @@ def test_an_emergency_stop_works_in_every_state(start: str) -> None:
     [{}, {"epoch": 1}, {"sequence": 0}, {"stamp_ns": 0}, {"stamp_ns": 5}, {"mode": "arm"}, {"mode": "stop"}],
     ids=str,
 )
-def test_the_flag_in_a_command_counts_whatever_the_command(changes: dict[str, Any]) -> None:
-    """An emergency stop in a command is honoured whatever its epoch, sequence and picture; the command is refused."""
+def test_an_emergency_stop_in_any_command_is_executed(changes: dict[str, Any]) -> None:
+    """An emergency stop in a command is executed whatever else the command has, and the command rejected."""
     rig = Rig().driving()
     assert not rig.drive(emergency_stop=1, **changes).accepted
     assert rig.state == "emergency_stop"
 
 
-def test_the_flag_counts_when_nobody_holds_the_vehicle() -> None:
-    """Also a vehicle that nobody holds is stopped by a flag, and nobody can arm it then but by clearing."""
+def test_an_emergency_stop_without_an_operator() -> None:
+    """An emergency stop in a command stops a vehicle without an operator, and must be cleared before arming."""
     rig = Rig()
     rig.send(emergency_stop=1)
     assert rig.state == "emergency_stop"
-    rig.hold().arm_for(NS_PER_S)
+    rig.acquire().arm_for(NS_PER_S)
     assert rig.state == "emergency_stop"
-    assert rig.send().reason == "the emergency stop must be cleared first"
+    assert rig.send().reason == RejectionReason.EMERGENCY_STOP_LATCHED
 
 
-def test_the_number_of_an_emergency_stop_only_grows() -> None:
-    """A number that is not higher than all before, over epochs, is a replay: refused, counted, without effect."""
+def test_an_old_emergency_stop_is_rejected() -> None:
+    """An emergency stop whose number is not higher than all before is rejected and counted as a replay."""
     rig = Rig().armed()
-    assert rig.ask("emergency_stop", number=40).granted
+    assert rig.request("emergency_stop", number=40).granted
     assert rig.clear().granted
-    rig.ask("hold")
+    rig.request("hold")
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
     for number in (40, 39, 1, 0):
-        reply = rig.ask("emergency_stop", "bob", 2, number=number)
+        reply = rig.request("emergency_stop", "bob", 2, number=number)
         assert isinstance(reply.reason, str)
         assert reply.reason != ""
         assert (reply.granted, reply.emergency_stop) == (False, 40)
     rig.picture()
-    assert rig.drive(emergency_stop=40).reason == "it carries an emergency stop"
+    assert rig.drive(emergency_stop=40).reason == RejectionReason.EMERGENCY_STOP
     assert rig.state == "driving"
     assert rig.gate.counts["emergency stop with an old number"] == 5
-    assert rig.ask("emergency_stop", "bob", 2, number=41).granted
+    assert rig.request("emergency_stop", "bob", 2, number=41).granted
     assert rig.state == "emergency_stop"
 
 
 @pytest.mark.parametrize("beyond", [0, 1])
-def test_a_number_too_large_to_be_followed_stops_and_is_forgotten(beyond: int) -> None:
-    """An emergency stop with any higher number stops the vehicle; one that leaves no room for a next is not kept."""
+def test_the_largest_emergency_stop_number(beyond: int) -> None:
+    """The largest emergency stop number is stored; a larger one stops the vehicle and is not stored."""
     rig = Rig().armed()
-    rig.ask("emergency_stop", "bob", 2, number=40)
+    rig.request("emergency_stop", "bob", 2, number=40)
     rig.clear()
-    reply = rig.ask("emergency_stop", "bob", 2, number=LARGEST_STORED_NUMBER + beyond)
+    reply = rig.request("emergency_stop", "bob", 2, number=LARGEST_STORED_NUMBER + beyond)
     assert (reply.granted, rig.state) == (True, "emergency_stop")
     assert reply.emergency_stop == (40 if beyond else LARGEST_STORED_NUMBER)
     assert rig.clear().granted
     assert rig.state == "disarmed"
 
 
-def test_a_command_that_carries_an_emergency_stop_never_moves_the_vehicle() -> None:
-    """After clearing, a client that still carries its old emergency stop can neither arm nor drive."""
-    rig = Rig().hold()
-    rig.ask("emergency_stop", number=3)
+def test_a_command_with_an_emergency_stop_never_moves_the_vehicle() -> None:
+    """After clearing, a client whose commands still carry the old emergency stop can neither arm nor drive."""
+    rig = Rig().acquire()
+    rig.request("emergency_stop", number=3)
     rig.clear()
-    rig.ask("hold")
+    rig.request("hold")
     for _ in range(100):
         rig.go(TICK_NS)
         rig.picture()
@@ -267,53 +268,54 @@ def test_a_command_that_carries_an_emergency_stop_never_moves_the_vehicle() -> N
     assert rig.state == "disarmed"
 
 
-def test_the_flag_that_every_command_repeats_is_no_replay() -> None:
-    """While the stop is in force, the same number in command after command is not counted as a replay."""
+def test_a_repeated_emergency_stop_is_not_counted_as_a_replay() -> None:
+    """The same number in command after command is not counted as a replay while the stop is latched."""
     rig = Rig().driving()
     for _ in range(10):
         rig.drive(emergency_stop=9)
     assert rig.gate.counts["emergency stop with an old number"] == 0
 
 
-def test_only_the_active_operator_clears_at_standstill_and_by_number() -> None:
-    """Clearing is refused to others, to a moving vehicle, and to a request that names another emergency stop."""
+def test_only_the_active_operator_clears_an_emergency_stop() -> None:
+    """Only the active operator clears an emergency stop, at standstill and by its number."""
     rig = Rig().driving()
-    rig.ask("emergency_stop", "bob", 2, number=8)
+    rig.request("emergency_stop", "bob", 2, number=8)
     rig.vehicle = vehicle_at(1.0)
-    assert rig.clear().reason == "the vehicle does not stand yet"
+    assert "stationary" in rig.clear().reason
     rig.vehicle = vehicle_at()
-    assert not rig.ask("clear_emergency_stop", "bob", 2, number=8).granted
-    rig.ask("emergency_stop", "bob", 2, number=9)
+    assert not rig.request("clear_emergency_stop", "bob", 2, number=8).granted
+    rig.request("emergency_stop", "bob", 2, number=9)
     late = rig.clear(number=8)
-    assert (late.granted, late.reason) == (False, "this is not the number of the last emergency stop")
+    assert not late.granted
+    assert "number" in late.reason
     assert rig.state == "emergency_stop"
     assert rig.clear(number=9).granted
     assert rig.state == "disarmed"
 
 
-def test_arming_is_rejected_before_clearing_and_needed_after_it() -> None:
-    """Until it is cleared the emergency stop refuses arming; cleared, the vehicle is disarmed and needs its second."""
+def test_an_emergency_stop_must_be_cleared_before_arming() -> None:
+    """An emergency stop must be cleared before arming, and arming takes its second afterwards."""
     rig = Rig().driving()
-    rig.ask("emergency_stop", number=8)
-    rig.ask("hold")
+    rig.request("emergency_stop", number=8)
+    rig.request("hold")
     rig.picture()
-    assert rig.send().reason == "the emergency stop must be cleared first"
+    assert rig.send().reason == RejectionReason.EMERGENCY_STOP_LATCHED
     assert rig.clear().granted
-    assert rig.drive().reason == "the vehicle is not armed"
+    assert rig.drive().reason == RejectionReason.NOT_ARMED
     rig.arm_for(NS_PER_S)
     assert rig.state == "driving"
 
 
-def test_transitions_are_told_with_their_reasons() -> None:
-    """Every transition is told once: from, to, and why."""
+def test_transitions_are_reported_with_reasons() -> None:
+    """Each transition is reported once, with both states and a reason."""
     rig = Rig().driving()
     rig.go(500 * NS_PER_MS)
-    told = rig.gate.take_transitions()
-    assert [(before, after) for before, after, _ in told] == [
+    transitions = rig.gate.machine.take_transitions()
+    assert [(before, after) for before, after, _ in transitions] == [
         ("disarmed", "arming"),
         ("arming", "driving"),
         ("driving", "degraded"),
         ("degraded", "safe_stop"),
     ]
-    assert all(reason for _, _, reason in told)
-    assert rig.gate.take_transitions() == []
+    assert all(reason for _, _, reason in transitions)
+    assert rig.gate.machine.take_transitions() == []

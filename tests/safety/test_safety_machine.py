@@ -1,6 +1,6 @@
-"""What no sequence of inputs may do to the safety gate: a machine that plays client, camera, vehicle and clock."""
+"""Property tests of the safety gate with random clients, cameras, vehicles and clocks."""
 
-# ruff: noqa: D102 (rules and invariants are named after what they are)
+# ruff: noqa: D102 (the names of rules and invariants describe them)
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from tests.safety.rig import MAX_STEERING_RAD, TICK_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, PATH_POINTS, Operation, SafetyState
-from lavt.safety.gate import BREAKS_ARMING, TRANSITIONS
+from lavt.safety.gate import INTERRUPTS_ARMING
 from lavt.safety.limits import LIMITS
+from lavt.safety.state_machine import TRANSITIONS
 
 STEPS = {(before, after) for (before, _), after in TRANSITIONS.items()}
 WIRE = {
@@ -29,58 +30,58 @@ WIRE = {
     "stamp_ns": st.integers(0, 2**63 - 1),
     "emergency_stop": st.sampled_from([0, 0, 0, 1, 2, 3]),
 }
-"""All that `decode` lets through."""
+"""All values that `decode` accepts."""
 SPEEDS = st.one_of(st.just(0.0), st.floats(-5, 40), st.just(math.nan))
 
 
 class GateMachine(RuleBasedStateMachine):
-    """Feeds the gate anything, and knows since when all conditions of arming have held."""
+    """A state machine that gives the gate any inputs and tracks since when all arming conditions were met."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.rig = Rig().hold()
-        self.held_since_ns: int | None = None
+        self.rig = Rig().acquire()
+        self.met_since_ns: int | None = None
         self.used_ns = -NS_PER_S
         self.newest_used = 0
         self.last_rad = 0.0
         self.last_ns = self.rig.now_ns
         self.before: SafetyState = "disarmed"
 
-    def give(self, **changes: Any) -> None:
-        """Hand a command to the gate and to the oracle: did it keep all conditions, or break one?"""
+    def send(self, **changes: Any) -> None:
+        """Send a command to the gate, and track whether it met all arming conditions."""
         rig = self.rig
         command = rig.command(**changes)
-        lawful = command.epoch == rig.gate._epoch and not command.emergency_stop
+        is_valid = command.epoch == rig.gate.epoch.number and not command.emergency_stop
         verdict = rig.gate.admit(command, rig.vehicle, rig.now_ns)
         if verdict.accepted and command.stamp_ns == rig.stamp_ns and rig.frame > self.newest_used:
             self.newest_used, self.used_ns = rig.frame, rig.now_ns
         fresh = rig.now_ns - self.used_ns < LIMITS.degraded_after_ns
         neutral = command.throttle == 0 and abs(command.steering_rad) <= LIMITS.arming_steering_rad
-        good = lawful and command.mode == "arm" and neutral and fresh and command.brake >= LIMITS.arming_brake
+        good = is_valid and command.mode == "arm" and neutral and fresh and command.brake >= LIMITS.arming_brake
         kept = good and verdict.accepted and abs(rig.vehicle.speed_mps) < LIMITS.standstill_mps
-        if not kept and (verdict.accepted or verdict.reason in BREAKS_ARMING):
-            self.held_since_ns = None
-        self.only_the_table_leads_anywhere()
-        if kept and self.held_since_ns is None:
-            self.held_since_ns = rig.now_ns
+        if not kept and (verdict.accepted or verdict.reason in INTERRUPTS_ARMING):
+            self.met_since_ns = None
+        self.transitions_follow_the_table()
+        if kept and self.met_since_ns is None:
+            self.met_since_ns = rig.now_ns
 
     @rule()
     def arm_well(self) -> None:
         self.rig.picture()
-        self.give()
+        self.send()
 
     @rule(seconds=st.sampled_from([0.4, 0.8, 1.0]))
     def arm_well_for_a_while(self, seconds: float) -> None:
-        self.rig.ask("hold")
+        self.rig.request("hold")
         self.rig.vehicle = vehicle_at(0.0, self.rig.vehicle.steering_rad)
         for _ in range(round(seconds * 50)):
             self.pass_time(TICK_NS)
             self.rig.picture()
-            self.give()
+            self.send()
 
     @rule(changes=st.fixed_dictionaries({}, optional=WIRE))
     def any_command(self, changes: dict[str, Any]) -> None:
-        self.give(**changes)
+        self.send(**changes)
 
     @rule(
         changes=st.fixed_dictionaries(
@@ -89,7 +90,7 @@ class GateMachine(RuleBasedStateMachine):
     )
     def drive(self, changes: dict[str, Any]) -> None:
         self.rig.picture()
-        self.give(mode="drive", **changes)
+        self.send(mode="drive", **changes)
 
     @rule(crc=st.sampled_from([None, None, -1]))
     def picture(self, crc: int | None) -> None:
@@ -99,31 +100,31 @@ class GateMachine(RuleBasedStateMachine):
     def frozen_pictures(self) -> None:
         for _ in range(LIMITS.frozen_frames):
             self.rig.picture(-1)
-        self.held_since_ns = None
+        self.met_since_ns = None
 
     @rule(duration_ns=st.sampled_from([0, 1, NS_PER_MS, TICK_NS, 200 * NS_PER_MS, 300 * NS_PER_MS, NS_PER_S]))
     def pass_time(self, duration_ns: int) -> None:
         self.rig.go(duration_ns)
         if self.rig.now_ns - self.used_ns >= LIMITS.degraded_after_ns:
-            self.held_since_ns = None
+            self.met_since_ns = None
 
     @rule(duration_ns=st.integers(0, NS_PER_S))
-    def pass_time_unwatched(self, duration_ns: int) -> None:
+    def pass_time_without_wakes(self, duration_ns: int) -> None:
         self.rig.now_ns += duration_ns
         if self.rig.now_ns - self.used_ns >= LIMITS.degraded_after_ns:
-            self.held_since_ns = None
+            self.met_since_ns = None
 
     @rule(
         operation=st.sampled_from(["hold", "ask", "release", "emergency_stop", "clear_emergency_stop"]),
         who=st.sampled_from(["alice", "alice", "bob"]),
         number=st.integers(0, 5),
     )
-    def ask(self, operation: Operation, who: str, number: int) -> None:
-        reply = self.rig.ask(operation, who, 1, number)
+    def request(self, operation: Operation, who: str, number: int) -> None:
+        reply = self.rig.request(operation, who, 1, number)
         if operation == "release" and reply.granted:
-            self.held_since_ns = None
+            self.met_since_ns = None
         if reply.epoch:
-            assert self.rig.gate.active_operator == (who, 1)
+            assert self.rig.gate.session.active_operator == (who, 1)
 
     @rule(speed_mps=SPEEDS, steering_rad=st.floats(-MAX_STEERING_RAD, MAX_STEERING_RAD))
     def vehicle_is(self, speed_mps: float, steering_rad: float) -> None:
@@ -138,18 +139,18 @@ class GateMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.rig.state == "driving")
     @rule()
     def end_drive(self) -> None:
-        self.rig.gate.end_drive()
+        self.rig.gate.machine.trigger("drive over")
 
     @invariant()
-    def only_the_table_leads_anywhere(self) -> None:
-        for before, after, _ in self.rig.gate.take_transitions():
+    def transitions_follow_the_table(self) -> None:
+        for before, after, _ in self.rig.gate.machine.take_transitions():
             assert before == self.before
             assert (before, after) in STEPS
             if (before, after) == ("arming", "driving"):
-                assert self.held_since_ns is not None
-                assert self.rig.now_ns - self.held_since_ns >= LIMITS.arming_hold_ns
+                assert self.met_since_ns is not None
+                assert self.rig.now_ns - self.met_since_ns >= LIMITS.arming_hold_ns
             if after != "arming" and (before == "arming" or after == "emergency_stop"):
-                self.held_since_ns = None
+                self.met_since_ns = None
             self.before = after
         assert self.rig.state == self.before
 
@@ -175,12 +176,12 @@ class GateMachine(RuleBasedStateMachine):
 GateMachine.TestCase.settings = settings(max_examples=150, stateful_step_count=25)
 TestGateMachine = GateMachine.TestCase
 TestGateMachine.__doc__ = (
-    "No inputs reach driving without a full arming second, leave the table, or put an actuation beyond a limit."
+    "No inputs reach driving without 1 s of arming, make a transition outside the table, or exceed a limit."
 )
 
 
-def test_every_row_of_the_table_is_reachable() -> None:
-    """Each state can be reached from the first, and each of them can be left again for driving."""
+def test_every_state_is_reachable() -> None:
+    """From every state of the table every state can be reached."""
     for start in {before for before, _ in TRANSITIONS} | set(TRANSITIONS.values()):
         reached: set[SafetyState] = {start}
         while True:
@@ -191,7 +192,7 @@ def test_every_row_of_the_table_is_reachable() -> None:
         assert reached == {"disarmed", "arming", "driving", "degraded", "safe_stop", "emergency_stop"}
 
 
-def test_only_arming_and_a_newer_picture_lead_to_driving() -> None:
-    """The table has two ways to driving: a held arming second, and the end of a silence."""
+def test_only_arming_and_a_fresh_command_lead_to_driving() -> None:
+    """The table has two ways to driving: complete arming, and a fresh command while degraded."""
     ways = {key for key, after in TRANSITIONS.items() if after == "driving"}
-    assert ways == {("arming", "arming held"), ("degraded", "fresh command")}
+    assert ways == {("arming", "arming complete"), ("degraded", "fresh command")}

@@ -1,4 +1,4 @@
-"""Who may command the vehicle."""
+"""Control of the vehicle: acquire, hand over, release."""
 
 from __future__ import annotations
 
@@ -6,51 +6,52 @@ import pytest
 from tests.safety.rig import TICK_NS, Rig, vehicle_at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Operation, SessionRequest
+from lavt.safety.gate import RejectionReason
 from lavt.safety.limits import LIMITS
 
 
-def test_nobody_is_accepted_before_somebody_holds_the_vehicle() -> None:
-    """Without a holder no command is obeyed, not even one that guessed the epoch in force."""
+def test_without_an_operator_every_command_is_rejected() -> None:
+    """While no client has control, every command is rejected, even with the present epoch."""
     rig = Rig()
     rig.picture()
     for epoch in range(999, 1003):
         verdict = rig.send(epoch=epoch)
-        assert (verdict.accepted, verdict.reason) == (False, "not the epoch in force")
+        assert (verdict.accepted, verdict.reason) == (False, RejectionReason.WRONG_EPOCH)
     assert rig.state == "disarmed"
 
 
-def test_what_is_in_force_is_known_from_the_start() -> None:
-    """Epoch and last accepted sequence can be read before the first session; a new epoch has no sequence yet."""
+def test_epoch_and_sequence_are_always_known() -> None:
+    """Epoch and last accepted sequence number are known at any time; a new epoch has no sequence yet."""
     rig = Rig()
     before, sequence = rig.gate.in_force
     assert sequence == -1
-    rig.hold()
+    rig.acquire()
     assert rig.gate.in_force == (rig.epoch, -1)
     assert rig.epoch != before
     rig.picture()
     assert rig.send().accepted
     assert rig.gate.in_force == (rig.epoch, rig.sequence)
-    rig.ask("release")
+    rig.request("release")
     assert rig.gate.in_force[0] not in (before, rig.epoch)
     assert rig.gate.in_force[1] == -1
 
 
 def test_the_active_operator_gets_an_epoch_and_a_token() -> None:
-    """Holding hands out the epoch to command under and the token that opens the path of the video."""
-    reply = Rig().ask("hold")
+    """A client that acquires control gets an epoch for commands and a token for the video path."""
+    reply = Rig().request("hold")
     assert (reply.granted, reply.reason) == (True, "")
     assert reply.epoch != 0
     assert len(reply.token) == 16
     assert (reply.video_port, reply.host, reply.emergency_stop) == (5600, "bench", 0)
 
 
-def test_asking_again_changes_nothing() -> None:
-    """The same instance asking again, also while it drives, gets the same epoch and token and goes on driving."""
+def test_acquiring_control_again_changes_nothing() -> None:
+    """An instance that acquires control again, also while driving, gets the same epoch and token."""
     rig = Rig()
-    first = rig.ask("hold")
-    assert rig.ask("hold") == first
+    first = rig.request("hold")
+    assert rig.request("hold") == first
     rig.arm_for(NS_PER_S)
-    assert rig.ask("hold") == first
+    assert rig.request("hold") == first
     assert rig.state == "driving"
     rig.picture()
     assert rig.drive().accepted
@@ -58,14 +59,11 @@ def test_asking_again_changes_nothing() -> None:
 
 @pytest.mark.parametrize("other", [("bob", 1), ("alice", 2)])
 def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: tuple[str, int]) -> None:
-    """While arming, driving, degraded, or still rolling in a stop, nobody else gets the vehicle, an epoch or a token.
-
-    A client that was started anew is somebody else.
-    """
-    rig = Rig().hold()
+    """While the vehicle is active or moves, no other client or instance acquires control."""
+    rig = Rig().acquire()
 
     def rejected() -> bool:
-        reply = rig.gate.answer(SessionRequest("hold", *other, 0), rig.vehicle, rig.now_ns)
+        reply = rig.gate.session.answer(SessionRequest("hold", *other, 0), rig.vehicle, rig.now_ns)
         return (reply.granted, reply.epoch, reply.token) == (False, 0, b"")
 
     rig.arm_for(NS_PER_S // 2)
@@ -85,47 +83,47 @@ def test_a_second_client_is_rejected_while_the_vehicle_is_armed_or_moves(other: 
     assert not rejected()
 
 
-def test_take_over_at_standstill_ends_the_first_ones_epoch() -> None:
-    """At standstill and disarmed another client takes over: new epoch, new token, the first is no longer obeyed."""
+def test_a_takeover_at_standstill_renews_the_epoch() -> None:
+    """At standstill and disarmed, another client acquires control under a new epoch and token."""
     rig = Rig()
-    first = rig.ask("hold")
-    second = rig.ask("hold", "bob", 7)
+    first = rig.request("hold")
+    second = rig.request("hold", "bob", 7)
     assert second.granted
     assert second.epoch != first.epoch
     assert second.token != first.token
     rig.picture()
-    assert rig.send().reason == "not the epoch in force"
+    assert rig.send().reason == RejectionReason.WRONG_EPOCH
     assert rig.send(epoch=second.epoch).accepted
-    assert not rig.ask("release").granted
+    assert not rig.request("release").granted
 
 
-def test_release_gives_the_vehicle_up_and_stops_it() -> None:
-    """Released while driving it stops for safety, obeys nothing more, and is free for whoever comes."""
+def test_a_release_stops_and_frees_the_vehicle() -> None:
+    """A release while driving leads to the safe stop, rejects later commands and frees the vehicle."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    assert rig.ask("release").granted
+    assert rig.request("release").granted
     assert rig.state == "safe_stop"
     rig.picture()
-    assert rig.drive().reason == "not the epoch in force"
-    assert rig.ask("hold", "bob", 1).granted
+    assert rig.drive().reason == RejectionReason.WRONG_EPOCH
+    assert rig.request("hold", "bob", 1).granted
 
 
-def test_release_hands_out_nothing() -> None:
-    """The answer to a release has neither epoch nor token, and nothing is obeyed after it."""
-    rig = Rig().hold()
-    reply = rig.ask("release")
+def test_the_reply_to_a_release_has_no_epoch() -> None:
+    """The reply to a release has neither epoch nor token."""
+    rig = Rig().acquire()
+    reply = rig.request("release")
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
     rig.picture()
     assert not rig.send().accepted
-    assert not rig.ask("release").granted
+    assert not rig.request("release").granted
 
 
 @pytest.mark.parametrize("operation", ["release", "clear_emergency_stop"])
 def test_only_the_active_operator_changes_the_session(operation: Operation) -> None:
-    """Release and clearing are refused to others, and to the holder's name under another instance."""
+    """Release and clearing are rejected from other clients, and from another instance of the same name."""
     rig = Rig().armed()
     for who, instance in (("bob", 1), ("alice", 2)):
-        reply = rig.ask(operation, who, instance)
+        reply = rig.request(operation, who, instance)
         assert not reply.granted
         assert isinstance(reply.reason, str)
         assert reply.reason != ""
@@ -133,76 +131,76 @@ def test_only_the_active_operator_changes_the_session(operation: Operation) -> N
     assert rig.state == "driving"
 
 
-def test_whoever_stops_the_vehicle_does_not_get_to_drive_it() -> None:
-    """The answer to a bystander's emergency stop has neither epoch nor token."""
+def test_an_emergency_stop_grants_no_control() -> None:
+    """The reply to another client's emergency stop has neither epoch nor token."""
     rig = Rig().driving()
-    reply = rig.ask("emergency_stop", "bob", 9, number=5)
+    reply = rig.request("emergency_stop", "bob", 9, number=5)
     assert reply.granted
     assert (reply.epoch, reply.token) == (0, b"")
 
 
-def test_what_was_requested_is_counted() -> None:
-    """Each operation is counted, granted and refused apart."""
+def test_session_requests_are_counted() -> None:
+    """Each operation is counted, granted and rejected separately."""
     rig = Rig().armed()
-    rig.ask("hold", "bob", 1)
+    rig.request("hold", "bob", 1)
     counts = rig.gate.counts
-    assert (counts["session hold granted"], counts["session hold refused"]) == (1, 1)
+    assert (counts["session hold granted"], counts["session hold rejected"]) == (1, 1)
 
 
 def requested_by(rig: Rig) -> str:
-    return rig.gate.claims.requested_by(rig.now_ns)
+    return rig.gate.session.takeover_requests.requested_by(rig.now_ns)
 
 
-def test_who_asks_is_told_to_the_active_operator_and_changes_nothing_else() -> None:
-    """An ask is granted without epoch or token, named for whoever holds the vehicle, and the drive goes on."""
+def test_a_handover_request_is_reported_and_changes_nothing_else() -> None:
+    """A handover request is granted without epoch or token, is reported, and leaves the drive unchanged."""
     rig = Rig().driving()
-    reply = rig.ask("ask", "bob", 7)
+    reply = rig.request("ask", "bob", 7)
     assert (reply.granted, reply.epoch, reply.token) == (True, 0, b"")
     assert requested_by(rig) == "bob"
     rig.picture()
     assert rig.drive().accepted
-    assert rig.gate.active_operator == ("alice", 1)
+    assert rig.gate.session.active_operator == ("alice", 1)
 
 
 def test_without_consent_a_driven_vehicle_is_not_handed_over() -> None:
-    """Asking alone, for however long, gives nobody a vehicle that is driven."""
+    """Handover requests alone never transfer control of a driven vehicle."""
     rig = Rig().driving()
     for _ in range(5):
-        rig.ask("ask", "bob", 7)
-        reply = rig.ask("hold", "bob", 7)
-        assert (reply.granted, reply.reason) == (
-            False, "held by alice, and the vehicle is not disarmed at standstill",
-        )  # fmt: skip
+        rig.request("ask", "bob", 7)
+        reply = rig.request("hold", "bob", 7)
+        assert not reply.granted
+        assert "alice has control" in reply.reason
         for _ in range(50):
             rig.go(TICK_NS)
             rig.picture()
             assert rig.drive().accepted
 
 
-def test_with_consent_the_vehicle_stops_and_goes_to_who_requested() -> None:
-    """A release while somebody asks stops the vehicle, keeps it from all others, and who asked gets it at once."""
+def test_with_consent_the_vehicle_stops_and_is_reserved_for_the_requester() -> None:
+    """A release during a handover request stops the vehicle and reserves it for the requester."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.ask("ask", "bob", 7)
-    assert rig.ask("release").granted
-    assert (rig.state, rig.gate.active_operator, requested_by(rig)) == ("safe_stop", None, "")
+    rig.request("ask", "bob", 7)
+    assert rig.request("release").granted
+    assert (rig.state, rig.gate.session.active_operator, requested_by(rig)) == ("safe_stop", None, "")
     for who, instance in (("carol", 1), ("alice", 1), ("bob", 8)):
-        reply = rig.ask("hold", who, instance)
-        assert (reply.granted, reply.reason) == (False, "handed over to bob, who has not taken it yet")
-    assert rig.ask("hold", "bob", 7).epoch != 0
+        reply = rig.request("hold", who, instance)
+        assert not reply.granted
+        assert "reserved for bob" in reply.reason
+    assert rig.request("hold", "bob", 7).epoch != 0
     rig.vehicle = vehicle_at(0.0)
-    assert rig.ask("hold", "carol").granted
+    assert rig.request("hold", "carol").granted
 
 
 def test_a_new_active_operator_arms_at_standstill() -> None:
-    """Who took over a rolling vehicle arms it like anybody: not before it stands, and then for a second."""
+    """A client that took over a moving vehicle arms it only at standstill, in 1 s."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.ask("ask", "bob", 7)
-    rig.ask("release")
-    rig.epoch = rig.ask("hold", "bob", 7).epoch
+    rig.request("ask", "bob", 7)
+    rig.request("release")
+    rig.epoch = rig.request("hold", "bob", 7).epoch
     rig.picture()
-    assert rig.send().reason == "arming needs standstill"
+    assert rig.send().reason == RejectionReason.NOT_STATIONARY
     rig.vehicle = vehicle_at(0.0)
     rig.arm_for(NS_PER_S - TICK_NS)
     assert rig.state == "arming"
@@ -210,83 +208,86 @@ def test_a_new_active_operator_arms_at_standstill() -> None:
     assert rig.state == "driving"
 
 
-def test_what_is_kept_for_who_requested_becomes_free() -> None:
-    """Who asked and then does not come has the vehicle kept for 5 s, and no longer."""
+def test_a_reservation_expires() -> None:
+    """The reservation for a requester ends after 5 s."""
     rig = Rig().driving()
-    rig.ask("ask", "bob", 7)
-    rig.ask("release")
-    rig.go(LIMITS.kept_ns - 1)
-    assert not rig.ask("hold", "carol").granted
+    rig.request("ask", "bob", 7)
+    rig.request("release")
+    rig.go(LIMITS.reservation_ns - 1)
+    assert not rig.request("hold", "carol").granted
     rig.go(1)
-    assert rig.ask("hold", "carol").granted
-    assert LIMITS.kept_ns == 5 * NS_PER_S
+    assert rig.request("hold", "carol").granted
+    assert LIMITS.reservation_ns == 5 * NS_PER_S
 
 
-def test_an_ask_lapses() -> None:
-    """Who has not asked for 3 s does not ask any more, and a release then keeps the vehicle for nobody."""
+def test_a_handover_request_expires() -> None:
+    """A handover request that is not renewed expires after 3 s, and a release then reserves nothing."""
     rig = Rig().driving()
-    rig.ask("ask", "bob", 7)
+    rig.request("ask", "bob", 7)
     rig.go(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
-    rig.ask("ask", "bob", 7)
+    rig.request("ask", "bob", 7)
     rig.go(LIMITS.handover_request_timeout_ns - 1)
     assert requested_by(rig) == "bob"
     rig.go(1)
     assert requested_by(rig) == ""
-    rig.ask("release")
-    assert rig.ask("hold", "carol").granted
+    rig.request("release")
+    assert rig.request("hold", "carol").granted
     assert LIMITS.handover_request_timeout_ns == 3 * NS_PER_S
 
 
-def test_the_first_who_asks_comes_first() -> None:
-    """While somebody asks, another is refused with that one's name; once the ask has lapsed the other may."""
+def test_the_first_handover_request_has_priority() -> None:
+    """A second handover request is rejected until the first has expired."""
     rig = Rig().driving()
-    rig.ask("ask", "bob", 7)
+    rig.request("ask", "bob", 7)
     for who, instance in (("carol", 1), ("bob", 8)):
-        reply = rig.ask("ask", who, instance)
-        assert (reply.granted, reply.reason) == (False, "bob asks for it already")
+        reply = rig.request("ask", who, instance)
+        assert not reply.granted
+        assert "bob" in reply.reason
     rig.go(LIMITS.handover_request_timeout_ns)
-    assert rig.ask("ask", "carol").granted
+    assert rig.request("ask", "carol").granted
     assert requested_by(rig) == "carol"
 
 
-def test_asking_is_for_what_somebody_else_holds() -> None:
-    """The holder, and anybody while nobody holds the vehicle, is refused with the reason."""
+def test_a_handover_request_needs_another_active_operator() -> None:
+    """A handover request is rejected from the active operator and while no client has control."""
     rig = Rig()
-    assert rig.ask("ask").reason == "nobody holds the vehicle"
-    rig.hold()
-    rejected = rig.ask("ask")
-    assert rejected.reason == "you hold the vehicle"
+    without_operator = rig.request("ask")
+    assert not without_operator.granted
+    rig.acquire()
+    rejected = rig.request("ask")
+    assert rejected.reason not in ("", without_operator.reason)
     assert (rejected.granted, rejected.epoch, rejected.token) == (False, 0, b"")
     assert requested_by(rig) == ""
 
 
 def test_at_rest_no_consent_is_needed() -> None:
-    """At standstill and disarmed another gets the vehicle also while a third one asks, whose ask is over then."""
-    rig = Rig().hold()
-    rig.ask("ask", "bob", 7)
-    assert rig.ask("hold", "carol").granted
+    """At standstill and disarmed, a third client acquires control in spite of a pending handover request."""
+    rig = Rig().acquire()
+    rig.request("ask", "bob", 7)
+    assert rig.request("hold", "carol").granted
     assert requested_by(rig) == ""
 
 
-def test_an_emergency_stop_by_another_is_named_and_leaves_the_session_as_it_is() -> None:
-    """Anybody stops the vehicle, also who asks for it; the state says who did, and the holder stays the holder."""
+def test_an_emergency_stop_by_another_client_keeps_the_session() -> None:
+    """Another client's emergency stop is reported with its name and leaves the session unchanged."""
     rig = Rig().driving()
-    rig.ask("ask", "bob", 7)
-    assert rig.ask("emergency_stop", "bob", 7, number=5).granted
-    assert (rig.state, rig.gate.reason) == ("emergency_stop", "emergency stop by bob")
-    assert (rig.gate.active_operator, requested_by(rig)) == (("alice", 1), "bob")
-    rig.ask("emergency_stop", "carol", 1, number=5)
-    assert rig.gate.reason == "emergency stop by bob"
+    rig.request("ask", "bob", 7)
+    assert rig.request("emergency_stop", "bob", 7, number=5).granted
+    assert (rig.state, rig.gate.machine.reason) == ("emergency_stop", "emergency stop by bob")
+    assert (rig.gate.session.active_operator, requested_by(rig)) == (("alice", 1), "bob")
+    rig.request("emergency_stop", "carol", 1, number=5)
+    assert rig.gate.machine.reason == "emergency stop by bob"
 
 
-def test_a_server_that_ends_stops_the_vehicle_for_good() -> None:
-    """When the server is about to end the vehicle stops, its holder is obeyed no more, and nobody gets it."""
+def test_a_server_shutdown_stops_the_vehicle() -> None:
+    """A server shutdown stops the vehicle, rejects commands and grants no control."""
     rig = Rig().driving()
     rig.vehicle = vehicle_at(5.0)
-    rig.gate.end()
-    assert (rig.state, rig.gate.reason, rig.gate.active_operator) == ("safe_stop", "the server was told to end", None)
+    rig.gate.session.close()
+    assert (rig.state, rig.gate.session.active_operator) == ("safe_stop", None)
+    assert "shutting down" in rig.gate.machine.reason
     rig.picture()
-    assert rig.drive().reason == "not the epoch in force"
+    assert rig.drive().reason == RejectionReason.WRONG_EPOCH
     rig.vehicle = vehicle_at(0.0)
-    assert rig.ask("hold", "bob").reason == "the server is about to end"
+    assert "shutting down" in rig.request("hold", "bob").reason

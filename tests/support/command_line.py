@@ -1,4 +1,4 @@
-"""Commands of `lavt` in the test's own process."""
+"""The result of a `lavt` command that a test has run."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import NamedTuple
 
 
 class CommandResult(NamedTuple):
-    """What a command left: exit code, standard output, standard error."""
+    """The exit code, standard output and standard error of a command."""
 
     code: int
     out: str
     err: str
 
     def rejected(self) -> str:
-        """Check that the input was refused as it must be, and return the sentence."""
+        """Check that the command rejected its input with exit code 2 and one sentence; return the sentence."""
         assert self.code == 2, self
         assert self.out == ""
         return self.sentence()
 
     def sentence(self) -> str:
-        """Check that standard error has one sentence of LAVT's and nothing else, and return it."""
+        """Check that standard error has one sentence of LAVT and nothing else; return it."""
         assert self.err.startswith("lavt: "), self
         assert self.err.count("\n") == 1, self
         assert "Traceback" not in self.err

@@ -2,9 +2,9 @@
 
     python -m tests.support.host_load --share 0.3 --stop-ms 300 --stops-every-s 20 --seed 1 -- COMMAND...
 
-Processes of the highest real-time priority, one on each processor, take a share of every 10 ms and at random times
-all processors together for a while. No other program runs meanwhile, whatever its priority: as under a hypervisor that
-gives the processors to others. It ends with the command, and its exit code is the command's. Needs root.
+Processes of the highest real-time priority, one on each processor, take a share of every 10 ms and, at random times,
+all processors together for a while. Meanwhile no other program runs, whatever its priority, as under a hypervisor that
+gives the processors to others. The load ends with the command, and returns its exit code. Needs root.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ import time  # noqa: TID251 (spins, and so measures the machine itself)
 PRIORITY = 99
 PERIOD_NS = 10_000_000
 LONGEST_S = 4 * 3600
-"""Processors are stopped no more after so long."""
-MOST = 0.95
-"""The kernel's own limit for real-time programs: the share of each second (sched_rt_runtime_us)."""
+"""Stops end after this time."""
+MAX_SHARE = 0.95
+"""The kernel's limit for real-time programs, as a share of each second (sched_rt_runtime_us)."""
 
 
 def stop_times(seed: int, every_s: float, stop_ms: float, longest_s: float = LONGEST_S) -> list[tuple[int, int]]:
-    """Return begin and end of each stop in ns from the start; the times between them are exponential."""
+    """Return begin and end of each stop in ns from the start; the intervals between stops are exponential."""
     from lavt.streams import stream
 
-    chance, stops, at_s = stream(seed, "host load"), [], 0.0
+    generator, stops, at_s = stream(seed, "host load"), [], 0.0
     while every_s > 0 and stop_ms > 0:
-        at_s += float(chance.exponential(every_s))
+        at_s += float(generator.exponential(every_s))
         if at_s > longest_s:
             break
         stops.append((round(at_s * 1e9), round(at_s * 1e9 + stop_ms * 1e6)))
@@ -40,7 +40,7 @@ def stop_times(seed: int, every_s: float, stop_ms: float, longest_s: float = LON
 
 
 def spin_until(end_ns: int) -> int:
-    """Occupy the processor until a time of CLOCK_MONOTONIC; return for how long."""
+    """Occupy the processor until a time of CLOCK_MONOTONIC; return the duration."""
     begin_ns = now_ns = time.monotonic_ns()
     while now_ns < end_ns:
         now_ns = time.monotonic_ns()
@@ -48,9 +48,9 @@ def spin_until(end_ns: int) -> int:
 
 
 def spin(processor: int) -> None:
-    """Take a processor as standard input says, until it ends; then tell for how long it was meant to be taken and was.
+    """Occupy a processor as standard input says, until it ends; then print the requested and the actual CPU time.
 
-    The two differ where the kernel kept the processor from this program.
+    They differ if the kernel kept the processor from this program.
     """
     os.sched_setaffinity(0, {processor})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
@@ -71,14 +71,17 @@ def spin(processor: int) -> None:
 
 
 def run_under_load(command: list[str], share: float, stops: list[tuple[int, int]]) -> int:
-    """Run a command while the processors are taken; return its exit code."""
+    """Run a command while the processors are occupied; return its exit code."""
     spinners = [
         subprocess.Popen(
             [sys.executable, "-I", "-S", __file__, "--processor", str(processor)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         for processor in sorted(os.sched_getaffinity(0))
-    ]  # fmt: skip
+    ]
     begin_ns = time.monotonic_ns()
     try:
         for spinner in spinners:
@@ -87,23 +90,23 @@ def run_under_load(command: list[str], share: float, stops: list[tuple[int, int]
             spinner.stdin.flush()
         code = subprocess.run(command, check=False).returncode
     finally:
-        told = [spinner.communicate()[0] for spinner in spinners]
-    for number, line in enumerate(told):
+        answers = [spinner.communicate()[0] for spinner in spinners]
+    for number, line in enumerate(answers):
         spun_ns, used_ns, lasted_ns = json.loads(line)
         stopped = sum(begin < lasted_ns for begin, _ in stops)
         sys.stderr.write(
-            f"host load: spinner {number} had {used_ns / spun_ns:.1%} of the time that it asked for, "
+            f"host load: spinner {number} had {used_ns / spun_ns:.1%} of the requested time, "
             f"{spun_ns / lasted_ns:.1%} of {lasted_ns / 1e9:.0f} s, with {stopped} stops\n"
         )
     return code if code >= 0 else 128 - code
 
 
 def main() -> int:
-    """Run the command of the arguments under load."""
+    """Parse the arguments and run the command under load."""
     parser = argparse.ArgumentParser(description="Run a command on a machine whose host is busy with other work.")
-    parser.add_argument("--share", type=float, default=0.3, help="of each processor that is taken away")
-    parser.add_argument("--stop-ms", type=float, default=300, help="for how long all processors are stopped together")
-    parser.add_argument("--stops-every-s", type=float, default=20, help="on average; 0: never")
+    parser.add_argument("--share", type=float, default=0.3, help="share of each processor to take")
+    parser.add_argument("--stop-ms", type=float, default=300, help="duration of the stops of all processors")
+    parser.add_argument("--stops-every-s", type=float, default=20, help="mean interval between stops; 0: no stops")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processor", type=int, help=argparse.SUPPRESS)
     parser.add_argument("command", nargs="*")
@@ -113,8 +116,8 @@ def main() -> int:
         return 0
     if not options.command:
         parser.error("give the command after --")
-    if options.share + options.stop_ms / 1e3 >= MOST:
-        parser.error(f"the kernel lets real-time programs have {MOST:.0%} of a second: take less")
+    if options.share + options.stop_ms / 1e3 >= MAX_SHARE:
+        parser.error(f"the kernel limits real-time programs to {MAX_SHARE:.0%} of a second: take less")
     stops = stop_times(options.seed, options.stops_every_s, options.stop_ms)
     return run_under_load(options.command, options.share, stops)
 

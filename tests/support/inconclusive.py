@@ -1,10 +1,9 @@
-"""Hooks of pytest: a test that the host stalled is run again, at most twice, and then it is inconclusive.
+"""Pytest hooks: a test that the host stalled is run again, at most twice, and is then inconclusive.
 
-`tests/conftest.py` loads this as a plugin. A test may use the fixture `stalls`, directly or through another one; a test
-whose assertions are all on times has the marker `judges_times`, with the arguments of `Stalls.judging`. Both are run
-again after `HostStalled` and after nothing else: any other exception fails the test, also one that was raised while a
-`HostStalled` was handled. A session in which too many tests were inconclusive on an idle machine fails, and so does
-one whose probes did not last.
+`tests/conftest.py` loads this plugin. A test may use the fixture `stalls`, directly or through another one; a test
+whose assertions are all about times has the marker `judges_times`, with the arguments of `Stalls.judging`. Both are
+run again only after `HostStalled`: any other exception fails the test, even one that was raised while a `HostStalled`
+was handled. A session fails if too many tests were inconclusive on an idle machine, or if a probe ended early.
 """
 
 from __future__ import annotations
@@ -16,38 +15,38 @@ import pytest
 from tests.support.stalls import TRIES, HostStalled, ProbeEnded, Stalls, inconclusive_too_often
 
 AGAIN = pytest.mark.flaky(reruns=TRIES - 1, rerun_except="^(?!HostStalled:)")
-"""pytest-rerunfailures searches "type: message" of the exception itself, not of those it was raised from."""
+"""pytest-rerunfailures searches "type: message" of the exception itself, not of its causes."""
 INCONCLUSIVE = "inconclusive"
 JUDGES_TIMES = "judges_times"
 
 
 @dataclass
-class Session:
-    """What this session's verdicts depend on."""
+class SessionState:
+    """The state of this session's verdicts."""
 
     stalls: Stalls | None = None
     tests: set[str] = field(default_factory=set)
-    said: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
 
-SESSION = pytest.StashKey[Session]()
+SESSION = pytest.StashKey[SessionState]()
 
 
 @pytest.fixture(scope="session")
 def stalls(request: pytest.FixtureRequest) -> Stalls:
-    """Give the record of the host's stalls, and verdicts on timing; the probes end with the session."""
+    """Return the record of the host's stalls; the probes end with the session."""
     measured = Stalls.measured()
     request.config.stash[SESSION].stalls = measured
     return measured
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin."""
-    config.stash[SESSION] = Session()
+    """Create the session's state."""
+    config.stash[SESSION] = SessionState()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let tests that use the fixture be run again; those that judge times use it."""
+    """Mark tests that use the fixture for reruns; tests with `judges_times` use it."""
     for item in items:
         names: list[str] = getattr(item, "fixturenames", [])
         if item.get_closest_marker(JUDGES_TIMES) and "stalls" not in names:
@@ -58,7 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
-    """Excuse an assertion of a test that judges times where the host stalled while it ran."""
+    """Excuse an assertion of a test with `judges_times` if the host stalled while it ran."""
     marker = item.get_closest_marker(JUDGES_TIMES)
     if marker is None:
         return (yield)
@@ -72,7 +71,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Note in the report whether the host stalled; a report of another process has no exception any more."""
+    """Record in the report whether the host stalled, because a report from another process has no exception."""
     report = yield
     vars(report)["host_stalled"] = call.excinfo is not None and isinstance(call.excinfo.value, HostStalled)
     if report.when == "call":
@@ -82,14 +81,14 @@ def pytest_runtest_makereport(
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_logreport(report: pytest.TestReport) -> Generator[None, object, object]:
-    """Call a last attempt that the host stalled inconclusive, before anything counts it as failed."""
+    """Call a last attempt that the host stalled inconclusive, before it is counted as failed."""
     if report.failed and getattr(report, "host_stalled", False):
         vars(report)["outcome"] = INCONCLUSIVE
     return (yield)
 
 
 def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple[str, dict[str, bool]]] | None:
-    """Give inconclusive tests a category of their own."""
+    """Return a category of their own for inconclusive tests."""
     if report.outcome != INCONCLUSIVE:
         return None
     return INCONCLUSIVE, "I", ("INCONCLUSIVE", {"yellow": True})
@@ -97,34 +96,34 @@ def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """End the probes; fail where one has ended before, or where too many tests were inconclusive."""
-    own = session.config.stash[SESSION]
-    if own.stalls is None:
+    """End the probes; fail the session if a probe ended early or too many tests were inconclusive."""
+    state = session.config.stash[SESSION]
+    if state.stalls is None:
         return
     reporter = session.config.pluginmanager.getplugin("terminalreporter")
     inconclusive = {report.nodeid for report in reporter.stats.get(INCONCLUSIVE, [])} if reporter else set()
-    tests, idle = len(own.tests | inconclusive), own.stalls.idle_share()
+    tests, idle = len(state.tests | inconclusive), state.stalls.idle_share()
     failures = []
     try:
-        own.stalls.collect()
+        state.stalls.collect()
     except ProbeEnded as ended:
         failures.append(str(ended))
-    own.stalls.end()
-    own.said.append(
-        f"HOST {own.stalls.summary()}; the machine was {idle:.0%} idle; "
+    state.stalls.end()
+    state.messages.append(
+        f"HOST {state.stalls.summary()}; the machine was {idle:.0%} idle; "
         f"{len(inconclusive)} of {tests} tests inconclusive"
     )
     if inconclusive_too_often(len(inconclusive), tests, idle):
         failures.append(f"{len(inconclusive)} of {tests} tests were inconclusive on a machine that was {idle:.0%} idle")
-    own.said += [f"FAILED: {failure}" for failure in failures]
+    state.messages += [f"FAILED: {failure}" for failure in failures]
     if failures and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Say which tests were run again or were inconclusive and why, and how often the host stalled."""
+    """Print which tests were run again or were inconclusive and why, and how often the host stalled."""
     for category, word in (("rerun", "AGAIN"), (INCONCLUSIVE, "INCONCLUSIVE")):
         for report in terminalreporter.getreports(category):
             terminalreporter.write_line(f"{word} {report.nodeid}: {report.longrepr.reprcrash.message}")
-    for line in config.stash[SESSION].said:
+    for line in config.stash[SESSION].messages:
         terminalreporter.write_line(line)

@@ -1,4 +1,4 @@
-"""Run lanes one after the other, each bounded in time, and say what became of them in a table."""
+"""Runs lanes sequentially, each with a time limit, and prints the results in a table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.lanes import REPOSITORY, Lane
+from tests.lanes import REPOSITORY, LaneSpec
 
 from lavt.clock import MachineClock, pause
 from lavt.domain import NS_PER_MS, NS_PER_S
@@ -21,54 +21,56 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 LOW_PRIORITY = 19
 POLL_NS = 100 * NS_PER_MS
 GRACE_NS = 10 * NS_PER_S
-"""How long a lane that is told to end may take."""
+"""Time for a lane to end after SIGTERM."""
 COUNTED = ("passed", "failed", "error", "skipped", "rerun", "inconclusive")
 SUMMARY = re.compile(r"^=+ (.*) in [\d.]+s(?: \([\d:]+\))? =+$", re.MULTILINE)
 COLOURS = re.compile(r"\x1b\[[\d;]*m")
 
-Tell = Callable[[str], None]
+Write = Callable[[str], None]
 
 
 def counts_of(output: str) -> Counter[str]:
-    """Return how many tests passed, failed, and so on, from the closing lines of pytest in an output."""
+    """Return the numbers of passed tests, failed tests etc. from the closing lines of pytest in an output."""
     counts: Counter[str] = Counter()
-    for said in SUMMARY.findall(COLOURS.sub("", output)):
-        for number, word in re.findall(r"(\d+) (\w+)", said):
+    for line in SUMMARY.findall(COLOURS.sub("", output)):
+        for number, word in re.findall(r"(\d+) (\w+)", line):
             counts[word.removesuffix("s") if word == "errors" else word] += int(number)
     return counts
 
 
 @dataclass
-class Outcome:
-    """What became of a lane."""
+class LaneOutcome:
+    """The result of a lane."""
 
     name: str
     took_s: float
     counts: Counter[str]
     failures: list[str] = field(default_factory=list)
-    """Why it failed, where it did."""
+    """Reasons of its failure; empty if it passed."""
 
 
 class RunningLane:
-    """The commands of a lane, one after the other, with their output in a file."""
+    """The commands of a lane, run sequentially, with their output in a file."""
 
-    def __init__(self, lane: Lane, folder: Path, *, niceness: int = 0) -> None:
+    def __init__(self, lane: LaneSpec, folder: Path, *, niceness: int = 0) -> None:
         self.lane = lane
         self._niceness = niceness
         self._left = list(lane.commands)
         self._command = ""
         self._process: subprocess.Popen[bytes] | None = None
         self._output = folder / f"{lane.name}.output"
-        self._progress = folder / lane.name / "progress"  # alone there: the kernel lane lets its machines write to it
+        self._progress = (
+            folder / lane.name / "progress"
+        )  # in its own folder, which the kernel lane's machines can write to
         self._progress.parent.mkdir()
         self._output.touch()
-        self._told = 0
+        self._written_bytes = 0
         self._began_ns = self._ended_ns = MachineClock().now().mono_ns
         self.failures: list[str] = []
         self.running = True
 
-    def go_on(self) -> None:
-        """Look at what runs, begin what comes next, and end what takes too long."""
+    def poll(self) -> None:
+        """Check the running command, start the next one, and end a lane that exceeds its time limit."""
         if not self.running:
             return
         now_ns = self._ended_ns = MachineClock().now().mono_ns
@@ -77,8 +79,10 @@ class RunningLane:
                 self.failures.append(f"`{self._command}` ended with {code}")
             self._process = None
         if now_ns - self._began_ns > self.lane.limit_min * 60 * NS_PER_S:
-            at = self._progress.read_text() if self._progress.exists() else ""
-            self.failures.append(f"took longer than {self.lane.limit_min:g} min, and was at: {at or 'no test'}")
+            running_test = self._progress.read_text() if self._progress.exists() else ""
+            self.failures.append(
+                f"took longer than {self.lane.limit_min:g} min, and was at: {running_test or 'no test'}"
+            )
             self.end()
         elif self._process is None and self._left:
             self._process = self._start(self._left.pop(0))
@@ -90,89 +94,94 @@ class RunningLane:
         with self._output.open("ab") as output:
             return subprocess.Popen(
                 ["nice", "-n", str(self._niceness), *command] if self._niceness else command,
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
-                cwd=REPOSITORY, env={**os.environ, "LAVT_PROGRESS": str(self._progress)},
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                cwd=REPOSITORY,
+                env={**os.environ, "LAVT_PROGRESS": str(self._progress)},
+            )
 
     def end(self) -> None:
-        """End it and all that it has started."""
+        """End it and all that it has started, at first as Ctrl-C does, so that pytest says what has failed by then."""
         self.running = False
         self._left.clear()
         if self._process is None:
             return
         group, clock = self._process.pid, MachineClock()
         with suppress(ProcessLookupError):
-            os.killpg(group, signal.SIGTERM)
-            limit_ns = clock.now().mono_ns + GRACE_NS
-            while self._process.poll() is None and clock.now().mono_ns < limit_ns:
-                pause(POLL_NS)
+            for number, process in ((signal.SIGINT, group), (signal.SIGTERM, -group)):
+                os.kill(process, number)
+                limit_ns = clock.now().mono_ns + GRACE_NS
+                while self._process.poll() is None and clock.now().mono_ns < limit_ns:
+                    pause(POLL_NS)
             os.killpg(group, signal.SIGKILL)
         self._process.wait()
 
-    def events(self) -> str:
+    def new_output(self) -> str:
         """Return the output since the last call."""
         with self._output.open("rb") as output:
-            output.seek(self._told)
-            piece = output.read()
-        self._told += len(piece)
-        return piece.decode(errors="replace")
+            output.seek(self._written_bytes)
+            chunk = output.read()
+        self._written_bytes += len(chunk)
+        return chunk.decode(errors="replace")
 
-    def outcome(self) -> Outcome:
-        """Return what became of it."""
+    def outcome(self) -> LaneOutcome:
+        """Return the result."""
         counts = counts_of(self._output.read_text(errors="replace"))
-        return Outcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
+        return LaneOutcome(self.lane.name, (self._ended_ns - self._began_ns) / NS_PER_S, counts, self.failures)
 
 
-def run_lanes(lanes: Sequence[Lane], *, tell: Tell) -> int:
-    """Run lanes in their order; return 0 where all passed, else 1.
+def run_lanes(lanes: Sequence[LaneSpec], *, write: Write) -> int:
+    """Run lanes in their order; return 0 if all passed, else 1.
 
-    The output of a lane that runs meanwhile is told after it.
+    The output of a lane that runs meanwhile is written after the other's.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[LaneOutcome] = []
     began_ns = MachineClock().now().mono_ns
     with TemporaryDirectory(prefix="lavt-lanes-") as folder:
         for lane in lanes:
             running = [RunningLane(lane, Path(folder))]
             if lane.meanwhile is not None:
                 running.append(RunningLane(lane.meanwhile, Path(folder), niceness=LOW_PRIORITY))
-            tell(f"\n---- {' and '.join(each.lane.name for each in running)}\n")
+            write(f"\n---- {' and '.join(each.lane.name for each in running)}\n")
             try:
-                _run_together(running, tell)
+                _run_together(running, write)
             finally:
                 for each in running:
                     each.end()
             outcomes += [each.outcome() for each in running]
-    tell(f"\n{table(outcomes)}\n{closing_line(outcomes, (MachineClock().now().mono_ns - began_ns) / NS_PER_S)}\n")
+    write(f"\n{table(outcomes)}\n{closing_line(outcomes, (MachineClock().now().mono_ns - began_ns) / NS_PER_S)}\n")
     return int(any(each.failures for each in outcomes))
 
 
-def _run_together(running: Sequence[RunningLane], tell: Tell) -> None:
+def _run_together(running: Sequence[RunningLane], write: Write) -> None:
     while any(each.running for each in running):
         for each in running:
-            each.go_on()
-        told = next((each for each in running if each.running), None)
-        for each in running:  # those before it have ended, and are told whole
-            tell(each.events())
-            if each is told:
+            each.poll()
+        unfinished = next((each for each in running if each.running), None)
+        for each in running:  # earlier lanes have ended, so their output is complete
+            write(each.new_output())
+            if each is unfinished:
                 break
         pause(POLL_NS)
     for each in running:
-        tell(each.events())
+        write(each.new_output())
 
 
-def table(outcomes: Sequence[Outcome]) -> str:
-    """Return what became of each lane, one a line, and below why any failed."""
+def table(outcomes: Sequence[LaneOutcome]) -> str:
+    """Return a table with one line per lane, followed by the reasons of failures."""
     lines = [f"{'lane':<10}{'time':>8}" + "".join(f"{word:>{len(word) + 3}}" for word in COUNTED)]
     for each in outcomes:
         minutes, seconds = divmod(round(each.took_s), 60)
         numbers = "".join(f"{each.counts[word]:>{len(word) + 3}}" for word in COUNTED)
         lines.append(f"{each.name:<10}{f'{minutes}:{seconds:02}':>8}{numbers}{'   FAILED' if each.failures else ''}")
-    lines += [f"{each.name}: {why}" for each in outcomes for why in each.failures]
+    lines += [f"{each.name}: {reason}" for each in outcomes for reason in each.failures]
     return "\n".join(lines)
 
 
-def closing_line(outcomes: Sequence[Outcome], took_s: float) -> str:
-    """Return the sums over all lanes in the form of pytest; a lane that failed without a failed test counts as one."""
+def closing_line(outcomes: Sequence[LaneOutcome], took_s: float) -> str:
+    """Return the totals in pytest's format; a lane that failed without a failed test counts as one failure."""
     total = sum((each.counts for each in outcomes), Counter[str]())
     failed = (
         total["failed"]

@@ -2,10 +2,10 @@
 
     python lateness_probe.py PROCESSOR
 
-The process sleeps 8 ms at a time and keeps each wake that came too late, with the time at which it was due and the time
-at which it came (CLOCK_MONOTONIC, ns). Its first line says whether it has real-time priority (SCHED_FIFO), which no
-niceness reaches. For each byte on standard input it answers with one line: the time, and what was late since the last
-answer. It ends with standard input or with the process that started it. It imports nothing of LAVT, to start fast.
+The process sleeps for 8 ms at a time and records each late wake, with the time when it was due and the time when it
+came (CLOCK_MONOTONIC, ns). Its first line says whether it has real-time priority (SCHED_FIFO), which is above any
+niceness. It answers each byte on standard input with one line: the time, and the late wakes since the last answer. It
+ends with standard input or with its parent process. It imports nothing of LAVT, so that it starts fast.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ import sys
 import time  # noqa: TID251 (a program that measures the machine itself)
 
 PRIORITY = 10
-"""Above all programs without real-time priority, whatever their niceness; below what stands for a busy host."""
+"""Above all programs without real-time priority, whatever their niceness; below the load of `host_load.py`."""
 PERIOD_MS = 8
-"""Shorter costs more than 1 % of a processor. A stall is recorded at most so much shorter than it was."""
+"""A shorter period costs more than 1 % of a processor. A stall is recorded at most this much too short."""
 LATE_NS = 1_000_000
-"""Less is not kept. A quiet machine wakes the probe within 0.1 ms."""
+"""Shorter delays are not recorded. A quiet machine wakes the probe within 0.1 ms."""
 SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
 
 
-def go_first() -> bool:
-    """Take real-time priority; without the right to it take the best niceness allowed, and return False."""
+def take_priority() -> bool:
+    """Take real-time priority and return True; without the right to it take the best niceness, and return False."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except PermissionError:
@@ -55,14 +55,14 @@ def main() -> None:
     if os.getppid() != parent:
         return
     os.sched_setaffinity(0, {int(sys.argv[1])})
-    answer(go_first())
+    answer(take_priority())
     late_ns = LATE_NS + 2 * round(time.clock_getres(time.CLOCK_MONOTONIC) * 1e9)
     late: list[tuple[int, int]] = []
-    requested = select.poll()
-    requested.register(0, select.POLLIN)
+    poller = select.poll()
+    poller.register(0, select.POLLIN)
     due_ns = time.monotonic_ns() + PERIOD_MS * 1_000_000
     while True:
-        ready = requested.poll(PERIOD_MS)
+        ready = poller.poll(PERIOD_MS)
         now_ns = time.monotonic_ns()
         if now_ns - due_ns > late_ns:
             late.append((due_ns, now_ns))

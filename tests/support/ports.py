@@ -1,4 +1,4 @@
-"""Ports of this machine that no program uses."""
+"""Free ports of this machine."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import closing
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """Return a port that is free at every address: of UDP, or of TCP with `SOCK_STREAM`."""
+    """Return a port that is free at every address: a UDP port, or with `SOCK_STREAM` a TCP port."""
     with closing(socket.socket(socket.AF_INET, kind)) as trial:
         trial.bind(("", 0))
         port: int = trial.getsockname()[1]
@@ -15,7 +15,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 
 def free_pair() -> int:
-    """Return the first of two consecutive free UDP ports: some tools expect RTCP at the second."""
+    """Return the first of two consecutive free UDP ports, because some tools expect RTCP at the second."""
     while True:
         port = free_port()
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as second:

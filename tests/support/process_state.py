@@ -1,7 +1,7 @@
-"""Hooks and fixtures of pytest: every test leaves the pytest process as it found it.
+"""Pytest hooks and fixtures that check that every test leaves the pytest process unchanged.
 
-`tests/conftest.py` loads this as a plugin. A test that leaves the state of the process changed would decide how those
-after it run: at another priority, with other signal handlers, or in another directory.
+`tests/conftest.py` loads this plugin. A test that changes the process would affect the tests after it: with another
+priority, other signal handlers, or another directory.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ import pytest
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 OF_PYTEST = "PYTEST_"
-"""Environment variables that pytest itself sets while a test runs."""
+"""Prefix of the environment variables that pytest itself sets while a test runs."""
 
 
 def pytest_configure() -> None:
-    """Let Ctrl-C end the tests and the programs that they start, although a shell without job control ignores it."""
+    """Let Ctrl-C end the tests and their programs, even if a shell without job control ignores it."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def process_state() -> dict[str, Any]:
-    """Return what a test could change for the tests after it."""
+    """Return the state that a test could change for later tests."""
     return {
         "niceness": os.getpriority(os.PRIO_PROCESS, 0),
         "scheduler": os.sched_getscheduler(0),
@@ -43,7 +43,7 @@ def process_state() -> dict[str, Any]:
 
 @contextmanager
 def process_unchanged() -> Iterator[None]:
-    """Fail the test if the process is not left as it was found."""
+    """Fail the test if the context changes the process."""
     before = process_state()
     yield
     after = process_state()
@@ -55,14 +55,14 @@ def process_unchanged() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _process_unchanged() -> Iterator[None]:
-    """Watch every test."""
+    """Check every test."""
     with process_unchanged():
         yield
 
 
 @pytest.fixture
 def own_switch_interval() -> Iterator[None]:
-    """Put back what the real-time runtime sets for its process."""
+    """Restore the switch interval, which the real-time runtime sets."""
     before = sys.getswitchinterval()
     yield
     sys.setswitchinterval(before)
@@ -70,7 +70,7 @@ def own_switch_interval() -> Iterator[None]:
 
 @pytest.fixture
 def own_environment() -> Iterator[None]:
-    """Put back the environment variables that a library sets for its process."""
+    """Restore the environment variables that a library sets."""
     before = dict(os.environ)
     yield
     for name in set(os.environ) - set(before):
@@ -80,7 +80,7 @@ def own_environment() -> Iterator[None]:
 
 @pytest.fixture
 def hangup_ends() -> Iterator[None]:
-    """Let a closed terminal end a program that the test starts, although the tests run under `nohup`."""
+    """Let SIGHUP end a program that the test starts, even if the tests run under `nohup`."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)

@@ -1,4 +1,4 @@
-"""Tell who started the tests which of them are running: LAVT_PROGRESS names the file."""
+"""A pytest plugin that writes the names of the running tests to the file LAVT_PROGRESS."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from pathlib import Path
 RUNNING: dict[str, None] = {}
 
 
-def tell() -> None:
-    """Write the tests that are running, one a line."""
+def write_running() -> None:
+    """Write the names of the running tests, one per line."""
     if path := os.environ.get("LAVT_PROGRESS"):
         Path(path).write_text("\n".join(RUNNING))
 
 
 def pytest_runtest_logstart(nodeid: str) -> None:
-    """Note that a test begins; where tests run side by side this is called for those of every worker."""
+    """Record that a test begins; with parallel tests this is called for those of every worker."""
     RUNNING[nodeid] = None
-    tell()
+    write_running()
 
 
 def pytest_runtest_logfinish(nodeid: str) -> None:
-    """Note that a test has ended."""
+    """Record that a test has ended."""
     RUNNING.pop(nodeid, None)
-    tell()
+    write_running()

@@ -1,13 +1,13 @@
-"""When the host stalled this machine, and verdicts on timing that take it into account.
+"""The record of times when the host stalled this machine, and verdicts on timing that use it.
 
 A test of real time can fail because a program is too slow, or because the host or hypervisor did not run this machine.
-One probe for each processor (`lateness_probe.py`) tells them apart. It has real-time priority, so no program of LAVT,
-at niceness -15 at most, can delay it. A timing assertion that fails is excused (`HostStalled`) only where a probe was
-late at the moment that counts; then pytest runs the test again, at most twice, and calls it inconclusive if the host
-stalls each time (`inconclusive.py`). Assertions on safety are plain `assert`s and are never excused.
+One probe for each processor (`lateness_probe.py`) distinguishes the two. It has real-time priority, so no program of
+LAVT, with a niceness of -15 at the least, can delay it. A failed timing assertion is excused (`HostStalled`) only if a
+probe was late at the relevant time; then pytest runs the test again, at most twice, and calls it inconclusive if the
+host stalls each time (`inconclusive.py`). Assertions on safety are plain `assert`s and are never excused.
 
-Without the right to real-time priority the probes are ordinary processes. They are still used, as the programs have
-no priority then either; but a stall may be the doing of the programs, and the summary says so.
+Without the right to real-time priority the probes are ordinary processes. They are still used, because LAVT's programs
+then have no priority either; but programs may cause a stall, and the summary says so.
 """
 
 from __future__ import annotations
@@ -27,24 +27,27 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 
 PROBE = Path(__file__).with_name("lateness_probe.py")
 STALL_MS = 30.0
-"""A stall this long matters where the caller says nothing else."""
+"""The default length from which a stall matters."""
 LONG_STALL_MS = 100.0
-"""A stall this long can cost a drive its lane, or its driver: commands time out after 300 ms."""
+"""A stall this long can make a drive leave its lane or lose its driver: commands time out after 300 ms."""
 BUSY_SHARE = 0.05
-"""A host that takes this share of a drive moves the medians of its latencies."""
+"""A host that takes this share of a drive changes the medians of its latencies."""
+SLOW_SHARE = 0.15
+"""Share of a by-wire drive that must be stalled to explain a too slow machine. Without 15 ms of each 100 ms it still
+drives as usual (`docs/by_wire.md`)."""
 LISTED_MS = 10.0
-"""The session's summary counts stalls from this length on."""
-SHOWN = 4
+"""The session's summary counts stalls from this length."""
+LISTED_STALLS = 4
 TRIES = 3
 MOST_INCONCLUSIVE = 0.05
 BUSY_BELOW = 0.5
-"""Of its time, a machine that is idle for less is busy, and may leave any number of tests inconclusive."""
+"""A machine that is idle for a smaller share is busy, and may leave any number of tests inconclusive."""
 
 Result = TypeVar("Result")
 
 
 class HostStalled(Exception):
-    """The host stalled this machine: what the test saw does not answer its question. The test is run again."""
+    """The host stalled this machine, so the result of the test means nothing. The test is run again."""
 
 
 class HostStalledEachTime(HostStalled):
@@ -52,12 +55,12 @@ class HostStalledEachTime(HostStalled):
 
 
 class ProbeEnded(Exception):
-    """A lateness probe ended before the session did: nothing can be excused any more."""
+    """A lateness probe ended before the session did, so nothing can be excused any more."""
 
 
 @dataclass(frozen=True)
 class Stall:
-    """A time during which one processor did not run its probe (CLOCK_MONOTONIC)."""
+    """An interval in which one processor did not run its probe (CLOCK_MONOTONIC)."""
 
     processor: int
     begin_ns: int
@@ -65,12 +68,12 @@ class Stall:
 
     @property
     def length_ms(self) -> float:
-        """Return how long it was."""
+        """The length of the interval."""
         return (self.end_ns - self.begin_ns) / NS_PER_MS
 
 
 def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
-    """Return the stalls of some length that overlap a time."""
+    """Return the stalls of at least a length that overlap an interval."""
     return [
         each
         for each in stalls
@@ -79,7 +82,7 @@ def overlapping(stalls: Iterable[Stall], since_ns: int, until_ns: int, *, at_lea
 
 
 def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> float:
-    """Return which share of a time the processor with most stalls was stalled."""
+    """Return the share of an interval in which the processor with most stalls was stalled."""
     total_ns: dict[int, int] = {}
     for each in overlapping(stalls, since_ns, until_ns):
         within_ns = min(each.end_ns, until_ns) - max(each.begin_ns, since_ns)
@@ -88,8 +91,8 @@ def stalled_share(stalls: Iterable[Stall], since_ns: int, until_ns: int) -> floa
 
 
 def described(stalls: Sequence[Stall], since_ns: int) -> str:
-    """Return the longest stalls as a sentence; their times count from `since_ns`."""
-    longest = sorted(sorted(stalls, key=lambda each: -each.length_ms)[:SHOWN], key=lambda each: each.begin_ns)
+    """Return a description of the longest stalls; their times count from `since_ns`."""
+    longest = sorted(sorted(stalls, key=lambda each: -each.length_ms)[:LISTED_STALLS], key=lambda each: each.begin_ns)
     said = [
         f"{each.length_ms:.0f} ms on processor {each.processor} at {(each.begin_ns - since_ns) / NS_PER_MS:+.0f} ms"
         for each in longest
@@ -99,52 +102,54 @@ def described(stalls: Sequence[Stall], since_ns: int) -> str:
 
 
 def inconclusive_too_often(inconclusive: int, tests: int, idle_share: float) -> bool:
-    """Return whether more tests were inconclusive than a machine with so much idle time explains.
+    """Return whether more tests were inconclusive than the machine's load explains.
 
-    More than 5 % and more than one, where the machine was idle for more than half of the time.
+    That is more than 5 % and more than one, if the machine was idle for more than half of the time.
     """
     return idle_share > BUSY_BELOW and inconclusive > max(1, MOST_INCONCLUSIVE * tests)
 
 
 def idle_share(before: str, after: str) -> float:
-    """Return which share of the time the processors were idle, from the first line of /proc/stat at both times.
+    """Return the idle share of the processors between two readings of the first line of /proc/stat.
 
-    Time of programs with a positive niceness counts as idle: other work may run at low priority.
+    Time of programs with a positive niceness counts as idle, because other work may run at low priority.
     """
     old, new = ([int(each) for each in line.split()[1:9]] for line in (before, after))
-    _user, nice, _system, idle, wait, *_others = gone = [now - then for now, then in zip(new, old, strict=True)]
-    return (nice + idle + wait) / max(sum(gone), 1)
+    _user, nice, _system, idle, wait, *_others = differences = [now - then for now, then in zip(new, old, strict=True)]
+    return (nice + idle + wait) / max(sum(differences), 1)
 
 
 class Probe(Protocol):
-    """What measures one processor."""
+    """The interface of a probe."""
 
     above: bool
-    """Whether no program without real-time priority can delay it."""
+    """Whether no program without real-time priority can delay the probe."""
 
     def report(self) -> tuple[int, list[Stall]]:
-        """Return the time, and the stalls since the last report; raise `ProbeEnded` where it has ended."""
+        """Return the time, and the stalls since the last report; raise `ProbeEnded` if the probe has ended."""
         ...
 
     def end(self) -> None:
-        """End it."""
+        """End the probe."""
         ...
 
 
 class ProbeProcess:
-    """`lateness_probe.py` on one processor."""
+    """A process that runs `lateness_probe.py` on one processor."""
 
     def __init__(self, processor: int) -> None:
         self.processor = processor
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", PROBE, str(processor)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
         self.above = bool(json.loads(self._line()))
 
     @property
     def pid(self) -> int:
-        """Return the process's id."""
+        """The process's id."""
         return self._process.pid
 
     def report(self) -> tuple[int, list[Stall]]:
@@ -159,7 +164,7 @@ class ProbeProcess:
         return now_ns, [Stall(self.processor, begin_ns, end_ns) for begin_ns, end_ns in late]
 
     def end(self) -> None:
-        """Let it end."""
+        """End the process."""
         self._process.communicate()
 
     def _line(self) -> bytes:
@@ -180,14 +185,14 @@ def read_processor_times() -> str:
 
 @dataclass
 class Stalls:
-    """The record of all probes, and the verdicts that need it."""
+    """The record of all probes, and verdicts that use it."""
 
     probes: Sequence[Probe]
     processor_times: Callable[[], str] = read_processor_times
     recorded: list[Stall] = field(default_factory=list)
     clock: MachineClock = field(default_factory=MachineClock)
     excused: int = 0
-    """How many failures the record has excused so far."""
+    """Number of failures that the record has excused so far."""
 
     def __post_init__(self) -> None:
         self._before = self.processor_times()
@@ -200,13 +205,13 @@ class Stalls:
         return cls([ProbeProcess(processor) for processor in sorted(os.sched_getaffinity(0))])
 
     def during(self, since_ns: int, until_ns: int, *, at_least_ms: float = 0.0) -> list[Stall]:
-        """Return the stalls that overlap a time; wait until all probes have reported beyond it."""
+        """Return the stalls that overlap an interval; wait until all probes have reported beyond it."""
         pause(until_ns - self.clock.now().mono_ns)
         self.collect(until_ns)
         return overlapping(self.recorded, since_ns, until_ns, at_least_ms=at_least_ms)
 
     def collect(self, until_ns: int = 0) -> None:
-        """Take over what the probes have recorded, at least up to a time; raise `ProbeEnded` where one has ended."""
+        """Collect the probes' records, at least up to a time; raise `ProbeEnded` if a probe has ended."""
         for probe in self.probes:
             reported_ns, stalls = probe.report()
             self.recorded += stalls
@@ -216,15 +221,15 @@ class Stalls:
             self._reported_ns = max(self._reported_ns, reported_ns)
 
     def require(self, ok: object, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> None:
-        """Raise AssertionError unless `ok`; `HostStalled` where one stall of `stall_ms` overlaps the time that counts.
+        """Raise AssertionError unless `ok`, or `HostStalled` if a stall of `stall_ms` overlaps the interval.
 
-        The time that counts ends with the limit at the latest: what came late or never was due before.
+        The interval ends with the limit at the latest: something late or missing was due before.
         """
         if not ok:
             raise self.verdict(said, since_ns, until_ns, stall_ms=stall_ms)
 
     def verdict(self, said: str, since_ns: int, until_ns: int, *, stall_ms: float = STALL_MS) -> Exception:
-        """Return what to raise for something that was not as it should be at a time."""
+        """Return the exception for a failure in an interval."""
         stalls = self.during(since_ns, until_ns, at_least_ms=stall_ms)
         if not stalls:
             return AssertionError(said)
@@ -232,9 +237,9 @@ class Stalls:
         return HostStalled(f"{described(stalls, since_ns)}; {said}")
 
     def share_verdict(self, said: str, since_ns: int, until_ns: int, *, share: float) -> Exception:
-        """Return what to raise for a rate or a median, which one stall does not explain but a share of the time does.
+        """Return the exception for a rate or a median, which a stalled share of the time explains, but no single stall.
 
-        It is the share of the processor that was stalled longest.
+        The share is that of the processor with most stalls.
         """
         stalls = self.during(since_ns, until_ns)
         stalled = stalled_share(stalls, since_ns, until_ns)
@@ -247,9 +252,9 @@ class Stalls:
     def judging(
         self, since_ns: int, until_ns: int | None = None, *, stall_ms: float = STALL_MS, share: float | None = None
     ) -> Iterator[None]:
-        """Excuse an assertion on times that fails inside, by one stall or, with `share`, by a share of the time.
+        """Excuse a failed assertion about times in this context, by one stall or, with `share`, by a stalled share.
 
-        The time that counts ends now where no end is given. Assertions on safety stay outside.
+        Without `until_ns` the interval ends now. Assertions on safety must be outside.
         """
         try:
             yield
@@ -264,11 +269,11 @@ class Stalls:
             raise verdict from None
 
     def idle_share(self) -> float:
-        """Return which share of the time since the start the processors were idle."""
+        """Return the idle share of the processors since the start."""
         return idle_share(self._before, self.processor_times())
 
     def summary(self) -> str:
-        """Return what the probes have recorded until the last report, processor by processor."""
+        """Return a summary of the record until the last report, by processor."""
         gone_ns = max(self._reported_ns - self._began_ns, 1)
         said = []
         for processor in sorted({each.processor for each in self.recorded}):
@@ -289,7 +294,7 @@ class Stalls:
 
 
 class Shared(Generic[Result]):
-    """What several tests judge, such as a drive: made again, at most twice, after the host stalled one of them."""
+    """A value that several tests judge, such as a drive; made again, at most twice, after the host stalled a test."""
 
     def __init__(self, stalls: Stalls, make: Callable[[], Result]) -> None:
         self._stalls, self._make = stalls, make
@@ -297,7 +302,7 @@ class Shared(Generic[Result]):
         self._left, self._excused = TRIES, 0
 
     def get(self) -> Result:
-        """Return what was made last, made anew where the record has excused a failure since."""
+        """Return the last value; make it again if the record has excused a failure since."""
         if self._left and not (self._made and self._excused == self._stalls.excused):
             self._left -= 1
             self._made[:] = [self._make()]
@@ -305,3 +310,13 @@ class Shared(Generic[Result]):
         if not self._made:
             raise HostStalledEachTime("the host stalled each attempt to make what this test judges")
         return self._made[0]
+
+
+def excuse_slow_machine(failure: Exception, stalls: Stalls, since_ns: int, until_ns: int) -> Exception:
+    """Return `HostStalled` if many short stalls made the machine too slow, and the failure otherwise."""
+    if isinstance(failure, HostStalled):
+        return failure
+    recorded = stalls.during(since_ns, until_ns)
+    share = stalled_share(recorded, since_ns, until_ns)
+    message = f"stalled for {share:.1%} of the time, {described(recorded, since_ns)}; {failure}"
+    return AssertionError(message) if share < SLOW_SHARE else HostStalled(message)

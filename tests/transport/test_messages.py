@@ -66,8 +66,8 @@ ROAD_WHEEL = st.floats(-1, 1)
 UNIT = st.floats(0, 1)
 
 
-def text(longest: int) -> st.SearchStrategy[str]:
-    return st.text(st.characters(exclude_categories=["Cs"])).filter(lambda value: len(value.encode()) <= longest)
+def text(max_bytes: int) -> st.SearchStrategy[str]:
+    return st.text(st.characters(exclude_categories=["Cs"])).filter(lambda value: len(value.encode()) <= max_bytes)
 
 
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", fullmatch=True)
@@ -123,14 +123,14 @@ REPLIES = st.builds(
 
 @given(st.one_of(COMMANDS, STATES, REQUESTS, REPLIES))
 def test_round_trip(message: AnyMessage) -> None:
-    """Every message whose fields are in range is read back as it was."""
+    """Decoding an encoded message whose fields are in range returns the same message."""
     kind: Any = type(message)
     assert decode(kind, encode(message)) == message
 
 
 @pytest.mark.parametrize("letter", ["a", "é", "€", "🚗"])
 def test_longest_texts_fit(letter: str) -> None:
-    """Texts as long as they may be, of letters of any size, still make a message that is read."""
+    """A message with texts of the maximum length, of letters of any size in UTF-8, can be decoded."""
     longest = letter * (200 // len(letter.encode()))
     message = replace(STATE, reason=longest, rejected=longest, sent_wall_ns=2**63 - 1, applied_sequence=2**63 - 1)
     assert decode(State, encode(message)) == message
@@ -139,14 +139,14 @@ def test_longest_texts_fit(letter: str) -> None:
 
 
 def test_version_comes_first() -> None:
-    """A message is a msgpack array of the version and the fields in the order of the class."""
+    """A message is a msgpack array of the version and the fields, in the order of the class."""
     values = msgpack.unpackb(encode(REQUEST))
     assert values == [VERSION, *(getattr(REQUEST, each.name) for each in fields(REQUEST))]
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_random_bytes(kind: type[Any]) -> None:
-    """Ten thousand random byte strings raise BadMessage, each of them, and nothing else."""
+    """Each of 10000 random byte strings raises BadMessage and nothing else."""
     generator = stream(1, f"random bytes {kind.__name__}")
     for _ in range(10_000):
         with pytest.raises(BadMessage):
@@ -155,7 +155,7 @@ def test_random_bytes(kind: type[Any]) -> None:
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_damaged_messages(kind: type[Any]) -> None:
-    """A message in which a byte was changed, or of which a part is missing, is a message in range or a BadMessage."""
+    """A message with a changed byte is decoded to values in range or raises BadMessage; a truncated one raises it."""
     whole = encode(MESSAGES[kind])
     generator = stream(2, f"damaged {kind.__name__}")
     rejected = 0
@@ -178,7 +178,7 @@ NOT_A_NUMBER: list[Any] = [NAN, INF, -INF, True, "0", b"0", None, [], {}, 2**64 
 NOT_A_TEXT: list[Any] = [1, 1.0, True, None, b"drive", [], {}]
 NOT_A_TIME = [*NOT_AN_INTEGER, -1, 2**63, 2**64 - 1]
 NOT_A_NAME = [*NOT_A_TEXT, "", "a/b", "**", "*", "a b", "-a", "_a", "a\n", "é", "a" * 33, "$a", "a#"]
-NOT_A_NAME_OR_NONE = [each for each in NOT_A_NAME if each != ""]
+NOT_A_NAME_OR_EMPTY = [each for each in NOT_A_NAME if each != ""]
 POINTS = [0.0] * PATH_POINTS
 OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
     Command: {
@@ -192,7 +192,14 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "throttle": [*NOT_A_NUMBER, 1.0001, -0.0001],
         "brake": [*NOT_A_NUMBER, 1.0001, -0.0001],
         "path_curvature_per_m": [
-            None, 0.0, "0000000000", bytes(10), {}, POINTS[1:], [*POINTS, 0.0], [],
+            None,
+            0.0,
+            "0000000000",
+            bytes(10),
+            {},
+            POINTS[1:],
+            [*POINTS, 0.0],
+            [],
             *([*POINTS[1:], bad] for bad in (*NOT_A_NUMBER, 1.0001, -1.0001)),
         ],
         "mode": [*NOT_A_TEXT, "", "fly", "Drive", "drive "],
@@ -208,9 +215,9 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "applied_sequence": [*NOT_AN_INTEGER, -2, 2**63],
         "rejected": [*NOT_A_TEXT, "x" * 201],
         "limited": [*NOT_A_TEXT, "x" * 101],
-        "active_operator": NOT_A_NAME_OR_NONE,
+        "active_operator": NOT_A_NAME_OR_EMPTY,
         "active_operator_instance": [*NOT_AN_INTEGER, -1],
-        "requested_by": NOT_A_NAME_OR_NONE,
+        "requested_by": NOT_A_NAME_OR_EMPTY,
         "instance": [*NOT_AN_INTEGER, -1],
     },
     SessionRequest: {
@@ -244,7 +251,7 @@ OUT_OF_RANGE: dict[type, dict[str, list[Any]]] = {
         "state_delay_ms": [*NOT_A_NUMBER, -0.1, 10_000.1],
     },
     NetemReply: {"granted": [0, 1, 1.0, "true", None, []], "reason": [*NOT_A_TEXT, "x" * 401]},
-}  # fmt: skip
+}
 
 
 def wire(message: AnyMessage, **changed: Any) -> bytes:
@@ -255,7 +262,7 @@ def wire(message: AnyMessage, **changed: Any) -> bytes:
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, each.name) for kind in MESSAGES for each in fields(kind)])
 def test_every_field_is_checked(kind: type[Any], name: str) -> None:
-    """A message is refused for a field of a wrong type, not finite or out of range; true and false are no numbers."""
+    """A message is rejected if a field has a wrong type, is not finite or is out of range; booleans are not numbers."""
     for bad in OUT_OF_RANGE[kind][name]:
         with pytest.raises(BadMessage, match=f"{kind.__name__}.{name}"):
             decode(kind, wire(MESSAGES[kind], **{name: bad}))
@@ -264,7 +271,7 @@ def test_every_field_is_checked(kind: type[Any], name: str) -> None:
 @pytest.mark.parametrize("kind", MESSAGES)
 @pytest.mark.parametrize("version", [0, 1, 3, -1, True, 1.0, "1", None, [1]])
 def test_other_versions(kind: type[Any], version: Any) -> None:
-    """A message whose version is not exactly the number of ours is refused."""
+    """A message whose version is not exactly the expected integer is rejected."""
     _, *values = msgpack.unpackb(encode(MESSAGES[kind]))
     with pytest.raises(BadMessage, match="version"):
         decode(kind, msgpack.packb([version, *values]))
@@ -272,7 +279,7 @@ def test_other_versions(kind: type[Any], version: Any) -> None:
 
 @pytest.mark.parametrize("kind", MESSAGES)
 def test_other_shapes(kind: type[Any]) -> None:
-    """A field too many or too few, a message of another class, and what is no array at all are refused."""
+    """A message with too many or too few fields, of another class, or that is not an array, is rejected."""
     values = msgpack.unpackb(encode(MESSAGES[kind]))
     shapes = [[*values, 0], values[:-1], [], {1: values}, values[0], None, "x", [values]]
     shapes += [msgpack.unpackb(encode(other)) for other_kind, other in MESSAGES.items() if other_kind is not kind]
@@ -284,14 +291,14 @@ def test_other_shapes(kind: type[Any]) -> None:
 
 
 def test_too_long() -> None:
-    """More bytes than a message may have are refused unread."""
+    """A message that exceeds the maximum size is rejected."""
     with pytest.raises(BadMessage, match=str(MAX_MESSAGE_BYTES + 1)):
         decode(Command, encode(COMMAND).ljust(MAX_MESSAGE_BYTES + 1, b"\0"))
 
 
 BOMBS = {
-    "an array of four thousand million": b"\xdd\xff\xff\xff\xff",
-    "a map of four thousand million": b"\xdf\xff\xff\xff\xff",
+    "an array of four billion": b"\xdd\xff\xff\xff\xff",
+    "a map of four billion": b"\xdf\xff\xff\xff\xff",
     "a text of four gigabytes": b"\xdb\xff\xff\xff\xff",
     "bytes of four gigabytes": b"\xc6\xff\xff\xff\xff",
     "an extension of four gigabytes": b"\xc9\xff\xff\xff\xff\x01",
@@ -303,7 +310,7 @@ BOMBS = {
 
 @pytest.mark.parametrize("bomb", BOMBS)
 def test_bombs(bomb: str) -> None:
-    """Bytes that claim to be huge or deep are refused and cost less than a megabyte."""
+    """A message that claims to contain huge or deeply nested data is rejected and costs less than a megabyte."""
     data = BOMBS[bomb].ljust(MAX_MESSAGE_BYTES, b"\x90")
     tracemalloc.start()
     try:

@@ -21,14 +21,14 @@ ARRIVES_S = 5.0
 ANY = ("127.0.0.1", 0)
 
 
-class Heard:
-    """What a link delivered."""
+class Received:
+    """The messages that a link delivered."""
 
     def __init__(self) -> None:
         self.messages: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
 
     def __call__(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        """Take a message."""
+        """Store a message."""
         self.messages.put((channel, payload, arrived, peer))
 
     def next(self) -> tuple[str, Any, Now, Any]:
@@ -36,13 +36,13 @@ class Heard:
         return self.messages.get(timeout=ARRIVES_S)
 
 
-def opened(heard: Heard, clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
-    return UdpLink(clock or MachineClock(), "rtp", heard, bind=ANY, remote=remote)
+def open_link(received: Received, clock: Clock | None = None, remote: tuple[str, int] | None = None) -> UdpLink:
+    return UdpLink(clock or MachineClock(), "rtp", received, bind=ANY, remote=remote)
 
 
 @pytest.fixture
 def sender() -> Iterator[socket.socket]:
-    """A socket on loopback that belongs to nobody."""
+    """Open a socket on the loopback that belongs to no link."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened_socket:
         opened_socket.bind(ANY)
         opened_socket.settimeout(ARRIVES_S)
@@ -51,35 +51,35 @@ def sender() -> Iterator[socket.socket]:
 
 def test_delivers(sender: socket.socket) -> None:
     """A datagram is delivered on the link's channel, with the address it came from."""
-    heard = Heard()
-    with closing(opened(heard)) as link:
+    received = Received()
+    with closing(open_link(received)) as link:
         link.start()
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        channel, payload, _, peer = heard.next()
+        channel, payload, _, peer = received.next()
     assert (channel, payload, peer) == ("rtp", b"packet", sender.getsockname())
 
 
 def test_time_of_arrival(sender: socket.socket) -> None:
-    """Arrival is when the kernel got the datagram, however late the link takes it, and is never in the future."""
-    heard = Heard()
-    with closing(opened(heard)) as link:
+    """The time of arrival is when the kernel received the datagram, however late the link reads it."""
+    received = Received()
+    with closing(open_link(received)) as link:
         before = MachineClock().now()
         sender.sendto(b"early", ("127.0.0.1", link.port))
-        taken_from = MachineClock().now()
+        sent = MachineClock().now()
         link.start()
-        arrived = heard.next()[2]
-    assert before.wall_ns <= arrived.wall_ns <= taken_from.wall_ns + NS_PER_S // 100
+        arrived = received.next()[2]
+    assert before.wall_ns <= arrived.wall_ns <= sent.wall_ns + NS_PER_S // 100
     assert before.mono_ns - NS_PER_S // 1000 <= arrived.mono_ns <= MachineClock().now().mono_ns
 
 
 def test_arrival_on_both_clocks(sender: socket.socket) -> None:
-    """A datagram that the kernel stamped 5 s ago arrived 5 s ago on the wall clock and on the monotonic clock."""
-    heard, clock = Heard(), ShiftedClock(mono_ns=10**15, wall_ns=5 * NS_PER_S)
-    with closing(opened(heard, clock)) as link:
+    """A kernel timestamp of 5 s ago puts the arrival 5 s back on the wall clock and on the monotonic clock."""
+    received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=5 * NS_PER_S)
+    with closing(open_link(received, clock)) as link:
         before = MachineClock().now()
         link.start()
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        arrived = heard.next()[2]
+        arrived = received.next()[2]
         after = MachineClock().now()
     assert before.wall_ns <= arrived.wall_ns <= after.wall_ns
     mono_ns = arrived.mono_ns - 10**15 + 5 * NS_PER_S
@@ -88,79 +88,79 @@ def test_arrival_on_both_clocks(sender: socket.socket) -> None:
 
 @pytest.mark.parametrize("wall_s", [-5.0, 3600.0])
 def test_stepped_clock(sender: socket.socket, wall_s: float) -> None:
-    """A kernel's stamp in the future or an hour old is not believed: the wall clock was stepped, it arrived now."""
-    heard, clock = Heard(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
-    with closing(opened(heard, clock)) as link:
+    """A kernel timestamp in the future or an hour old is ignored, and the time of reading is used."""
+    received, clock = Received(), ShiftedClock(mono_ns=10**15, wall_ns=round(wall_s * NS_PER_S))
+    with closing(open_link(received, clock)) as link:
         before = clock.now()
         link.start()
         sender.sendto(b"packet", ("127.0.0.1", link.port))
-        arrived = heard.next()[2]
+        arrived = received.next()[2]
         after = clock.now()
     assert before.wall_ns <= arrived.wall_ns <= after.wall_ns
     assert before.mono_ns <= arrived.mono_ns <= after.mono_ns
 
 
 def test_garbage(sender: socket.socket) -> None:
-    """Datagrams of any content and length are delivered as they are and in order, the empty one too."""
-    heard = Heard()
+    """Datagrams of any content and length are delivered unchanged and in order, even an empty one."""
+    received = Received()
     generator = stream(1, "garbage")
     datagrams = [b"", bytes(65_000), *(generator.bytes(int(generator.integers(1, 1500))) for _ in range(100))]
-    with closing(opened(heard)) as link:
+    with closing(open_link(received)) as link:
         link.start()
         for datagram in datagrams:
             sender.sendto(datagram, ("127.0.0.1", link.port))
-            assert heard.next()[1] == datagram
+            assert received.next()[1] == datagram
 
 
 def test_send_to_a_peer(sender: socket.socket) -> None:
     """A link without a remote sends to the peer that a message names."""
-    with closing(opened(Heard())) as link:
+    with closing(open_link(Received())) as link:
         link.send(Send("rtp", b"to you", sender.getsockname()))
         assert sender.recvfrom(100) == (b"to you", ("127.0.0.1", link.port))
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_send_to_the_remote(sender: socket.socket, known: bool) -> None:
-    """A client's link sends to its remote: to the configured port, or else to the one that the session named."""
+    """A client's link sends to its server, at the configured port or else at the port of the session's reply."""
     port = sender.getsockname()[1]
-    with closing(opened(Heard(), remote=("localhost", port if known else 0))) as link:
+    with closing(open_link(Received(), remote=("localhost", port if known else 0))) as link:
         link.send(Send("feedback", b"hello", 9 if known else port))
         assert sender.recv(100) == b"hello"
 
 
-def test_what_cannot_be_sent() -> None:
-    """A datagram that the system refuses is counted, and the link goes on."""
-    with closing(opened(Heard())) as link:
+def test_unsendable_datagrams_are_counted() -> None:
+    """A datagram that the system rejects is counted and raises nothing."""
+    with closing(open_link(Received())) as link:
         for payload, address in ((bytes(70_000), ANY), (b"x", ("255.255.255.255", 9)), (b"x", ANY)):
             link.send(Send("rtp", payload, address))
         assert link.counts == {"datagrams_not_sent": 3}
 
 
 def test_port_in_use(sender: socket.socket) -> None:
-    """A port that another program has is named in a sentence that says what to do."""
+    """A port in use raises a UserError that names the port and a remedy."""
     port = sender.getsockname()[1]
     with pytest.raises(UserError, match=rf"port 127\.0\.0\.1:{port} .*in use.*: choose another, or 0"):
-        UdpLink(MachineClock(), "rtp", Heard(), bind=("127.0.0.1", port))
+        UdpLink(MachineClock(), "rtp", Received(), bind=("127.0.0.1", port))
 
 
 @pytest.mark.parametrize("host", ["a" * 64, "192.0.2.1"])
 def test_address_of_another_machine(host: str) -> None:
-    """An address that is not this machine's, or none at all, is refused in a sentence."""
+    """An address of another machine, or an invalid one, raises a UserError."""
     with pytest.raises(UserError, match="cannot be opened"):
-        UdpLink(MachineClock(), "rtp", Heard(), bind=(host, 0))
+        UdpLink(MachineClock(), "rtp", Received(), bind=(host, 0))
 
 
 def test_unknown_remote() -> None:
-    """A server that nobody can look up is refused at once."""
+    """A server whose name cannot be resolved raises a UserError."""
     with pytest.raises(UserError, match="is not known"):
-        opened(Heard(), remote=("a" * 64, 5600))
+        open_link(Received(), remote=("a" * 64, 5600))
 
 
 @pytest.mark.parametrize("started", [True, False])
 def test_close(started: bool) -> None:
-    """Closing ends the thread and frees the port."""
+    """Closing a link ends its thread and frees its port."""
     before = set(threading.enumerate())
-    link = opened(Heard())
+    link = open_link(Received())
     port = link.port
     if started:
         link.start()
@@ -171,15 +171,15 @@ def test_close(started: bool) -> None:
 
 
 def test_only_from_one_host(sender: socket.socket) -> None:
-    """A link that only listens hears any port of the one host that it was given; the others are counted."""
-    heard = Heard()
+    """A link with `only_from` receives from any port of that host; datagrams of other hosts are counted."""
+    received = Received()
     with (
-        closing(UdpLink(MachineClock(), "rtp", heard, bind=ANY, only_from="127.0.0.2")) as link,
+        closing(UdpLink(MachineClock(), "rtp", received, bind=ANY, only_from="127.0.0.2")) as link,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as known,
     ):
         known.bind(("127.0.0.2", 0))
         link.start()
         sender.sendto(b"stranger", ("127.0.0.1", link.port))
         known.sendto(b"known", ("127.0.0.1", link.port))
-        assert heard.next()[1] == b"known"
+        assert received.next()[1] == b"known"
         assert link.counts["datagrams_from_strangers"] == 1

@@ -19,7 +19,7 @@ from lavt.domain import NS_PER_S, Now
 from lavt.errors import UserError
 from lavt.node import Send
 from lavt.transport.messages import MAX_MESSAGE_BYTES
-from lavt.transport.zenoh_link import ARRIVING_KEPT, Router, ZenohLink, quiet_logs
+from lavt.transport.zenoh_link import RECEIVE_RING_LENGTH, Router, ZenohLink, quiet_logs
 
 ARRIVES_S = 10.0
 CONFIGS = shipped("zenoh-configs")
@@ -29,39 +29,40 @@ BETWEEN = "udp/127.0.0.1:0?rel=1;mixed_rel=1"
 QUIET = "scouting: { multicast: { enabled: false } }, adminspace: { enabled: true }"
 
 
-class Heard:
-    """What a link delivered, by channel."""
+class Received:
+    """The messages that a link delivered."""
 
     def __init__(self) -> None:
         self.messages: queue.Queue[tuple[str, Any, Now, Any]] = queue.Queue()
         self.payloads: list[Any] = []
 
     def __call__(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        """Take a message."""
+        """Store a message."""
         self.payloads.append(payload)
         self.messages.put((channel, payload, arrived, peer))
 
-    def next(self, wanted: tuple[str, bytes], again: Callable[[], None] | None = None) -> tuple[Now, Any]:
-        """Wait for a payload on a channel; `again` repeats what may have been said too early or lost."""
+    def next(self, wanted: tuple[str, bytes], send: Callable[[], None] | None = None) -> tuple[Now, Any]:
+        """Wait for a payload on a channel; `send` sends it, repeatedly, because it may be lost or too early."""
         for _ in range(100):
-            if again is not None:
-                again()
+            if send is not None:
+                send()
             try:
                 channel, payload, arrived, peer = self.messages.get(timeout=ARRIVES_S / 100)
             except queue.Empty:
                 continue
             if (channel, payload) == wanted:
                 return arrived, peer
-        raise AssertionError(f"nothing came on {wanted}")
+        raise AssertionError(f"did not receive {wanted}")
 
 
 def local(router: Router) -> str:
+    """Return the loopback endpoint of a router."""
     return next(each for each in router.locators() if each.startswith("tcp/"))
 
 
 @pytest.fixture(scope="module")
 def routers() -> Iterator[tuple[str, str]]:
-    """The shipped routers on free ports, the client's dialling the server's; gives where each side's session goes."""
+    """Start the shipped routers on free ports, linked to each other; yield the endpoint of each side's router."""
     quiet_logs()
     with ExitStack() as stack:
         server = Router(CONFIGS / "router-server.json5", {"listen/endpoints": [LOCAL, BETWEEN]})
@@ -78,7 +79,7 @@ def routers() -> Iterator[tuple[str, str]]:
 
 def link(
     side: Literal["server", "client"],
-    heard: Heard,
+    received: Received,
     router: str,
     *,
     vehicle: str = "vehicle-1",
@@ -86,17 +87,23 @@ def link(
     path: Path = SESSION,
 ) -> ZenohLink:
     return ZenohLink(
-        MachineClock(), heard, side=side, path=path, router=router, vehicle=vehicle, who=who or f"{side}-1"
+        MachineClock(),
+        received,
+        side=side,
+        path=path,
+        router=router,
+        vehicle=vehicle,
+        who=f"{side}-1" if who is None else who,
     )
 
 
 class Pair:
-    """A server and a client of one vehicle, at work."""
+    """The started links of a server and a client of one vehicle."""
 
     def __init__(self, routers: tuple[str, str], vehicle: str) -> None:
-        self.server_heard, self.client_heard = Heard(), Heard()
-        self.server = link("server", self.server_heard, routers[0], vehicle=vehicle)
-        self.client = link("client", self.client_heard, routers[1], vehicle=vehicle)
+        self.server_received, self.client_received = Received(), Received()
+        self.server = link("server", self.server_received, routers[0], vehicle=vehicle)
+        self.client = link("client", self.client_received, routers[1], vehicle=vehicle)
         self.server.start()
         self.client.start()
 
@@ -108,94 +115,94 @@ class Pair:
 
 @pytest.fixture(scope="module")
 def pair(routers: tuple[str, str]) -> Iterator[Pair]:
-    """A server and a client, each at the router of its own side."""
+    """Start a server's and a client's link, each at the router of its own side."""
     with closing(Pair(routers, "vehicle-1")) as opened:
         yield opened
 
 
 def test_control(pair: Pair) -> None:
-    """A command reaches the server through both routers as it was, with the time it arrived."""
+    """A command reaches the server through both routers unchanged, with its time of arrival."""
     before = MachineClock().now()
     command = Send("control", b"\x00command")
-    arrived, _ = pair.server_heard.next(("control", b"\x00command"), lambda: pair.client.send(command))
+    arrived, _ = pair.server_received.next(("control", b"\x00command"), lambda: pair.client.send(command))
     assert before.mono_ns <= arrived.mono_ns <= MachineClock().now().mono_ns
 
 
 @pytest.mark.realtime
 @pytest.mark.judges_times(share=0.05)  # a slow host may bring the query before most of the commands
-def test_more_than_can_be_heard(routers: tuple[str, str]) -> None:
-    """While a command is being looked at the newest of the others are kept, and a query is heard at once."""
+def test_the_newest_commands_are_kept_while_the_server_is_busy(routers: tuple[str, str]) -> None:
+    """While a command is being processed the newest of the others are kept, and a query is delivered at once."""
     with closing(Pair(routers, "vehicle-busy")) as pair:
-        looking, seen = threading.Event(), threading.Event()
-        heard = pair.server_heard
+        blocked, resume = threading.Event(), threading.Event()
+        received = pair.server_received
 
-        def look(channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-            heard(channel, payload, arrived, peer)
-            if payload == b"look":
-                looking.set()
-                seen.wait(ARRIVES_S)
+        def block(channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+            received(channel, payload, arrived, peer)
+            if payload == b"block":
+                blocked.set()
+                resume.wait(ARRIVES_S)
 
-        pair.server._deliver = look
-        heard.next(("control", b"look"), lambda: pair.client.send(Send("control", b"look")))
-        assert looking.wait(ARRIVES_S)
-        heard.payloads.clear()
-        for number in range(10 * ARRIVING_KEPT):
+        pair.server._deliver = block
+        received.next(("control", b"block"), lambda: pair.client.send(Send("control", b"block")))
+        assert blocked.wait(ARRIVES_S)
+        received.payloads.clear()
+        for number in range(10 * RECEIVE_RING_LENGTH):
             pair.client.send(Send("control", b"%d" % number))
-        heard.next(("session", b"who holds?"), lambda: pair.client.send(Send("session", b"who holds?")))
-        assert set(heard.payloads) == {b"who holds?"}
-        seen.set()
+        received.next(("session", b"query"), lambda: pair.client.send(Send("session", b"query")))
+        assert set(received.payloads) == {b"query"}
+        resume.set()
         for _ in range(100):
             pair.client.send(Send("control", b"last"))
             pause(round(ARRIVES_S * NS_PER_S / 100))
-            if b"last" in heard.payloads:
+            if b"last" in received.payloads:
                 break
-        numbers = [int(payload) for payload in heard.payloads if payload.isdigit()]
-        assert b"last" in heard.payloads
+        numbers = [int(payload) for payload in received.payloads if payload.isdigit()]
+        assert b"last" in received.payloads
         assert numbers == sorted(numbers)
-        assert 0 < len(numbers) < 2 * ARRIVING_KEPT
-        assert numbers[0] > ARRIVING_KEPT
+        assert 0 < len(numbers) < 2 * RECEIVE_RING_LENGTH
+        assert numbers[0] > RECEIVE_RING_LENGTH
 
 
 def test_state(pair: Pair) -> None:
-    """A state reaches the client through both routers as it was."""
-    pair.client_heard.next(("state", b"state\xff"), lambda: pair.server.send(Send("state", b"state\xff")))
+    """A state reaches the client through both routers unchanged."""
+    pair.client_received.next(("state", b"state\xff"), lambda: pair.server.send(Send("state", b"state\xff")))
 
 
-@pytest.mark.parametrize(("channel", "answer"), [("session", "session_reply"), ("netem", "netem_reply")])
-def test_queries(pair: Pair, channel: str, answer: str) -> None:
-    """A client's question reaches the server, and the server's answer reaches the client who asked."""
-    question = Send(channel, b"who holds?")
-    _, peer = pair.server_heard.next((channel, b"who holds?"), lambda: pair.client.send(question))
-    pair.server.send(Send(answer, b"you", peer))
-    pair.client_heard.next((answer, b"you"))
+@pytest.mark.parametrize(("channel", "reply"), [("session", "session_reply"), ("netem", "netem_reply")])
+def test_queries(pair: Pair, channel: str, reply: str) -> None:
+    """A client's query reaches the server, and the server's reply reaches the client."""
+    query = Send(channel, b"query")
+    _, peer = pair.server_received.next((channel, b"query"), lambda: pair.client.send(query))
+    pair.server.send(Send(reply, b"reply", peer))
+    pair.client_received.next((reply, b"reply"))
 
 
-def test_answer_to_nobody(pair: Pair) -> None:
-    """An answer to a question that is not open, or was answered already, reaches nobody."""
-    question = Send("session", b"who?")
-    _, peer = pair.server_heard.next(("session", b"who?"), lambda: pair.client.send(question))
-    pair.server.send(Send("session_reply", b"to nobody", 10**9), Send("netem_reply", b"to nobody", peer))
+def test_reply_without_a_query(pair: Pair) -> None:
+    """A reply without a pending query, or to one that has been answered, is not sent."""
+    query = Send("session", b"number")
+    _, peer = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
+    pair.server.send(Send("session_reply", b"no query", 10**9), Send("netem_reply", b"no query", peer))
     pair.server.send(Send("session_reply", b"first", peer), Send("session_reply", b"second", peer))
-    pair.client_heard.next(("session_reply", b"first"))
-    _, following = pair.server_heard.next(("session", b"who?"), lambda: pair.client.send(question))
+    pair.client_received.next(("session_reply", b"first"))
+    _, following = pair.server_received.next(("session", b"number"), lambda: pair.client.send(query))
     pair.server.send(Send("session_reply", b"following", following))
-    pair.client_heard.next(("session_reply", b"following"))
-    assert not {b"to nobody", b"second"} & set(pair.client_heard.payloads)
+    pair.client_received.next(("session_reply", b"following"))
+    assert not {b"no query", b"second"} & set(pair.client_received.payloads)
     assert not [name for name in pair.server.counts if name.endswith("_reply_not_sent")]
 
 
 def test_vehicles_do_not_mix(pair: Pair, routers: tuple[str, str]) -> None:
-    """What is meant for one vehicle is not heard by another at the same router."""
+    """A message for one vehicle does not reach another at the same router."""
     with closing(Pair(routers, "vehicle-2")) as other:
-        other.server_heard.next(("control", b"for two"), lambda: other.client.send(Send("control", b"for two")))
-        pair.server_heard.next(("control", b"for one"), lambda: pair.client.send(Send("control", b"for one")))
-        assert b"for two" not in pair.server_heard.payloads
-        assert b"for one" not in other.server_heard.payloads
+        other.server_received.next(("control", b"for two"), lambda: other.client.send(Send("control", b"for two")))
+        pair.server_received.next(("control", b"for one"), lambda: pair.client.send(Send("control", b"for one")))
+        assert b"for two" not in pair.server_received.payloads
+        assert b"for one" not in other.server_received.payloads
 
 
 @pytest.mark.usefixtures("pair")
 def test_liveliness(routers: tuple[str, str]) -> None:
-    """Who is there is known at the other side's router while the link is open, and gone when it is closed."""
+    """A link's liveliness token is visible at the other side's router while the link is open."""
     config = zenoh.Config.from_file(str(SESSION))
     config.insert_json5("connect/endpoints", json.dumps([routers[0]]))
     changes: queue.Queue[tuple[str, bool]] = queue.Queue()
@@ -207,7 +214,7 @@ def test_liveliness(routers: tuple[str, str]) -> None:
         )
         known = {changes.get(timeout=ARRIVES_S) for _ in range(2)}
         assert known == {(f"lavt/vehicle-1/alive/{who}", True) for who in ("server-1", "client-1")}
-        visitor = link("client", Heard(), routers[1], who="visitor")
+        visitor = link("client", Received(), routers[1], who="visitor")
         visitor.start()
         assert changes.get(timeout=ARRIVES_S) == ("lavt/vehicle-1/alive/visitor", True)
         visitor.close()
@@ -215,19 +222,19 @@ def test_liveliness(routers: tuple[str, str]) -> None:
         watch.undeclare()
 
 
-def test_question_without_a_server(routers: tuple[str, str]) -> None:
-    """A question that nobody answers is no error: nothing comes back, and the link closes."""
-    heard = Heard()
-    with closing(link("client", heard, routers[1], vehicle="nobody")) as alone:
+def test_query_without_a_server(routers: tuple[str, str]) -> None:
+    """A query without a reply is not an error, and the link can be closed."""
+    received = Received()
+    with closing(link("client", received, routers[1], vehicle="nobody")) as alone:
         alone.start()
-        alone.send(Send("session", b"anybody?"))
-        alone.send(Send("control", b"into the air"))
-    assert heard.messages.empty()
+        alone.send(Send("session", b"query"))
+        alone.send(Send("control", b"command"))
+    assert received.messages.empty()
 
 
 def test_send_after_close(routers: tuple[str, str]) -> None:
-    """What is sent when the session is gone is counted and not raised."""
-    closed = link("client", Heard(), routers[1], vehicle="closed")
+    """A message that is sent after the session was closed is counted and raises nothing."""
+    closed = link("client", Received(), routers[1], vehicle="closed")
     closed.start()
     closed.close()
     for channel in ("session", "control"):
@@ -240,15 +247,21 @@ BAD_NAMES = ["a/b", "**", "*", "", "a" * 33, "-a", "_a", "a b", "a$*", "a#", "a?
 
 @pytest.mark.parametrize("name", BAD_NAMES)
 def test_names(name: str) -> None:
-    """A vehicle or client whose name could mean something in a key is refused before anything is opened."""
+    """A vehicle or client name with a meaning in a Zenoh key raises a UserError before a session is opened."""
     for vehicle, who in ((name, "operator-1"), ("vehicle-1", name)):
         with pytest.raises(UserError, match="1 to 32 letters"):
             ZenohLink(
-                MachineClock(), Heard(), side="client", path=SESSION, router="tcp/127.0.0.1:1", vehicle=vehicle, who=who
+                MachineClock(),
+                Received(),
+                side="client",
+                path=SESSION,
+                router="tcp/127.0.0.1:1",
+                vehicle=vehicle,
+                who=who,
             )
 
 
-def is_a_sentence(error: pytest.ExceptionInfo[UserError]) -> bool:
+def is_one_plain_line(error: pytest.ExceptionInfo[UserError]) -> bool:
     text = str(error.value)
     return "\n" not in text and ".rs" not in text and "Location" not in text and len(text) < 1000
 
@@ -259,52 +272,64 @@ def unanswered() -> str:
 
 
 def test_no_router() -> None:
-    """Where no router answers, the sentence names the endpoint and the command that starts one."""
+    """Without a router, the error names the endpoint and the command that starts a router."""
     endpoint = unanswered()
     with pytest.raises(UserError, match=rf"{endpoint}.*lavt router") as error:
-        link("server", Heard(), endpoint)
-    assert is_a_sentence(error)
+        link("server", Received(), endpoint)
+    assert is_one_plain_line(error)
 
 
 def test_waiting_for_a_router() -> None:
-    """A link that may wait says why once, counts what it cannot send, and carries messages once a router is there."""
-    endpoint, said, heard = unanswered(), list[str](), Heard()
+    """A waiting link reports the reason once, counts unsent messages, and sends as soon as a router answers."""
+    endpoint, reasons, received = unanswered(), list[str](), Received()
     with ExitStack() as stack:
         waiting = ZenohLink(
-            MachineClock(), Heard(), side="client", path=SESSION, router=endpoint, vehicle="late", who="client-1",
-            waiting=said.append,
-        )  # fmt: skip
+            MachineClock(),
+            Received(),
+            side="client",
+            path=SESSION,
+            router=endpoint,
+            vehicle="late",
+            who="client-1",
+            waiting=reasons.append,
+        )
         stack.callback(waiting.close)
-        assert said == []
+        assert reasons == []
         waiting.start()
         waiting.send(Send("control", b"too early"), Send("session", b"too early"))
         assert waiting.counts["control_not_sent"] == waiting.counts["session_not_sent"] == 1
         stack.callback(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]}).close)
-        server = link("server", heard, endpoint, vehicle="late")
+        server = link("server", received, endpoint, vehicle="late")
         stack.callback(server.close)
         server.start()
-        heard.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
-    assert len(said) == 1
-    assert f"no router answers at ['{endpoint}']" in said[0]
+        received.next(("control", b"now"), lambda: waiting.send(Send("control", b"now")))
+    assert len(reasons) == 1
+    assert endpoint in reasons[0]
 
 
-def test_leaving_while_waiting_for_a_router() -> None:
+def test_closing_while_waiting_for_a_router() -> None:
     """A link that still waits for its router can be closed."""
     with closing(
         ZenohLink(
-            MachineClock(), Heard(), side="server", path=SESSION, router=unanswered(),
-            vehicle="late", who="server", waiting=lambda _: None,
+            MachineClock(),
+            Received(),
+            side="server",
+            path=SESSION,
+            router=unanswered(),
+            vehicle="late",
+            who="server",
+            waiting=lambda _: None,
         )
-    ) as waiting:  # fmt: skip
+    ) as waiting:
         waiting.start()
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "foo/127.0.0.1:1", "tcp/127.0.0.1", "tcp/127.0.0.1:99999"])
 def test_bad_endpoint(endpoint: str) -> None:
-    """An endpoint that is none is refused in a sentence that names it."""
+    """An invalid endpoint raises a UserError that names it."""
     with pytest.raises(UserError, match=endpoint) as error:
-        link("server", Heard(), endpoint)
-    assert is_a_sentence(error)
+        link("server", Received(), endpoint)
+    assert is_one_plain_line(error)
 
 
 ROUTER_PROBLEMS = {
@@ -315,41 +340,45 @@ ROUTER_PROBLEMS = {
     "empty": ("", "not a Zenoh config"),
     "mode of a session": (f'{{ mode: "client", {QUIET} }}', 'mode: "router"'),
     "no mode": (f"{{ {QUIET} }}", 'mode: "router"'),
-    "no listen endpoints": (f'{{ mode: "router", {QUIET} }}', "names no listen endpoints"),
-    "an empty list": (f'{{ mode: "router", listen: {{ endpoints: [] }}, {QUIET} }}', "names no listen endpoints"),
+    "no listen endpoints": (f'{{ mode: "router", {QUIET} }}', "no listen endpoints"),
+    "an empty list": (f'{{ mode: "router", listen: {{ endpoints: [] }}, {QUIET} }}', "no listen endpoints"),
     "endpoints of a peer": (
-        f'{{ mode: "router", listen: {{ endpoints: {{ peer: ["{LOCAL}"] }} }}, {QUIET} }}', "names no listen endpoints",
+        f'{{ mode: "router", listen: {{ endpoints: {{ peer: ["{LOCAL}"] }} }}, {QUIET} }}',
+        "no listen endpoints",
     ),
     "no admin space": (f'{{ mode: "router", listen: {{ endpoints: ["{LOCAL}"] }} }}', "adminspace"),
     "unknown protocol": (f'{{ mode: "router", listen: {{ endpoints: ["foo/127.0.0.1:0"] }}, {QUIET} }}', "foo"),
-    "address of nobody": (f'{{ mode: "router", listen: {{ endpoints: ["tcp/192.0.2.1:0"] }}, {QUIET} }}', "192.0.2.1"),
-}  # fmt: skip
+    "address of another machine": (
+        f'{{ mode: "router", listen: {{ endpoints: ["tcp/192.0.2.1:0"] }}, {QUIET} }}',
+        "192.0.2.1",
+    ),
+}
 
 
 @pytest.mark.parametrize("problem", ROUTER_PROBLEMS)
 def test_bad_router_config(problem: str, tmp_path: Path) -> None:
-    """A router's config that is wrong is refused in one sentence that names the file and says what is wrong."""
-    text, said = ROUTER_PROBLEMS[problem]
+    """An invalid config of a router raises a UserError that names the file and the problem."""
+    text, expected = ROUTER_PROBLEMS[problem]
     path = tmp_path / "router.json5"
     path.write_text(text)
     with pytest.raises(UserError, match=r"router\.json5") as error:
         Router(path, {})
-    assert said in str(error.value)
-    assert is_a_sentence(error)
+    assert expected in str(error.value)
+    assert is_one_plain_line(error)
 
 
-def test_bytes_that_are_no_text(tmp_path: Path) -> None:
-    """A file that is no text is refused in a sentence."""
+def test_binary_router_config(tmp_path: Path) -> None:
+    """A config file that is not text raises a UserError that names the file."""
     path = tmp_path / "router.json5"
     path.write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(UserError, match=r"router\.json5") as error:
         Router(path, {})
-    assert is_a_sentence(error)
+    assert is_one_plain_line(error)
 
 
 @pytest.mark.parametrize("name", ["nothing.json5", "."])
 def test_missing_file(name: str, tmp_path: Path) -> None:
-    """A file that is not there is named, and so is where the shipped ones are."""
+    """A missing config file raises a UserError that names the directory of the shipped ones."""
     with pytest.raises(UserError, match=r"there is no Zenoh config .*zenoh-configs/"):
         Router(tmp_path / name, {})
 
@@ -364,26 +393,26 @@ def test_missing_file(name: str, tmp_path: Path) -> None:
         ("mode", float("nan")),
     ],
 )
-def test_bad_change(key: str, value: Any) -> None:
-    """A change that the config cannot take is named as the user wrote it, with dots."""
+def test_bad_override(key: str, value: Any) -> None:
+    """An override that the config cannot take raises a UserError that names the key with dots, as the user wrote it."""
     with pytest.raises(UserError, match=key.replace("/", r"\.")) as error:
         Router(CONFIGS / "router-server.json5", {key: value})
-    assert is_a_sentence(error)
+    assert is_one_plain_line(error)
 
 
 def test_port_in_use() -> None:
-    """A router whose port another program has is refused in a sentence that names the port."""
+    """A router whose port is in use raises a UserError that names the endpoint."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(UserError, match=endpoint) as error:
             Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]})
-    assert is_a_sentence(error)
+    assert is_one_plain_line(error)
 
 
 ENCRYPTED = "quic/127.0.0.1:0?mixed_rel=1"
-OPENED = {
+ENDPOINTS = {
     "router-server.json5": [LOCAL, BETWEEN],
     "router-client.json5": [LOCAL],
     "router-cloud.json5": [LOCAL, BETWEEN],
@@ -395,12 +424,12 @@ OPENED = {
     "session.json5": LOCAL,
     "session-unix.json5": "unixsock-stream/{}/zenoh.sock",
 }
-"""Free places for shipped routers to listen at, {} being a directory; for a session, that of its router."""
+"""Free listen endpoints for the shipped routers, or the router's endpoint for a session; {} is a directory."""
 
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys as the shipped configs want them, in a directory `keys`."""
+    """Make the keys that the shipped configs need, in a directory `keys`."""
     pytest.importorskip("cryptography")
     from lavt.cli.keys import keys
 
@@ -413,23 +442,23 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_shipped_configs(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every file of zenoh-configs/ is one that Zenoh opens, the encrypted ones with what `lavt keys` makes."""
-    places = OPENED[name]
-    if isinstance(places, str):
-        place = places.format(tmp_path)
-        with closing(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [place]})) as router:
-            at = local(router) if place == LOCAL else place
-            link("server", Heard(), at, vehicle="shipped", path=CONFIGS / name).close()
+    """Zenoh opens every file of zenoh-configs/, the encrypted ones with the keys that `lavt keys` makes."""
+    endpoints = ENDPOINTS[name]
+    if isinstance(endpoints, str):
+        endpoint = endpoints.format(tmp_path)
+        with closing(Router(CONFIGS / "router-server.json5", {"listen/endpoints": [endpoint]})) as router:
+            connect = local(router) if endpoint == LOCAL else endpoint
+            link("server", Received(), connect, vehicle="shipped", path=CONFIGS / name).close()
         return
     if "-tls" in name:
         monkeypatch.chdir(request.getfixturevalue("keys").parent)
-    with closing(Router(CONFIGS / name, {"listen/endpoints": [each.format(tmp_path) for each in places]})) as router:
-        assert len(router.locators()) >= len(places)
+    with closing(Router(CONFIGS / name, {"listen/endpoints": [each.format(tmp_path) for each in endpoints]})) as router:
+        assert len(router.locators()) >= len(endpoints)
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir()))
-def test_shipped_configs_are_careful(name: str) -> None:
-    """No shipped config looks for others by multicast or gossip, or stamps messages with a clock of its own."""
+def test_shipped_configs_use_no_scouting(name: str) -> None:
+    """Every shipped config disables scouting by multicast and gossip, and Zenoh's timestamps."""
     config = zenoh.Config.from_file(str(CONFIGS / name))
     assert json.loads(config.get_json("scouting/multicast/enabled")) is False
     assert json.loads(config.get_json("scouting/gossip/enabled")) is False
@@ -445,7 +474,7 @@ def test_shipped_configs_are_careful(name: str) -> None:
     ],
 )
 def test_one_side_dials(dialling: str, dialled: str) -> None:
-    """Of two shipped routers with a link only one dials, and both say the same of the link."""
+    """Of two linked shipped routers only one dials, and both use the same parameters of the link."""
     endpoints = {
         (name, way): json.loads(zenoh.Config.from_file(str(CONFIGS / name)).get_json(f"{way}/endpoints"))
         for name in (dialling, dialled)
@@ -460,8 +489,8 @@ def test_one_side_dials(dialling: str, dialled: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.iterdir() if "-tls" in path.name))
-def test_encrypted_configs_are_careful(name: str) -> None:
-    """An encrypted router has sessions by a unix socket only, wants certificates both ways, and limits lengths."""
+def test_encrypted_configs_restrict_access(name: str) -> None:
+    """An encrypted router accepts sessions by a Unix socket only, requires mutual TLS and limits message sizes."""
     config = zenoh.Config.from_file(str(CONFIGS / name))
     listened = json.loads(config.get_json("listen/endpoints"))
     assert {each.partition("/")[0] for each in listened} <= {"unixsock-stream", "quic"}
@@ -479,13 +508,13 @@ def test_encrypted_configs_are_careful(name: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CONFIGS.glob("router-*.json5") if "tls" not in path.name))
 def test_plain_configs_say_so(name: str) -> None:
-    """The first line of a router's config without encryption says that it is for a lab or a VPN."""
+    """The first line of an unencrypted router's config restricts it to a lab or a VPN."""
     assert "plain" in (first := (CONFIGS / name).read_text().partition("\n")[0])
     assert "a lab or a VPN" in first
 
 
 def test_both_dial_a_router_in_the_cloud() -> None:
-    """Where both sides' routers dial one in between, a command reaches the server, and a side's router has one link."""
+    """With a router in the cloud that both sides' routers dial, a command reaches the server over one link per side."""
     with ExitStack() as stack:
 
         def router(name: str, changes: dict[str, Any]) -> Router:
@@ -498,7 +527,7 @@ def test_both_dial_a_router_in_the_cloud() -> None:
         dials = {"listen/endpoints": [LOCAL], "connect/endpoints": [f"udp/127.0.0.1:{port}?rel=1;mixed_rel=1"]}
         sides = [router(name, dials) for name in ("router-server-to-cloud.json5", "router-client.json5")]
         far = stack.enter_context(closing(Pair((local(sides[0]), local(sides[1])), "vehicle-1")))
-        far.server_heard.next(("control", b"far"), lambda: far.client.send(Send("control", b"far")))
+        far.server_received.next(("control", b"far"), lambda: far.client.send(Send("control", b"far")))
         found = far.client.routers()
         assert found is not None
         assert (found.linked, len(set(found.versions))) == (1, 1)

@@ -1,4 +1,4 @@
-"""Real video files of a bar that moves, so that each picture tells its own number."""
+"""Real video files with a moving bar, whose position encodes the picture's number."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BARS = MODEL.width_px // BAR_PX
 
 
 def write_video(path: Path, *, rate_hz: float, pictures: int = BARS, model: CameraModel = MODEL) -> Path:
-    """Write pictures 0, 1, .. with the bar further to the right in each."""
+    """Write pictures 0, 1, ..., with the bar further to the right in each."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate_hz, (model.width_px, model.height_px))
     assert writer.isOpened()
     for number in range(pictures):
@@ -27,5 +27,5 @@ def write_video(path: Path, *, rate_hz: float, pictures: int = BARS, model: Came
 
 
 def number_of(picture: Picture) -> int:
-    """Tell which picture of the file it is."""
+    """Return the picture's number in the file."""
     return int(np.argmax(picture[120, :, 1] > 127)) // BAR_PX

@@ -1,1 +1,1 @@
-"""Objects made of configs: the only floor that sees both."""
+"""The construction of objects from configs; the layers below see no config."""

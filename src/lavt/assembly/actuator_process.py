@@ -1,8 +1,8 @@
-"""The actuator in a process of its own, for vehicles that must not be driven by a server that stands still.
+"""The actuator in a process of its own, which stops the vehicle when the server's process is frozen or killed.
 
-The server's process has pictures to draw, to encode and to send. Whatever it is busy with, and also when it is frozen
-or killed, the actuator's goes on, finds silence, and stops the vehicle. When the actuator's own process is frozen, no
-frame leaves it, and the vehicle's own watchdog brakes.
+The server's process renders, encodes and sends pictures. Whatever happens to it, the actuator's process keeps running,
+detects the command timeout, and stops the vehicle. If the actuator's own process is frozen, it sends no frame, and the
+vehicle's own watchdog brakes.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ from lavt.runtime.remote_node import NodeHost, RemoteNodeProxy
 from lavt.vehicle.dbw.vehicle import DbwVehicle
 
 NAME = "actuator"
-READY_S = 30.0
-REST_S = 10.0
-"""So long a vehicle gets to be stopped and let go of when the server ends."""
-LOOK_S = 0.05
+READY_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 10.0
+"""How long the vehicle may take to stop and disengage when the server ends."""
+POLL_PERIOD_S = 0.05
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""These go to all processes of a terminal or service; the server's process decides, and its end is noticed."""
+"""Signals that all processes of a terminal or service receive; the server's process handles them, and its end is
+detected."""
 
 
 class ActuatorProcess(RemoteNodeProxy):
-    """The actuator's process, as the server's sees it."""
+    """The server's handle of the actuator's process."""
 
     def __init__(self, process: BaseProcess, connection: Connection) -> None:
         super().__init__(NAME, connection)
@@ -43,77 +44,79 @@ class ActuatorProcess(RemoteNodeProxy):
 
     @property
     def pid(self) -> int:
-        """The process' number."""
+        """The process id."""
         return self._process.pid or 0
 
     @property
     def in_force(self) -> tuple[int, int]:
-        """The epoch in force and the sequence of the command last obeyed under it, as last told."""
-        return self.noted or (0, -1)
+        """The epoch in force and the sequence of its last accepted command, as last reported."""
+        return self.status or (0, -1)
 
     def end(self) -> None:
-        """Have the vehicle stopped and let go of, and wait for the end."""
-        self.close(REST_S + 2)
+        """Stop the vehicle, disengage, and wait for the end of the process."""
+        self.close(STOP_TIMEOUT_S + 2)
         self._process.join(1)
-        if self._process.is_alive():  # it does not run: nothing leaves it, and the vehicle brakes by itself
+        if self._process.is_alive():  # it is frozen: it sends no frame, and the vehicle brakes by itself
             self._process.kill()
 
 
 def start_actuator(config: ServerConfig, *, host: str, video_port: int) -> ActuatorProcess:
-    """Start the process; raises what went wrong in it: `UserError` for wrong input."""
+    """Start the process; raise its start-up error, which is a `UserError` for invalid input."""
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    process = context.Process(target=serve_actuator, args=(there, config, host, video_port), name=NAME)
+    own_end, other_end = context.Pipe()
+    process = context.Process(target=serve_actuator, args=(other_end, config, host, video_port), name=NAME)
     process.start()
-    there.close()
+    other_end.close()
     try:
-        said = here.recv() if here.poll(READY_S) else "it did not get ready"
+        error = own_end.recv() if own_end.poll(READY_TIMEOUT_S) else "it did not become ready in time"
     except EOFError:
-        said = "it ended"
-    except BaseException:  # Ctrl-C, while it gets ready
+        error = "it ended"
+    except BaseException:  # such as Ctrl-C during the start
         process.kill()
         raise
-    if said is None:
-        return ActuatorProcess(process, here)
+    if error is None:
+        return ActuatorProcess(process, own_end)
     process.kill()
-    if isinstance(said, UserError):
-        raise said
-    raise WorkError(f"the process of the {NAME} cannot be used: {said}")
+    if isinstance(error, UserError):
+        raise error
+    raise WorkError(f"the process of the {NAME} failed to start: {error}")
 
 
 def serve_actuator(connection: Connection, config: ServerConfig, host: str, video_port: int) -> None:
-    """Be the actuator's process: drive until the server's process ends or says so, then stop the vehicle."""
+    """Run the actuator's process: drive until the server's process ends or requests the end, then stop the vehicle."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
-    process_priority.take(process_priority.OF_THE_CAR)
+    process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     clock = MachineClock()
     try:
         vehicle, start = open_by_wire(config.vehicle, clock), clock.now()
         node = build_actuator(
             config, vehicle, MachineEntropy(), start, host=host, video_port=video_port, route=driven_route(config)
         )
-    except Exception as error:  # whatever it is, the server's process says it
+    except Exception as error:  # the server's process reports any error
         connection.send(error if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
         return
     connection.send(None)
-    parted = threading.Event()
-    here = NodeHost(connection, clock, node, note=lambda: node.gate.in_force, parted=parted.set)
-    here.start()
+    disconnected = threading.Event()
+    host_of_node = NodeHost(
+        connection, clock, node, get_status=lambda: node.gate.in_force, on_disconnect=disconnected.set
+    )
+    host_of_node.start()
     try:
-        while not parted.wait(LOOK_S) and not here.runtime.stopped.is_set():
+        while not disconnected.wait(POLL_PERIOD_S) and not host_of_node.runtime.stopped.is_set():
             pass
-        here.hand("server_ends", None)
-        _wait_for_rest(here, vehicle, clock)
+        host_of_node.deliver("server_ends", None)
+        _wait_until_disengaged(host_of_node, vehicle, clock)
     finally:
-        here.close()
+        host_of_node.close()
         vehicle.close()
 
 
-def _wait_for_rest(here: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
-    """Wait until the vehicle was stopped and is let go of."""
-    end_ns = clock.now().mono_ns + round(REST_S * NS_PER_S)
-    rest = threading.Event()
-    while clock.now().mono_ns < end_ns and not here.runtime.stopped.is_set():
-        rest.wait(LOOK_S)
+def _wait_until_disengaged(host: NodeHost, vehicle: DbwVehicle, clock: Clock) -> None:
+    """Wait until the vehicle has stopped and is disengaged."""
+    end_ns = clock.now().mono_ns + round(STOP_TIMEOUT_S * NS_PER_S)
+    never = threading.Event()
+    while clock.now().mono_ns < end_ns and not host.runtime.stopped.is_set():
+        never.wait(POLL_PERIOD_S)
         if vehicle.is_silent:
             return

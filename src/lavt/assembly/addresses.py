@@ -1,13 +1,13 @@
-"""Addresses as configs write them."""
+"""Parsing of the network addresses in configs."""
 
 from __future__ import annotations
 
 from lavt.errors import UserError
-from lavt.transport.udp_link import look_up
+from lavt.transport.udp_link import resolve_host
 
 
 def parse_address(key: str, text: str) -> tuple[str, int]:
-    """Read `host:port`; raises `UserError` naming `key`."""
+    """Parse `host:port`; raise `UserError` that names `key` for invalid text."""
     host, colon, port = text.rpartition(":")
     if not colon or not host or not (port.isascii() and port.isdigit()) or len(port) > 5 or int(port) > 65535:
         raise UserError(f"{key}: {text!r} is not an address: write it as host:port")
@@ -15,6 +15,6 @@ def parse_address(key: str, text: str) -> tuple[str, int]:
 
 
 def resolved_address(key: str, text: str) -> tuple[str, int]:
-    """Read `host:port` and look the host up; raises `UserError` naming `key`."""
+    """Parse `host:port` and resolve the host; raise `UserError` that names `key` on failure."""
     host, port = parse_address(key, text)
-    return look_up(key, host), port
+    return resolve_host(key, host), port

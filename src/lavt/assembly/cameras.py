@@ -1,4 +1,4 @@
-"""Cameras of configs: what is plugged in, and the geometry of any, as the vehicle has it and as the client knows it."""
+"""The construction of cameras, and of the camera geometry on the vehicle and on the client."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from lavt.vehicle.camera import Camera
 from lavt.vehicle.video_device import VideoDevice
 
 CUSTOM_CAMERAS = "lavt.cameras"
-"""Entry points of this group are functions like `build_device`: a user adds a camera without touching LAVT."""
+"""The group of entry points with which users add cameras: functions like `build_device`."""
 SIMULATED = "simulated"
 
 
 def build_device(config: ServerConfig) -> VideoDevice:
-    """Open the camera that is plugged in; raises `UserError` for one that is not there or gives other pictures."""
+    """Open a camera device; raise `UserError` if it does not exist or delivers pictures of another size or rate."""
     camera = config.camera
     return VideoDevice(
         str(camera.device),
@@ -45,75 +45,90 @@ CAMERAS: dict[str, Callable[[ServerConfig], Camera | None]] = {SIMULATED: lambda
 
 
 def build_camera(config: ServerConfig) -> Camera | None:
-    """Make the configured camera; None: the vehicle's own. Raises `UserError` naming the known sources."""
+    """Build the configured camera; return None for the simulator's own. Raise `UserError` for an unknown source."""
     source = config.camera.source
     if source in CAMERAS:
         return CAMERAS[source](config)
     custom = {entry.name: entry for entry in entry_points(group=CUSTOM_CAMERAS)}
     if source not in custom:
-        raise UserError(f"there is no camera {source!r}: the known sources are {', '.join([*CAMERAS, *custom])}")
+        raise UserError(f"unknown camera source {source!r}: choose one of {', '.join([*CAMERAS, *custom])}")
     build: Callable[[ServerConfig], Camera] = custom[source].load()
     return build(config)
 
 
 def check_own_camera(config: ServerConfig) -> None:
-    """Raise `UserError` where a vehicle that draws its own pictures is given another camera."""
+    """Raise `UserError` if a vehicle that renders its own pictures is configured with another camera."""
     if config.camera.source != SIMULATED:
         raise UserError(
-            f"a vehicle of kind {config.vehicle.kind!r} draws its own pictures, no camera sees its road: leave out "
-            f"camera.source, or choose the vehicle.kind of a real car instead"
+            f"a vehicle of kind {config.vehicle.kind!r} renders its own pictures, which no other camera can take: "
+            "leave out camera.source, or choose the vehicle.kind of a real car"
         )
 
 
 def camera_model(config: CameraConfig) -> CameraModel:
-    """Geometry of the configured camera."""
+    """Return the geometry of the configured camera."""
     return CameraModel(
-        config.width_px, config.height_px, math.radians(config.field_of_view_deg), config.x_m, config.z_m,
-        math.radians(config.pitch_deg), config.y_m, math.radians(config.yaw_deg), math.radians(config.roll_deg),
-    )  # fmt: skip
+        config.width_px,
+        config.height_px,
+        math.radians(config.field_of_view_deg),
+        config.x_m,
+        config.z_m,
+        math.radians(config.pitch_deg),
+        config.y_m,
+        math.radians(config.yaw_deg),
+        math.radians(config.roll_deg),
+    )
 
 
 def calibrated_camera(config: CalibrationConfig) -> CalibratedCamera:
-    """Give the camera of a calibration."""
-    middle_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
+    """Return the camera of a calibration."""
+    centre_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
     if config.field_of_view_deg is None:
         focal_px = (config.fx_px or 0.0, config.fy_px or 0.0)
-        middle_px = (config.cx_px or 0.0, config.cy_px or 0.0)
+        centre_px = (config.cx_px or 0.0, config.cy_px or 0.0)
     else:
         focal_px = (config.width_px / 2 / math.tan(math.radians(config.field_of_view_deg) / 2),) * 2
     return CalibratedCamera(
-        config.width_px, config.height_px, focal_px, middle_px, config.x_m, config.y_m, config.z_m,
-        math.radians(config.yaw_deg), math.radians(config.pitch_deg), math.radians(config.roll_deg),
-        config.distortion, config.lens == "fisheye",
-    )  # fmt: skip
+        config.width_px,
+        config.height_px,
+        focal_px,
+        centre_px,
+        config.x_m,
+        config.y_m,
+        config.z_m,
+        math.radians(config.yaw_deg),
+        math.radians(config.pitch_deg),
+        math.radians(config.roll_deg),
+        config.distortion,
+        config.lens == "fisheye",
+    )
 
 
 def camera_of_file(path: Path) -> CalibratedCamera:
-    """Read a camera from a calibration, or take that of any config that has one; raises `UserError`."""
+    """Read a camera from a calibration or from a config with a camera section; raise `UserError` for other files."""
     data = read_yaml(path)
     if not data.keys() & {*RunConfig.model_fields, *ClientConfig.model_fields}:
         return calibrated_camera(parse_config(CalibrationConfig, data, str(path)))
     section = data.get("camera", {})
     if not isinstance(section, dict):
-        raise UserError(f"{path}: camera must hold keys and values, not {section!r}")
-    vehicles_own = ServerCameraConfig.model_fields.keys() - CameraConfig.model_fields.keys()
-    known = {key: each for key, each in section.items() if key not in vehicles_own}
-    return client_camera(parse_config(ClientCameraConfig, known, f"{path}: camera"))
+        raise UserError(f"{path}: camera must contain keys and values, not {section!r}")
+    server_only = ServerCameraConfig.model_fields.keys() - CameraConfig.model_fields.keys()
+    geometry = {key: each for key, each in section.items() if key not in server_only}
+    return client_camera(parse_config(ClientCameraConfig, geometry, f"{path}: camera"))
 
 
 def client_camera(config: ClientCameraConfig) -> CalibratedCamera:
-    """Give the camera as the client knows it: its calibration where there is one, else what the config says."""
+    """Return the camera of a client's config, from its calibration file if it names one, otherwise from its keys."""
     if not config.calibration:
         return calibrated(camera_model(config))
     path = Path(config.calibration)
-    said = config.model_fields_set - {"calibration", "rate_hz", "width_px", "height_px"}
-    if said:
-        raise UserError(f"camera.calibration says everything: leave out camera.{', camera.'.join(sorted(said))}")
+    redundant = config.model_fields_set - {"calibration", "rate_hz", "width_px", "height_px"}
+    if redundant:
+        keys = ", camera.".join(sorted(redundant))
+        raise UserError(f"camera.calibration replaces the other keys: leave out camera.{keys}")
     camera = calibrated_camera(parse_config(CalibrationConfig, read_yaml(path), str(path)))
     sizes = {"width_px": camera.width_px, "height_px": camera.height_px}
     for key in config.model_fields_set & sizes.keys():
         if getattr(config, key) != sizes[key]:
-            raise UserError(
-                f"camera.{key} is {getattr(config, key)}, but {path} was made for {sizes[key]}: use its size"
-            )
+            raise UserError(f"camera.{key} is {getattr(config, key)}, but {path} is for {sizes[key]}: use that size")
     return camera

@@ -1,4 +1,4 @@
-"""From the config's `clock` to what is asked, once a second, how far this machine's clock is off."""
+"""The construction of the time source that is queried once a second for the error of this machine's clock."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ MS_PER_S = 1000.0
 
 
 def interpreter(config: ClockConfig) -> PersistentProcess:
-    """Give what runs the commands of the source that the config names; to be closed."""
+    """Return the process that runs the commands of the configured time source; the caller closes it."""
     return Chronyc() if config.source == "chrony" else Shell()
 
 
 def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], ClockReport | None]:
-    """Give the function that asks the source which the config names; it gives None where no answer came in time.
+    """Return a function that queries the configured time source and returns None on timeout.
 
-    `run` is that of the source's `interpreter`.
+    `run` is the method of the source's `interpreter`.
     """
 
     def external() -> ClockReport:
@@ -30,15 +30,15 @@ def clock_source(config: ClockConfig, clock: Clock, run: Run) -> Callable[[], Cl
         correction_s, bound_s = (config.correction_ms or 0.0) / MS_PER_S, (config.bound_ms or 0.0) / MS_PER_S
         return ClockReport(
             now.mono_ns, now.wall_ns, kernel_identity(), "external", correction_s, bound_s, addresses=host_addresses()
-        )  # fmt: skip
+        )
 
-    def left_to_the_probe() -> ClockReport:
+    def probe_only() -> ClockReport:
         return unknown_clock(clock.now(), kernel_identity(), "probe", "left to the probe by clock.source")
 
     sources: dict[str, Callable[[], ClockReport | None]] = {
         "chrony": lambda: read_chrony(clock, run),
         "ptp": lambda: read_ptp(clock, run),
         "external": external,
-        "probe": left_to_the_probe,
+        "probe": probe_only,
     }
     return sources[config.source]

@@ -1,4 +1,4 @@
-"""By-wire buses for whoever looks at them: which one a config names, and what a profile expects on it."""
+"""The bus that a config or profile names, and the messages that are expected on it, for `lavt can monitor`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavt.vehicle.dbw.traffic import ExpectedMessages
 
 
 def find_dbw(target: str) -> DbwConfig:
-    """Give the section `vehicle.dbw` of a server's config, or one with a profile that is named.
+    """Return the section `vehicle.dbw` of a server's config, or a default section with the named profile.
 
     Raises `UserError` for a config whose vehicle is not by wire.
     """
@@ -20,17 +20,20 @@ def find_dbw(target: str) -> DbwConfig:
     if path.suffix not in {".yaml", ".yml"}:
         return DbwConfig(profile=target)
     data = read_yaml(path)
-    if "kit" in data:  # a profile's
+    if "kit" in data:  # the file is a profile
         return DbwConfig(profile=target)
     vehicle = data.get("vehicle")
     section = vehicle.get("dbw") if isinstance(vehicle, dict) and vehicle.get("kind") == "dbw" else None
     if not isinstance(section, dict):
-        raise UserError(f"{path} has no vehicle of kind dbw with a section dbw: name a config that has, or a profile")
+        raise UserError(f"{path} has no vehicle of kind dbw with a section dbw: name one that has, or a profile")
     return parse_config(DbwConfig, section, f"{path}: vehicle.dbw")
 
 
 def expected_traffic(profile: Profile) -> ExpectedMessages:
-    """What a profile says of the messages on its bus; checksums and counters of other messages have the same names."""
+    """Return the messages that a profile expects on its bus.
+
+    Checksums and counters are selected by signal name, and so include those of messages that the profile does not use.
+    """
     axes = profile.axes.values()
     checksums = {part.checksum for part in axes} | {part.checksum for part in profile.reports.values()}
     return ExpectedMessages(

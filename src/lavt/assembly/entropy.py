@@ -1,4 +1,4 @@
-"""Where epochs, tokens, stream identifiers and the seeds of runs come from."""
+"""The sources of random epochs, tokens and stream identifiers, and the seeds of runs."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from lavt.streams import stream, stream_key
 
 
 class Entropy(Protocol):
-    """Where epochs, tokens and stream identifiers come from."""
+    """A source of random epochs, tokens and stream identifiers."""
 
     def number(self, bits: int) -> int:
-        """Give a number of so many random bits."""
+        """Return a random number of `bits` bits."""
         ...
 
     def token(self, length: int) -> bytes:
-        """Give so many random bytes."""
+        """Return `length` random bytes."""
         ...
 
 
 class MachineEntropy:
-    """The operating system's randomness."""
+    """The operating system's source of randomness."""
 
     def number(self, bits: int) -> int:
-        """Give a number of so many random bits."""
+        """Return a random number of `bits` bits."""
         return secrets.randbits(bits)
 
     def token(self, length: int) -> bytes:
-        """Give so many random bytes."""
+        """Return `length` random bytes."""
         return secrets.token_bytes(length)
 
 
 class SeededEntropy:
-    """Numbers that repeat with the seed: for virtual time, where nobody is kept out."""
+    """A reproducible source of numbers for virtual time, where no attacker has to be kept out."""
 
     def __init__(self, seed: int, name: str) -> None:
         self._generator = stream(seed, f"{name} entropy")
 
     def number(self, bits: int) -> int:
-        """Give a number of so many random bits."""
+        """Return a random number of `bits` bits."""
         return int.from_bytes(self.token(bits // 8), "little")
 
     def token(self, length: int) -> bytes:
-        """Give so many random bytes."""
+        """Return `length` random bytes."""
         return self._generator.bytes(length)
 
 
 def run_seed(seed: int, route: str, repetition: int) -> int:
-    """Seed of one repetition on a route: the same under every condition, so that conditions are paired.
+    """Return the seed of one repetition on a route, which is equal under all conditions, so that runs are paired.
 
-    53 bits, because that is as far as JSON's readers agree on numbers.
+    The seed has 53 bits, the largest integer size that all JSON readers support.
     """
     return stream_key(seed, f"run {route} {repetition}") & (2**53 - 1)

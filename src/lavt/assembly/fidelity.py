@@ -1,4 +1,4 @@
-"""What stands for pictures in a run: video, pixels, or the geometry of the lane alone."""
+"""The fidelities of a run's pictures: coded video, rendered pixels, or the geometry of the lane alone."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lavt.assembly.cameras import client_camera
-from lavt.assembly.vehicles import VehicleSetup, build_plant, build_unpictured
+from lavt.assembly.vehicles import VehicleSetup, build_geometry_setup, build_vehicle_setup
 from lavt.config import ClientConfig, ServerConfig
 from lavt.nodes.driver import LaneDetection
 from lavt.perception.lane_detector import LaneDetector
@@ -25,9 +25,9 @@ from lavt.transport.video.h264 import Decoder, Encoder
 
 @dataclass(frozen=True, slots=True)
 class FidelityModel:
-    """How the pictures of a run come about and cross the network: what is made for it on both sides."""
+    """The functions that build both sides of the picture path for one fidelity."""
 
-    plant: Callable[[ServerConfig], VehicleSetup]
+    vehicle_setup: Callable[[ServerConfig], VehicleSetup]
     sender: Callable[[ServerConfig], PictureSender]
     receiver: Callable[[ClientConfig], PictureReceiver]
     detector: Callable[[ClientConfig], LaneDetection]
@@ -58,16 +58,16 @@ def _lane_detector(config: ClientConfig) -> LaneDetector:
     return LaneDetector(client_camera(config.camera))
 
 
-VIDEO = FidelityModel(build_plant, _video_sender, _video_receiver, _lane_detector)
+VIDEO = FidelityModel(build_vehicle_setup, _video_sender, _video_receiver, _lane_detector)
 
 
 def _pixels() -> FidelityModel:
-    between = InMemoryFrameCodec()
-    return FidelityModel(build_plant, lambda _: between, lambda _: between, _lane_detector)
+    codec = InMemoryFrameCodec()
+    return FidelityModel(build_vehicle_setup, lambda _: codec, lambda _: codec, _lane_detector)
 
 
 def _geometry() -> FidelityModel:
-    return FidelityModel(build_unpictured, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
+    return FidelityModel(build_geometry_setup, lambda _: LaneSender(), lambda _: LaneReceiver(), lambda _: GivenLane())
 
 
 FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
@@ -75,4 +75,4 @@ FIDELITIES: dict[str, Callable[[], FidelityModel]] = {
     "pixels": _pixels,
     "geometry": _geometry,
 }
-"""By the config's `fidelity`: what to make for one run, whose two sides may share something."""
+"""The models by the config's `fidelity`; each run has its own model, whose sides may share a codec."""

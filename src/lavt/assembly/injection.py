@@ -1,4 +1,4 @@
-"""From a condition to the flows that netem holds, by the role of the machine, and to the nodes that ask for them."""
+"""The conversion of a condition to netem flows, by the role of the machine, and the nodes that request them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SENT_BY: Final[dict[Role, tuple[str, ...]]] = {
     "client": ("control",),
     "both": ("video", "control", "state"),
 }
-"""Which flows leave a machine; both roles are on one machine, and its loopback, in a run on one machine."""
+"""The flows that a machine of each role sends; with role both, server and client share the machine and its loopback."""
 
 
 def netem_flows(
@@ -35,10 +35,10 @@ def netem_flows(
     protocol: Protocol = "udp",
     state_delay: StateDelay = "none",
 ) -> list[ImpairedFlow]:
-    """Give the flows that a machine of this role has to hold under a condition.
+    """Return the flows that a machine of this role impairs under a condition.
 
-    `control_port` is that of the server's router, to which the client's dials by `protocol`. A flow that nothing is to
-    happen to is among them, so that another condition can follow without a packet being lost.
+    `control_port` is the port of the server's router, to which the client's router connects by `protocol`. Flows
+    without an impairment are included, so that another condition can be applied later without packet loss.
     """
     flows = [
         ImpairedFlow("video", "udp", video_port, "source", law(requested.video_ms, requested.video)),
@@ -50,7 +50,7 @@ def netem_flows(
 
 
 def law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
-    """Give the law by which netem does it to one flow; raises `UserError` for what no law of netem's says."""
+    """Return the netem impairment of one flow; raise `UserError` for an impairment that netem does not support."""
     if impairment.trace:
         raise UserError(
             f"netem cannot replay the trace {impairment.trace!r}: choose network.injection relay or time virtual, or a "
@@ -58,20 +58,20 @@ def law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
         )
     if impairment.queue_packets != QUEUE_PACKETS:
         raise UserError(
-            f"netem has room for {QUEUE_PACKETS} packets, not for queue_packets {impairment.queue_packets}: choose "
+            f"netem's queue has {QUEUE_PACKETS} packets, not queue_packets {impairment.queue_packets}: choose "
             "network.injection relay or time virtual, or leave queue_packets out"
         )
     return plain_law(delay_ms, impairment)
 
 
 def plain_law(delay_ms: float, impairment: ImpairmentConfig) -> Impairment:
-    """Give the law of one flow, which says nothing of a trace and of the queue."""
-    said = {each.name for each in fields(Impairment)}
-    return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=said - {"delay_ms"}))
+    """Return the impairment of one flow without its trace and queue."""
+    names = {each.name for each in fields(Impairment)}
+    return Impairment(delay_ms=delay_ms, **impairment.model_dump(include=names - {"delay_ms"}))
 
 
 def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port: int) -> InjectionNode:
-    """Make the server's node."""
+    """Build the server's injection node."""
     return InjectionNode(
         allowed=config.remote,
         simulated=simulated,
@@ -81,15 +81,15 @@ def injection_node(config: ServerInjectionConfig, *, simulated: bool, video_port
 
 
 def injection_client(config: ClientInjectionConfig, who: str, instance: int, start_ns: int) -> InjectionClient:
-    """Make the client's node; raises `UserError` for a condition that does not exist."""
+    """Build the client's injection node; raise `UserError` for a condition that is unknown or cannot be requested."""
     requested = condition(config.condition) if config.condition else NO_CONDITION
     [control] = netem_flows(
         requested, "client", video_port=0, control_port=config.control_port, protocol=config.control_protocol
     )
-    if not (config.interface or control.law.is_nothing):
+    if not (config.interface or control.impairment.is_transparent):
         raise UserError(
-            f"condition {config.condition} delays the control, which this machine must do: name the interface towards "
-            "the vehicle in injection.interface"
+            f"condition {config.condition} delays control, which this machine sends: set injection.interface to the "
+            "interface towards the vehicle"
         )
     client = InjectionClient(
         who,
@@ -103,5 +103,5 @@ def injection_client(config: ClientInjectionConfig, who: str, instance: int, sta
     try:
         decode(NetemRequest, client.request)
     except BadMessage as error:
-        raise UserError(f"condition {config.condition} cannot be asked of a server: {error}") from error
+        raise UserError(f"condition {config.condition} cannot be requested from a server: {error}") from error
     return client

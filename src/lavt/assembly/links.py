@@ -1,4 +1,4 @@
-"""From what a condition says of a flow to the link that does it, with its trace."""
+"""The construction of emulated links, and the reading of their traces."""
 
 from __future__ import annotations
 
@@ -10,53 +10,53 @@ from lavt.assembly.injection import plain_law
 from lavt.config import Condition, ImpairmentConfig
 from lavt.config_file import shipped
 from lavt.errors import UserError
-from lavt.transport.emulation.link import LinkInjection, check_injected
+from lavt.transport.emulation.link import LinkInjection, check_injection
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 TRACES: Final = "netem/traces"
-LONGEST_TRACE_BYTES: Final = 50_000_000
+MAX_TRACE_BYTES: Final = 50_000_000
 
 
 def injected(name: str, delay_ms: float, impairment: ImpairmentConfig, seed: int) -> LinkInjection | None:
-    """Give what is injected into the flow `name`; None where that is at most a constant delay.
+    """Return the injection into the flow `name`; None if it is a constant delay or nothing.
 
-    Raises `UserError` for what contradicts itself, and for a trace that is missing or wrong.
+    Raises `UserError` for contradictory values and for a missing or invalid trace.
     """
     if impairment == ImpairmentConfig():
         return None
     trace = read_trace(impairment.trace) if impairment.trace else None
     requested = LinkInjection(plain_law(delay_ms, impairment), seed, name, trace, impairment.queue_packets)
-    check_injected(requested)
+    check_injection(requested)
     return requested
 
 
 def trace_path(name: str) -> Path:
-    """Find a trace that comes with LAVT by its name, or a file; raises `UserError` where there is neither."""
+    """Return the path of a shipped trace or of a file; raise `UserError` if neither exists."""
     known = sorted(path.name for path in shipped(TRACES).iterdir() if path.suffix != ".py")
     if name in known:
         return shipped(TRACES) / name
     path = Path(name)
     try:
         exists = path.is_file()
-    except OSError:  # a name that is too long, or in a directory that is not ours to look into
+    except OSError:  # the name is too long, or its directory is not accessible
         exists = False
     if not exists:
-        raise UserError(f"there is no trace {name!r}: name one of {', '.join(known)}, or an existing file")
+        raise UserError(f"unknown trace {name!r}: name one of {', '.join(known)}, or an existing file")
     return path
 
 
 def trace_digests(requested: Condition) -> dict[str, str]:
-    """Give the SHA-256 of each trace that a condition names, by name: a file can be changed after a run."""
+    """Return the SHA-256 of each trace of a condition by name, because a file can be changed after a run."""
     names = [flow.trace for flow in (requested.video, requested.control) if flow.trace]
     return {name: sha256(trace_path(name).read_bytes()).hexdigest() for name in names}
 
 
 def read_trace(name: str) -> Trace:
-    """Read a trace: a delay over time where the name ends in .csv, else a capacity in Mahimahi's format."""
+    """Read a trace: a delay over time if the name ends with .csv, otherwise a capacity in Mahimahi's format."""
     path = trace_path(name)
     try:
-        if path.stat().st_size > LONGEST_TRACE_BYTES:
-            raise UserError(f"the trace {path} is larger than {LONGEST_TRACE_BYTES} bytes: cut it")
+        if path.stat().st_size > MAX_TRACE_BYTES:
+            raise UserError(f"the trace {path} is larger than {MAX_TRACE_BYTES} bytes: shorten it")
         text = path.read_text()
     except OSError as error:
         raise UserError(f"the trace {path} cannot be read ({error.strerror}): name another file") from error

@@ -1,4 +1,4 @@
-"""The one place where nodes are made of configs; nothing below it asks whether time is real."""
+"""The construction of all nodes from configs; the nodes do not know whether time is real or virtual."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavt.assembly.entropy import Entropy
 from lavt.assembly.fidelity import VIDEO, FidelityModel
 from lavt.assembly.injection import injection_client, injection_node
 from lavt.assembly.security import cipher_of
-from lavt.assembly.vehicles import check_vehicle, looks_of
+from lavt.assembly.vehicles import check_vehicle, physics_sample_times
 from lavt.config import ClientConfig, ControllerConfig, SafetyConfig, ServerConfig, VehicleConfig
 from lavt.control.drive_controller import DriveController, find_preset, make_controller
 from lavt.control.driver_limits import CLIENT_LIMITS
@@ -41,7 +41,7 @@ from lavt.vehicle.vehicle import Vehicle
 
 @dataclass(frozen=True, slots=True)
 class ServerNodes:
-    """The server's nodes; the actuator is None where it is in a process of its own."""
+    """The server's nodes; the actuator is None if it runs in a process of its own."""
 
     camera: CameraNode
     actuator: ActuatorNode | None
@@ -70,20 +70,20 @@ class ClientNodes:
         return (self.receiver, self.driver, self.clock_sync, self.injection)
 
 
-@lru_cache(maxsize=64)  # a sweep asks for each of its runs
+@lru_cache(maxsize=64)  # a sweep checks each of its runs
 def check_names(vehicle: VehicleConfig, controller: ControllerConfig) -> None:
-    """Raise `UserError` for a vehicle, route, controller or preset that does not exist, before any work is begun."""
+    """Raise `UserError` for an unknown vehicle, route, controller or preset, before any work starts."""
     check_vehicle(vehicle)
     build_controller(controller)
 
 
 def build_controller(config: ControllerConfig) -> DriveController:
-    """Make the configured controller; raises `UserError` naming the known ones and the known presets."""
+    """Build the configured controller; raise `UserError` with the known names for an unknown controller or preset."""
     return make_controller(config.kind, replace(find_preset(config.preset), **config.changes), config.wheelbase_m)
 
 
 def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
-    """Take the configured limits; only a simulated vehicle may have wider ones than the default."""
+    """Return the configured limits; raise `UserError` if a vehicle that is not simulated exceeds the defaults."""
     limits = replace(
         LIMITS,
         lateral_acceleration_mps2=config.lateral_acceleration_mps2,
@@ -99,7 +99,8 @@ def limits_of(config: SafetyConfig, *, simulated: bool) -> Limits:
         raise UserError(
             f"only a simulated vehicle may have safety limits beyond {LIMITS.lateral_acceleration_mps2} m/s2, "
             f"{LIMITS.picture_age_limit_ns // NS_PER_MS} ms and {LIMITS.stopping_distance_limit_m:.0f} m: lower "
-            "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and safety.sight_m"
+            "safety.lateral_acceleration_mps2, safety.picture_age_limit_ms and "
+            "safety.stopping_distance_limit_m"
         )
     return limits
 
@@ -112,25 +113,32 @@ def build_server(
     host: str,
     video_port: int,
     fidelity: FidelityModel = VIDEO,
-    lives_on_demand: bool = False,
+    lazy_physics: bool = False,
 ) -> ServerNodes:
-    """Make the server's nodes; their time begins when everything that is slow has been prepared.
+    """Build the server's nodes; their time starts after all slow preparations.
 
-    With `lives_on_demand` a vehicle that catches up lives on only when somebody looks: where no wake is ever late, in
-    virtual time.
+    With `lazy_physics`, a vehicle that catches up advances only when its state is read. This is for virtual time, where
+    no wake-up is late.
     """
-    plant = fidelity.plant(config)
+    setup = fidelity.vehicle_setup(config)
     pictures = fidelity.sender(config)
     start = now()
-    looks = looks_of(plant.camera, start.mono_ns) if lives_on_demand and plant.catches_up else ()
+    sample_times = physics_sample_times(setup.camera, start.mono_ns) if lazy_physics and setup.catches_up else ()
     actuator = None
-    if plant.start is not None:
+    if setup.start is not None:
         actuator = build_actuator(
-            config, plant.start(start), entropy, start, host=host, video_port=video_port, route=plant.route, looks=looks
+            config,
+            setup.start(start),
+            entropy,
+            start,
+            host=host,
+            video_port=video_port,
+            route=setup.route,
+            sample_times=sample_times,
         )
     return ServerNodes(
         CameraNode(
-            plant.camera,
+            setup.camera,
             pictures,
             StreamSender(
                 Packetizer(entropy.number(32), entropy.number(16)),
@@ -143,7 +151,7 @@ def build_server(
         ),
         actuator,
         ClockSyncNode(start.mono_ns),
-        injection_node(config.injection, simulated=plant.simulated, video_port=video_port),
+        injection_node(config.injection, simulated=setup.simulated, video_port=video_port),
     )
 
 
@@ -156,16 +164,16 @@ def build_actuator(
     host: str,
     video_port: int,
     route: Route | None,
-    looks: Sequence[FrameTimes] = (),
+    sample_times: Sequence[FrameTimes] = (),
 ) -> ActuatorNode:
-    """Make the node that drives a vehicle; `looks` are the times for which it lives on, all where there are none."""
-    able = vehicle.capabilities
-    limits = limits_of(config.safety, simulated=able.simulated)
+    """Build the actuator of a vehicle, whose physics advances at `sample_times` only, or at every step if empty."""
+    capabilities = vehicle.capabilities
+    limits = limits_of(config.safety, simulated=capabilities.simulated)
     limiter = Limiter(
         limits,
-        wheelbase_m=able.wheelbase_m,
-        max_steering_rad=able.max_steering_rad,
-        max_braking_mps2=able.max_braking_mps2,
+        wheelbase_m=capabilities.wheelbase_m,
+        max_steering_rad=capabilities.max_steering_rad,
+        max_braking_mps2=capabilities.max_braking_mps2,
     )
     gate = SafetyGate(
         limits,
@@ -181,7 +189,7 @@ def build_actuator(
         gate,
         start_ns=start.mono_ns,
         route=route,
-        looks=looks,
+        sample_times=sample_times,
         after_collision=config.vehicle.after_collision,
     )
 
@@ -189,7 +197,7 @@ def build_actuator(
 def build_client(
     config: ClientConfig, now: Callable[[], Now], entropy: Entropy, *, fidelity: FidelityModel = VIDEO
 ) -> ClientNodes:
-    """Make the client's nodes."""
+    """Build the client's nodes."""
     controller = config.controller
     pictures, detector = fidelity.receiver(config), fidelity.detector(config)
     hold_ms = config.video.reorder_hold_ms

@@ -1,4 +1,4 @@
-"""From configs to the two ends of a rendezvous: the vehicle's sockets, and the forwarder's."""
+"""The construction of a side's sockets, with or without a rendezvous, and of the rendezvous itself."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from lavt.clock import Clock
 from lavt.config import ClientConfig, RendezvousConfig, ServerConfig
 from lavt.errors import UserError
 from lavt.transport.messages import NAME
-from lavt.transport.rendezvous.forwarder import Address, FlowName, Forwarder, write_registration
+from lavt.transport.rendezvous.forwarder import Address, FlowName, Forwarder, encode_registration
 from lavt.transport.rendezvous.link import RendezvousLink, RendezvousPort
 from lavt.transport.security.keys import load_private, load_public
-from lavt.transport.udp_link import Deliver, UdpLink, look_up
+from lavt.transport.udp_link import Deliver, UdpLink, resolve_host
 
 
 def open_flow(
@@ -24,27 +24,31 @@ def open_flow(
     bind: Address,
     remote: Address | None,
 ) -> UdpLink | RendezvousLink:
-    """Open a side's socket for a flow; that of a server which has a rendezvous also talks through it.
+    """Open a side's socket for a flow; a server with a rendezvous also communicates through the rendezvous.
 
-    Raises `UserError` for a port that cannot be opened, and for a host that is not known or a key that cannot be read.
+    Raises `UserError` for a port that cannot be opened, an unknown host, and a key that cannot be read.
     """
     if not isinstance(config, ServerConfig) or not config.rendezvous.host:
         return UdpLink(clock, channel, deliver, bind=bind, remote=remote, name=flow)
-    there = config.rendezvous
+    rendezvous = config.rendezvous
     key = load_private(Path(config.security.key)) if config.security.key else None
-    host = look_up("rendezvous.host", there.host)
+    host = resolve_host("rendezvous.host", rendezvous.host)
     return RendezvousLink(
-        clock, channel, deliver, bind=bind, name=flow,
-        rendezvous=(host, {"video": there.video_port, "probe": there.probe_port}[flow]),
-        registration=lambda wall_ns: write_registration(config.vehicle_id, flow, wall_ns, key),
-    )  # fmt: skip
+        clock,
+        channel,
+        deliver,
+        bind=bind,
+        name=flow,
+        rendezvous=(host, {"video": rendezvous.video_port, "probe": rendezvous.probe_port}[flow]),
+        registration=lambda wall_ns: encode_registration(config.vehicle_id, flow, wall_ns, key),
+    )
 
 
 def open_rendezvous(config: RendezvousConfig, clock: Clock) -> dict[FlowName, RendezvousPort]:
-    """Open the ports of both flows; raises `UserError` for one that cannot be opened, a name or key that is none."""
+    """Open the ports of both flows; raise `UserError` for a port in use, an invalid name, and an unreadable key."""
     vehicle = config.vehicle_id
     if not NAME.match(vehicle):
-        raise UserError(f"the vehicle {vehicle!r} has no name that can be: up to 32 of A-Z, a-z, 0-9, - and _")
+        raise UserError(f"the vehicle {vehicle!r} has an invalid name: use up to 32 of A-Z, a-z, 0-9, - and _")
     key = load_public(Path(config.vehicle_key)) if config.vehicle_key else None
     ports: dict[FlowName, int] = {"video": config.video_port, "probe": config.probe_port}
     opened: dict[FlowName, RendezvousPort] = {}

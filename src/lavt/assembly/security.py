@@ -1,4 +1,4 @@
-"""From the keys that a config names to the ends of what is signed."""
+"""The construction of gateways, authenticators and ciphers from the keys in configs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 
 from lavt.config import ClientConfig, ServerConfig
 from lavt.transport.rtp.srtp import check_srtp
-from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
 from lavt.transport.security.gateway import Carry, ClientGateway, Deliver, OpenClientGateway, ServerGateway
 from lavt.transport.security.keys import load_private, load_public
 from lavt.transport.video.cipher import End, NewCipher, SrtpCipher, plain_cipher
 
 
 def cipher_of(config: ServerConfig | ClientConfig) -> NewCipher:
-    """Say what happens to the video: where messages are signed it is encrypted."""
+    """Return the cipher of the video, which is encrypted if the config has a key."""
     if not config.security.key:
         return plain_cipher
     check_srtp()
@@ -28,24 +28,24 @@ def gateway_of(
     carry: Carry,
     in_force: Callable[[], tuple[int, int]] = lambda: (0, -1),
 ) -> ServerGateway | ClientGateway | OpenClientGateway:
-    """Make a side's door; raises `UserError` for a key that cannot be read. Only the server asks what is `in_force`."""
+    """Build a side's gateway; raise `UserError` for an unreadable key. Only the server's gateway calls `in_force`."""
     if isinstance(config, ServerConfig):
         return ServerGateway(deliver, carry, in_force, vehicle_authenticator(config))
     authenticator = operator_authenticator(config)
     return OpenClientGateway(deliver, carry) if authenticator is None else ClientGateway(deliver, carry, authenticator)
 
 
-def vehicle_authenticator(config: ServerConfig) -> NoVehicleAuthenticator:
-    """Make the vehicle's end; raises `UserError` for a key that cannot be read."""
+def vehicle_authenticator(config: ServerConfig) -> NullVehicleAuthenticator:
+    """Build the vehicle's authenticator; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:
-        return NoVehicleAuthenticator()
+        return NullVehicleAuthenticator()
     operators = {name: load_public(Path(file)) for name, file in security.operators.items()}
     return VehicleAuthenticator(config.vehicle_id, load_private(Path(security.key)), operators)
 
 
 def operator_authenticator(config: ClientConfig) -> OperatorAuthenticator | None:
-    """Make the operator's end; raises `UserError` for a key that cannot be read. None where nothing is signed."""
+    """Build the operator's authenticator, None without a key; raise `UserError` for an unreadable key."""
     security = config.security
     if not security.key:
         return None

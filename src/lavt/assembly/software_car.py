@@ -1,4 +1,4 @@
-"""Software cars of configs: the kit that a profile is for, and the built-in simulator."""
+"""The construction of software cars: a by-wire kit and the built-in simulator."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from lavt.vehicle.software_car.kit import Kit
 from lavt.vehicle.software_car.mechanics import Mechanics
 
 GENERATIONS: Final[dict[str, Literal[1, 2]]] = {"dataspeed_1": 1, "dataspeed_2": 2}
-"""By a profile's `kit`."""
+"""The kit's generation by a profile's `kit`."""
 
 
 def build_software_car(config: ServerConfig, profile: Profile, road: Road, start_ns: int) -> SoftwareCar:
-    """Make the car with the kit that a profile is for; nothing else of the profile is told to it.
+    """Build a car with the kind of kit that a profile is for; the car uses nothing else of the profile.
 
-    What the kit makes of a command comes from the facts: a profile that is wrong must show as a car that does not obey.
+    The kit interprets commands as documented, so that an error in a profile shows as a car that does not respond.
     """
     simulator = simulator_of(config, road, start_ns)
     kit = Kit(

@@ -1,4 +1,4 @@
-"""Vehicles of configs, each with its camera and, where one is known, the road it drives."""
+"""The construction of vehicles with their cameras and, if known, their roads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.vehicle import Vehicle
 
 CUSTOM_VEHICLES = "lavt.vehicles"
-"""Entry points of this group are functions like `build_simulator`: a user adds a vehicle without touching LAVT."""
+"""The group of entry points with which users add vehicles: functions like `build_simulator`."""
 
 
 ROUTE_STEP_M = 1.0
@@ -32,48 +32,45 @@ ROUTE_STEP_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class VehicleSetup:
-    """A vehicle with its camera, and the road it drives where one is known.
-
-    `start` begins its time: building takes seconds, and a vehicle's time must not run before the loop does. None: the
-    vehicle is in the actuator's own process (`actuator_process.py`).
-    """
+    """A vehicle with its camera and, if known, its road."""
 
     camera: Camera
     start: Callable[[Now], Vehicle] | None
+    """Builds the vehicle when the loop starts, because the preparations take seconds; None: the vehicle is in the
+    actuator's own process (`actuator_process.py`)."""
     route: Route | None
     simulated: bool = False
     catches_up: bool = False
-    """The vehicle loses nothing when `advance` is called later than it asked for."""
+    """Whether `advance` may be called late without loss of accuracy."""
 
 
 def build_simulator(config: ServerConfig) -> VehicleSetup:
-    """Make the built-in simulator and its camera."""
+    """Build the built-in simulator and its camera."""
     check_own_camera(config)
     road = load_road(config.vehicle.route)
-    return _simulated(config, road, _sim_camera(config, road))
+    return _build_simulated(config, road, _build_sim_camera(config, road))
 
 
 def build_dbw(config: ServerConfig) -> VehicleSetup:
-    """Make a by-wire vehicle and its camera: the simulator's, where a software car tells where it is."""
+    """Build a by-wire vehicle and its camera, which is the simulator's for a software car that sends ground truth."""
     check_vehicle(config.vehicle)
-    requested = config.vehicle.dbw
-    if requested.is_inside:
+    dbw = config.vehicle.dbw
+    if dbw.is_inside:
         return build_simulator(config)
-    if requested.truth:
+    if dbw.truth:
         check_own_camera(config)
-        return VehicleSetup(
-            _sim_camera(config, load_road(config.vehicle.route)), None, None, simulated=is_simulated(requested)
-        )
-    camera = build_camera(config)
-    if camera is None:
+        camera = _build_sim_camera(config, load_road(config.vehicle.route))
+        return VehicleSetup(camera, None, None, simulated=is_simulated(dbw))
+    device = build_camera(config)
+    if device is None:
         raise UserError(
-            "a real car needs a real camera: set camera.source device and camera.device; or vehicle.dbw.truth where "
-            "`lavt software-car` drives"
+            "a real car needs a real camera: set camera.source device and camera.device, or set vehicle.dbw.truth for "
+            "`lavt software-car`"
         )
-    return VehicleSetup(camera, None, None)
+    return VehicleSetup(device, None, None)
 
 
-def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
+def _build_sim_camera(config: ServerConfig, road: Road) -> SimCamera:
     camera = SimCamera(
         model=camera_model(config.camera),
         rate_hz=config.camera.rate_hz,
@@ -89,13 +86,13 @@ def _sim_camera(config: ServerConfig, road: Road) -> SimCamera:
     return camera
 
 
-def build_unpictured(config: ServerConfig) -> VehicleSetup:
-    """Make the built-in simulator with a camera that gives the lane itself; other vehicles' roads are not known."""
+def build_geometry_setup(config: ServerConfig) -> VehicleSetup:
+    """Build the built-in simulator with a camera that returns the lane; raise `UserError` for other vehicles."""
     kind = config.vehicle.kind
     if kind != "simulator" and not (kind == "dbw" and config.vehicle.dbw.is_inside):
         raise UserError(
-            f"fidelity geometry needs the road, which only the built-in simulator tells: choose vehicle.kind simulator "
-            f"instead of {kind!r}, or another fidelity"
+            f"fidelity geometry needs the road, which is known for the built-in simulator only: choose vehicle.kind "
+            f"simulator instead of {kind!r}, or another fidelity"
         )
     road = load_road(config.vehicle.route)
     camera = LaneCamera(
@@ -109,26 +106,26 @@ def build_unpictured(config: ServerConfig) -> VehicleSetup:
         exposure_ns=round(config.camera.exposure_ms * NS_PER_MS),
         sensor_delay_ns=round(config.camera.sensor_delay_ms * NS_PER_MS),
     )
-    return _simulated(config, road, camera)
+    return _build_simulated(config, road, camera)
 
 
 def camera_phase_ns(config: ServerConfig) -> int:
-    """Draw when the camera's first frame is taken after the start: anywhere within its period."""
+    """Return the random time of the camera's first frame after the start, within one frame period."""
     return int(stream(config.seed, "camera phase").integers(round(NS_PER_S / config.camera.rate_hz)))
 
 
 def driven_route(config: ServerConfig) -> Route | None:
-    """Give the road that a software car on a bus drives; None for a real car."""
+    """Return the road of a software car on a bus; None for a real car."""
     return route_of(config.vehicle.route, load_road(config.vehicle.route)) if config.vehicle.dbw.truth else None
 
 
 def route_of(name: str, road: Road) -> Route:
-    """Give the middle of a road's lane for the record."""
+    """Return the centre line of a road's lane for the record."""
     x_m, y_m, _, _ = road.point(np.arange(0.0, road.length_m, ROUTE_STEP_M))
     return Route(name, road.length_m, tuple(zip(x_m.tolist(), y_m.tolist(), strict=True)))
 
 
-def _simulated(config: ServerConfig, road: Road, camera: Camera) -> VehicleSetup:
+def _build_simulated(config: ServerConfig, road: Road, camera: Camera) -> VehicleSetup:
     route = route_of(config.vehicle.route, road)
     if config.vehicle.kind == "dbw":
 
@@ -144,24 +141,24 @@ def _simulated(config: ServerConfig, road: Road, camera: Camera) -> VehicleSetup
 VEHICLES: dict[str, Callable[[ServerConfig], VehicleSetup]] = {"simulator": build_simulator, "dbw": build_dbw}
 
 
-def build_plant(config: ServerConfig) -> VehicleSetup:
-    """Make the configured vehicle with its camera; raises `UserError` naming the known kinds."""
-    return _vehicle(config.vehicle.kind)(config)
+def build_vehicle_setup(config: ServerConfig) -> VehicleSetup:
+    """Build the configured vehicle with its camera; raise `UserError` with the known kinds for an unknown one."""
+    return _find_builder(config.vehicle.kind)(config)
 
 
-def _vehicle(kind: str) -> Callable[[ServerConfig], VehicleSetup]:
+def _find_builder(kind: str) -> Callable[[ServerConfig], VehicleSetup]:
     if kind in VEHICLES:
         return VEHICLES[kind]
     custom = {entry.name: entry for entry in entry_points(group=CUSTOM_VEHICLES)}
     if kind not in custom:
-        raise UserError(f"there is no vehicle {kind!r}: the known kinds are {', '.join([*VEHICLES, *custom])}")
+        raise UserError(f"unknown vehicle kind {kind!r}: choose one of {', '.join([*VEHICLES, *custom])}")
     build: Callable[[ServerConfig], VehicleSetup] = custom[kind].load()
     return build
 
 
 def check_vehicle(config: VehicleConfig) -> None:
-    """Raise `UserError` for a vehicle, road or car that does not exist, before any work is begun."""
-    _vehicle(config.kind)
+    """Raise `UserError` for an unknown vehicle, road or car, before any work starts."""
+    _find_builder(config.kind)
     if config.kind == "dbw":
         check_by_wire(config)
     if config.kind == "simulator" or config.dbw.is_inside or config.dbw.truth:
@@ -169,8 +166,8 @@ def check_vehicle(config: VehicleConfig) -> None:
         car_of(config)
 
 
-def looks_of(camera: Camera, start_ns: int) -> list[FrameTimes]:
-    """Tell when the vehicle's pose is needed: when the shutter opens and, where the camera has an exposure, closes."""
+def physics_sample_times(camera: Camera, start_ns: int) -> list[FrameTimes]:
+    """Return when the vehicle's pose is needed: when the shutter opens and, for a finite exposure, when it closes."""
     opens = FrameTimes(start_ns + camera.phase_ns, camera.rate_hz)
     exposure_ns = camera.exposure_ns if isinstance(camera, TimedCamera) else 0
     return [opens, replace(opens, first_ns=opens.first_ns + exposure_ns)] if exposure_ns else [opens]

@@ -1,4 +1,4 @@
-"""`lavt boundary`: how much total delay a loop bears."""
+"""`lavt boundary`: the maximum total latency that a control loop tolerates."""
 
 from __future__ import annotations
 
@@ -24,38 +24,40 @@ def boundary(
     config: Annotated[Path, typer.Argument(help="A boundary config in YAML, such as configs/boundary.yaml.")],
     changes: console.Set = None,
     out: console.Out = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Seeds at a time; default: one for each core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel searches; default: one per core.")] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Search the delay at which a swing begins to grow, the car leaves its lane, and the drive fails.
+    """Find the maximum tolerable latency.
+
+    The search finds the total delays from which an oscillation grows, the car leaves its lane, and the drive fails, and
+    compares them with theory.
 
     Example: lavt boundary configs/boundary.yaml --set 'routes=[a_key]' --out out/boundary
     """
-    from lavt.experiment.boundary.boundary import boundary as search_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.boundary.boundary import plan_boundary  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.boundary.boundary import plan_boundary, search_boundary  # noqa: PLC0415 (slow: scipy)
 
     requested = load_config(BoundaryConfig, config, changes or [])
     searches = plan_boundary(requested)
     out = out or Path("out") / "boundary"
     prepare_directory(out)
-    with console.interruptible(), progress(f"boundary into {out}", len(searches)) as tell:
-        found, done = search_boundary(requested, searches, out, jobs=jobs, tell=tell)
+    with console.interruptible(), progress(f"boundary into {out}", len(searches)) as report_done:
+        found, is_complete = search_boundary(requested, searches, out, jobs=jobs, on_progress=report_done)
     for failure in found["failed"]:
-        console.say(f"failed: {failure['name']}: {failure['why']}")
-    if not done:
-        raise WorkError(f"stopped; what was found is in {out}")
+        console.print_message(f"failed: {failure['name']}: {failure['why']}")
+    if not is_complete:
+        raise WorkError(f"stopped; the results so far are in {out}")
     if as_json:
-        console.show_json(found)
+        console.print_json(found)
     else:
-        for line in lines(found):
-            console.show(line)
-        console.show(f"boundary.json, .csv, .svg and .png are in {out}")
+        for line in boundary_table(found):
+            console.print_result(line)
+        console.print_result(f"boundary.json, .csv, .svg and .png are in {out}")
     if found["failed"]:
         raise typer.Exit(1)
 
 
-def lines(found: dict[str, Any]) -> list[str]:
-    """Say for each route and preset the medians with their intervals."""
+def boundary_table(found: dict[str, Any]) -> list[str]:
+    """Return the lines of a table with the medians and intervals for each route and preset."""
     from lavt.experiment.report.boundary_figure import ALL_ROUTES, span  # noqa: PLC0415 (slow: matplotlib)
     from lavt.experiment.report.table_format import number  # noqa: PLC0415 (with them)
     from lavt.experiment.statistics.boundary_summary import CRITERIA  # noqa: PLC0415 (slow: scipy)

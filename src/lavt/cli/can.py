@@ -1,4 +1,4 @@
-"""`lavt can`: what is on a drive-by-wire bus, and whether a profile fits its DBC."""
+"""`lavt can`: monitor a drive-by-wire bus, check a profile against its DBC, and test a kit's watchdog."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import typer
 
 from lavt.assembly.dbw import load_profile, read_profile
 from lavt.assembly.dbw_bus import expected_traffic, find_dbw
-from lavt.assembly.dbw_check import disagreements, hindrances_on_a_real_bus
+from lavt.assembly.dbw_check import find_mismatches, real_bus_inhibit_reasons
 from lavt.cli import console
-from lavt.cli.can_prove import prove
+from lavt.cli.can_test_watchdog import run_watchdog_test
 from lavt.cli.can_view import BusView
 from lavt.clock import MachineClock
 from lavt.config.dbw import DbwConfig
@@ -27,25 +27,26 @@ from lavt.vehicle.dbw.bus import CanPort, log_line, read_log
 from lavt.vehicle.dbw.codec import Codec
 from lavt.vehicle.dbw.traffic import BusTraffic, ExpectedMessages
 
-TAKE_EVERY_S = 0.02
+POLL_PERIOD_S = 0.02
 
 Batch = tuple[list[ReceivedCanFrame], int]
-"""What was heard up to a time, ns."""
+"""The frames received since the batch before, and the time up to which they were received, ns."""
 
-Interface = Annotated[str | None, typer.Option(help="python-can's name of the interface, such as socketcan.")]
+Interface = Annotated[str | None, typer.Option(help="The CAN interface by python-can's name, such as socketcan.")]
 Channel = Annotated[str | None, typer.Option(help="The interface's channel, such as can0.")]
 Option = Annotated[
     list[str] | None,
-    typer.Option("--option", help="Another argument of python-can's Bus: name=value, as often as needed."),
+    typer.Option("--option", help="A further argument of python-can's Bus, as name=value; repeatable."),
 ]
-Dbc = Annotated[str, typer.Option(help="The vendor's DBC file, instead of the profile's.")]
+Dbc = Annotated[str, typer.Option(help="The vendor's DBC file, to use instead of the profile's.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    can = typer.Typer(no_args_is_help=True, help="Drive-by-wire buses, see docs/can.md.")
-    for command in (monitor, check, prove):
-        can.command(command.__name__)(command)
+    can = typer.Typer(no_args_is_help=True, help="Inspect drive-by-wire CAN buses (docs/can.md).")
+    can.command("monitor")(monitor)
+    can.command("check")(check)
+    can.command("test-watchdog")(run_watchdog_test)
     app.add_typer(can, name="can")
 
 
@@ -60,14 +61,15 @@ def monitor(
     channel: Channel = None,
     option: Option = None,
     dbc: Dbc = "",
-    log: Annotated[Path | None, typer.Option(help="Read this log (candump -L) instead of a bus.")] = None,
-    write: Annotated[Path | None, typer.Option(help="Write what is heard to a file, as candump -L does.")] = None,
-    seconds: Annotated[int | None, typer.Option(min=1, help="End after so long, not by Ctrl-C only.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Read a log (candump -L) instead of a bus.")] = None,
+    write: Annotated[Path | None, typer.Option(help="Write the received frames to a log, as candump -L does.")] = None,
+    seconds: Annotated[int | None, typer.Option(min=1, help="Stop after this time; default: on Ctrl-C.")] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Listen to a bus and say each second, and at the end, what is on it and what is wrong with it. Sends nothing.
+    """Decode the messages on a CAN bus and report errors.
 
-    Ends with 1 if no frame came.
+    The command prints the messages and their errors each second, and a summary at the end. It sends nothing. It exits
+    with 1 if no frame arrived.
 
     Example: lavt can monitor dataspeed_gen1 --channel can0
     """
@@ -77,16 +79,16 @@ def monitor(
     else:
         profile = load_profile(config.profile, dbc or config.dbc)
         codec, expected = profile.codec, expected_traffic(profile)
-    with ExitStack() as ends, console.until_told() as told:
+    with ExitStack() as stack, console.stop_on_signals() as stop:
         if log is None:
-            port = ends.enter_context(closing(_port(config)))
-            batches, dropped, to_wall_ns = _from_bus(port, told, seconds), port.counts, _from_mono_to_wall_ns()
+            port = stack.enter_context(closing(_open_port(config)))
+            batches, dropped, to_wall_ns = _read_bus(port, stop, seconds), port.counts, _mono_to_wall_ns()
         else:
-            batches, dropped, to_wall_ns = _from_log(log), Counter[str](), 0
-        write_down = ends.enter_context(_writing(write, config.channel, to_wall_ns))
-        if not _show(batches, (codec, expected), dropped, write_down, as_json):
+            batches, dropped, to_wall_ns = _read_log(log), Counter[str](), 0
+        write_frame = stack.enter_context(_log_writer(write, config.channel, to_wall_ns))
+        if not _show_batches(batches, (codec, expected), dropped, write_frame, as_json):
             raise WorkError(
-                f"no frame came on {config.interface} {config.channel}" if log is None else f"{log} is empty"
+                f"no frame arrived on {config.interface} {config.channel}" if log is None else f"{log} is empty"
             )
 
 
@@ -95,104 +97,107 @@ def check(
     dbc: Dbc = "",
     as_json: console.Json = False,
 ) -> None:
-    """Check a profile against its DBC without a car, list what is unverified, and say whether it may arm on a real bus.
+    """Check a by-wire profile against its DBC file.
 
-    Ends with 0 where the two agree; what is unverified is no disagreement.
+    The check needs no car. It lists the mismatches, the unverified signals, and the reasons why the profile may not arm
+    on a real bus. It exits with 0 if profile and DBC match; an unverified signal is not a mismatch.
 
     Example: lavt can check dataspeed_gen1
     """
     config, codec = read_profile(name, dbc)
-    found = disagreements(config, codec)
-    if not found:
+    mismatches = find_mismatches(config, codec)
+    if not mismatches:
         try:
             profile = load_profile(name, dbc)
         except UserError as error:
-            found = [str(error)]
-    hindrances = [] if found else hindrances_on_a_real_bus(profile)
-    unverified = () if found else profile.unverified
+            mismatches = [str(error)]
+    inhibit_reasons = [] if mismatches else real_bus_inhibit_reasons(profile)
+    unverified = () if mismatches else profile.unverified
     against = dbc or config.dbc
     if as_json:
-        console.show_json(
+        console.print_json(
             {
                 "profile": name,
                 "dbc": against,
-                "agree": not found,
-                "disagreements": found,
+                "agree": not mismatches,
+                "disagreements": mismatches,
                 "unverified": unverified,
-                "may_arm_on_a_real_bus": not (found or hindrances),
-                "hindrances_on_a_real_bus": hindrances,
+                "may_arm_on_a_real_bus": not (mismatches or inhibit_reasons),
+                "real_bus_inhibit_reasons": inhibit_reasons,
             }
         )
-    for sentence in found:
-        console.say(sentence)
-    if found:
-        raise UserError(f"{name} and {against} disagree {len(found)} times: change the profile, or name another DBC")
+    for sentence in mismatches:
+        console.print_message(sentence)
+    if mismatches:
+        raise UserError(
+            f"{name} and {against} have {len(mismatches)} mismatches: change the profile, or name another DBC"
+        )
     if not as_json:
-        _show_agreement(name, against, unverified, hindrances)
+        _show_match(name, against, unverified, inhibit_reasons)
 
 
-def _show_agreement(name: str, dbc: str, unverified: Sequence[str], hindrances: Sequence[str]) -> None:
-    console.show(f"{name} and {dbc} agree")
-    console.show(f"unverified: {len(unverified) or 'nothing'}")
+def _show_match(name: str, dbc: str, unverified: Sequence[str], inhibit_reasons: Sequence[str]) -> None:
+    console.print_result(f"{name} and {dbc} match")
+    console.print_result(f"unverified signals: {len(unverified) or 'none'}")
     for signal in unverified:
-        console.show(f"  {signal}")
-    if not hindrances:
-        console.show("on a real bus: may arm, once `lavt can prove` has seen its watchdog brake")
-    for sentence in hindrances:
-        console.show(f"on a real bus: may not arm: {sentence}")
+        console.print_result(f"  {signal}")
+    if not inhibit_reasons:
+        console.print_result("on a real bus: may arm, after `lavt can test-watchdog` has passed")
+    for sentence in inhibit_reasons:
+        console.print_result(f"on a real bus: may not arm: {sentence}")
 
 
-def _show(
+def _show_batches(
     batches: Iterator[Batch],
     messages: tuple[Codec, ExpectedMessages],
     dropped: Counter[str],
-    write_down: Callable[[ReceivedCanFrame], None],
+    write_frame: Callable[[ReceivedCanFrame], None],
     as_json: bool,
 ) -> bool:
-    """Show what is heard until there is no more; tell whether anything was."""
+    """Show all batches each second and as a summary; return whether there was any frame."""
     first = next(batches, ([], 0))
     begin_ns = now_ns = first[1]
     traffic = BusTraffic(*messages, start_ns=begin_ns)
     view, shown_s, is_any = BusView(traffic, dropped, as_json), 0, False
-    with view.showing():
+    with view.live():
         for frames, now_ns in chain([first], batches):
             is_any = is_any or bool(frames)
-            for heard in frames:
-                traffic.hear(heard)
-                write_down(heard)
+            for frame in frames:
+                traffic.receive(frame)
+                write_frame(frame)
             if (now_ns - begin_ns) // NS_PER_S > shown_s:
                 shown_s = (now_ns - begin_ns) // NS_PER_S
-                view.second(now_ns - begin_ns, now_ns)
-    view.summary(now_ns - begin_ns, now_ns)
+                view.show_second(now_ns - begin_ns, now_ns)
+    view.show_summary(now_ns - begin_ns, now_ns)
     return is_any
 
 
-def _from_bus(port: CanPort, told: console.StopEvent, seconds: int | None) -> Iterator[Batch]:
-    """Take what comes on a bus until told to end, or for so long; a bus that has gone is said, and tried again."""
-    clock, gone = MachineClock(), ""
+def _read_bus(port: CanPort, stop: console.StopEvent, seconds: int | None) -> Iterator[Batch]:
+    """Yield the frames received until the stop event, or for `seconds`; report a lost bus and retry."""
+    clock, failure = MachineClock(), ""
     begin_ns = clock.now().mono_ns
-    while not told.wait(TAKE_EVERY_S):
+    while not stop.wait(POLL_PERIOD_S):
         now_ns = clock.now().mono_ns
         try:
-            frames, why = port.take(now_ns), ""
-        except BusGone as error:
-            frames, why = [], str(error)
-        if why != gone:
-            console.say(f"lavt: {why}; it is tried again each second" if why else "lavt: the bus is back")
-            gone = why
+            frames, error = port.take(now_ns), ""
+        except BusGone as gone:
+            frames, error = [], str(gone)
+        if error != failure:
+            console.print_message(f"lavt: {error}; retrying each second" if error else "lavt: the bus is back")
+            failure = error
         yield frames, now_ns
         if seconds is not None and now_ns - begin_ns >= seconds * NS_PER_S:
             return
 
 
-def _from_log(path: Path) -> Iterator[Batch]:
-    for heard in read_log(path):
-        yield [heard], heard.arrived_ns
+def _read_log(path: Path) -> Iterator[Batch]:
+    for frame in read_log(path):
+        yield [frame], frame.arrived_ns
 
 
 @contextmanager
-def _writing(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Callable[[ReceivedCanFrame], None]]:
-    """Give what writes a frame down: into a log, or nowhere."""
+def _log_writer(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Callable[[ReceivedCanFrame], None]]:
+    """Yield a function that writes a frame to the log at `path`; without a path it does nothing."""
     if path is None:
         yield lambda _: None
         return
@@ -201,11 +206,11 @@ def _writing(path: Path | None, channel: str, to_wall_ns: int) -> Iterator[Calla
     except OSError as error:
         raise UserError(f"{path} cannot be written ({error.strerror}): name another file") from error
     with file:
-        yield lambda heard: file.writelines([log_line(heard.arrived_ns + to_wall_ns, channel, heard.frame)])
+        yield lambda received: file.writelines([log_line(received.arrived_ns + to_wall_ns, channel, received.frame)])
 
 
 def _with_bus(config: DbwConfig, interface: str | None, channel: str | None, option: list[str] | None) -> DbwConfig:
-    """A config's bus, or another as the command line has it: another interface takes none of the config's options."""
+    """Return the config with the bus of the command line; another interface drops the config's options."""
     options = {} if interface else dict(config.options)
     for each in option or ():
         name, equals, text = each.partition("=")
@@ -221,12 +226,13 @@ def _with_bus(config: DbwConfig, interface: str | None, channel: str | None, opt
     )
 
 
-def _port(config: DbwConfig) -> CanPort:
+def _open_port(config: DbwConfig) -> CanPort:
     if config.interface == "inside":
-        raise UserError("a bus inside the server's process can be heard by nobody else: name another with --interface")
+        raise UserError("a bus inside the server's process cannot be reached from here: name another with --interface")
     return CanPort(config.interface, config.channel, config.options, clock=MachineClock())
 
 
-def _from_mono_to_wall_ns() -> int:
+def _mono_to_wall_ns() -> int:
+    """Return the machine's wall-clock time minus its monotonic time."""
     now = MachineClock().now()
     return now.wall_ns - now.mono_ns

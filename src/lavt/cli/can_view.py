@@ -1,4 +1,4 @@
-"""What a person or a program sees of a bus: a table that changes on a terminal, lines elsewhere, or JSON."""
+"""The output of `lavt can monitor`: a live table on a terminal, lines elsewhere, or JSON."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from rich.text import Text
 
 from lavt.cli import console
 from lavt.domain import NS_PER_S
-from lavt.vehicle.dbw.traffic import OTHERS, BusTraffic, MessageSummary, signal_words
+from lavt.vehicle.dbw.traffic import OTHER_IDENTIFIERS, BusTraffic, MessageSummary, signal_text
 
 
 class BusView:
-    """Shows a bus second by second, and in the end the whole of it."""
+    """A view of a bus that is printed each second, and as a summary at the end."""
 
     def __init__(self, traffic: BusTraffic, counts: Mapping[str, int], as_json: bool) -> None:
         self._traffic, self._counts, self._as_json = traffic, counts, as_json
         self._live: Live | None = None
-        self._known: set[str] = set()
+        self._printed: set[str] = set()
+        """Names of the messages that have been printed."""
 
     @contextmanager
-    def showing(self) -> Iterator[None]:
-        """Have the terminal, where there is one, for the time of a `with`."""
+    def live(self) -> Iterator[None]:
+        """Show a live table inside the `with` block if standard output is a terminal."""
         if self._as_json or not sys.stdout.isatty():
             yield
             return
@@ -36,103 +37,104 @@ class BusView:
             yield
         self._live = None
 
-    def second(self, passed_ns: int, now_ns: int) -> None:
-        """Show what came since the last time."""
-        told = self._traffic.tell(now_ns)
+    def show_second(self, passed_ns: int, now_ns: int) -> None:
+        """Show the messages since the last call."""
+        messages = self._traffic.take_period(now_ns)
         if self._as_json:
-            console.show_json({"second": self._as_data(passed_ns, told)})
+            console.print_json({"second": self._as_data(passed_ns, messages)})
         elif self._live is not None:
-            self._live.update(_table(told, self._rest()), refresh=True)
+            self._live.update(_table(messages, self._other_lines()), refresh=True)
         else:
-            for each in told:
-                if each.wrong or each.changed or each.facts.name not in self._known:
-                    self._known.add(each.facts.name)
-                    console.show(f"{passed_ns / NS_PER_S:.0f} s  {_line(each)}")
+            for message in messages:
+                if message.wrong or message.changed or message.facts.name not in self._printed:
+                    self._printed.add(message.facts.name)
+                    console.print_result(f"{passed_ns / NS_PER_S:.0f} s  {_line(message)}")
 
-    def summary(self, passed_ns: int, now_ns: int) -> None:
-        """Show what came in all."""
-        told = self._traffic.tell_all(now_ns)
+    def show_summary(self, passed_ns: int, now_ns: int) -> None:
+        """Show the messages of the whole time."""
+        messages = self._traffic.total(now_ns)
         if self._as_json:
-            console.show_json({"summary": self._as_data(passed_ns, told)})
+            console.print_json({"summary": self._as_data(passed_ns, messages)})
             return
-        console.show(f"in all, in {passed_ns / NS_PER_S:.1f} s:")
-        for line in [*map(_line, told), *self._rest()]:
-            console.show(f"  {line}")
+        console.print_result(f"summary of {passed_ns / NS_PER_S:.1f} s:")
+        for line in [*map(_line, messages), *self._other_lines()]:
+            console.print_result(f"  {line}")
 
-    def _rest(self) -> list[str]:
-        """Tell what belongs to no message."""
-        unknown = [f"{identifier_words(*key)} {count} times" for key, count in sorted(self._traffic.unknown.items())]
+    def _other_lines(self) -> list[str]:
+        """Return the lines on frames of unknown messages and on dropped frames."""
+        unknown = [f"{format_identifier(*key)} {count} times" for key, count in sorted(self._traffic.unknown.items())]
         dropped = [f"{name.replace('_', ' ')} {count}" for name, count in self._counts.items() if count]
-        lines = {"in no message of the DBC": unknown, "dropped": dropped}
-        return [f"{what}: {', '.join(words)}" for what, words in lines.items() if words]
+        lines = {"not in the DBC": unknown, "dropped": dropped}
+        return [f"{label}: {', '.join(counts)}" for label, counts in lines.items() if counts]
 
-    def _as_data(self, passed_ns: int, told: Sequence[MessageSummary]) -> dict[str, Any]:
+    def _as_data(self, passed_ns: int, messages: Sequence[MessageSummary]) -> dict[str, Any]:
         unknown: Counter[str] = Counter()
         for key, count in self._traffic.unknown.items():
-            unknown[identifier_words(*key)] += count
+            unknown[format_identifier(*key)] += count
         return {
             "passed_s": round(passed_ns / NS_PER_S, 3),
-            "messages": [_message_data(each) for each in told],
+            "messages": [_message_data(message) for message in messages],
             "unknown": unknown,
             "dropped": {name: count for name, count in self._counts.items() if count},
         }
 
 
-def identifier_words(identifier: int, is_extended: bool) -> str:
-    """Say an identifier as CAN tools do: three digits, or eight of one of 29 bits."""
-    if (identifier, is_extended) == OTHERS:
+def format_identifier(identifier: int, is_extended: bool) -> str:
+    """Format an identifier as CAN tools do: three hexadecimal digits, or eight for a 29-bit identifier."""
+    if (identifier, is_extended) == OTHER_IDENTIFIERS:
         return "others"
     return f"0x{identifier:0{8 if is_extended else 3}X}"
 
 
-def _line(told: MessageSummary) -> str:
-    facts = told.facts
+def _line(message: MessageSummary) -> str:
+    facts = message.facts
+    identifier = format_identifier(facts.identifier, facts.is_extended)
     parts = [
-        f"{facts.name} {identifier_words(facts.identifier, facts.is_extended)}  {told.frames} times, {_rate(told)}",
-        ", ".join(_words(told)),
-        f"changed: {', '.join(told.changed)}" if told.changed else "",
-        f"WRONG: {'; '.join(told.wrong)}" if told.wrong else "",
+        f"{facts.name} {identifier}  {message.frames} times, {_rate(message)}",
+        ", ".join(_signal_labels(message)),
+        f"changed: {', '.join(message.changed)}" if message.changed else "",
+        f"WRONG: {'; '.join(message.wrong)}" if message.wrong else "",
     ]
     return "  ".join(part for part in parts if part)
 
 
-def _rate(told: MessageSummary) -> str:
-    nominal = f" of {NS_PER_S / told.facts.period_ns:g}" if told.facts.period_ns else ""
-    return f"{told.rate_hz:.1f}{nominal} per s"
+def _rate(message: MessageSummary) -> str:
+    nominal = f" of {NS_PER_S / message.facts.period_ns:g}" if message.facts.period_ns else ""
+    return f"{message.rate_hz:.1f}{nominal} per s"
 
 
-def _words(told: MessageSummary) -> list[str]:
-    words = (signal_words(told.facts.signals[name], value) for name, value in told.values.items())
-    return [each for each in words if each]
+def _signal_labels(message: MessageSummary) -> list[str]:
+    labels = (signal_text(message.facts.signals[name], value) for name, value in message.values.items())
+    return [label for label in labels if label]
 
 
-def _table(told: Sequence[MessageSummary], rest: Sequence[str]) -> Table:
-    table = Table(expand=True, caption="\n".join([*rest, "? marks what is unverified; Ctrl-C ends"]))
-    for heading in ("message", "", "per s", "says", "wrong"):
-        table.add_column(heading, overflow="fold", ratio=4 if heading == "says" else None)
-    for each in told:
-        says = Text()
-        for name, value in each.values.items():
-            words = signal_words(each.facts.signals[name], value)
-            says.append(f"{words}  " if words else "", style="bold yellow" if name in each.changed else "")
+def _table(messages: Sequence[MessageSummary], other_lines: Sequence[str]) -> Table:
+    table = Table(expand=True, caption="\n".join([*other_lines, "? marks an unverified signal; Ctrl-C ends"]))
+    for heading in ("message", "", "per s", "signals", "wrong"):
+        table.add_column(heading, overflow="fold", ratio=4 if heading == "signals" else None)
+    for message in messages:
+        signals = Text()
+        for name, value in message.values.items():
+            label = signal_text(message.facts.signals[name], value)
+            signals.append(f"{label}  " if label else "", style="bold yellow" if name in message.changed else "")
         table.add_row(
-            each.facts.name,
-            identifier_words(each.facts.identifier, each.facts.is_extended),
-            f"{each.rate_hz:.1f}",
-            says,
-            Text("; ".join(each.wrong), style="bold red"),
+            message.facts.name,
+            format_identifier(message.facts.identifier, message.facts.is_extended),
+            f"{message.rate_hz:.1f}",
+            signals,
+            Text("; ".join(message.wrong), style="bold red"),
         )
     return table
 
 
-def _message_data(told: MessageSummary) -> dict[str, Any]:
-    signals = told.facts.signals
+def _message_data(message: MessageSummary) -> dict[str, Any]:
+    signals = message.facts.signals
     return {
-        "message": told.facts.name,
-        "identifier": told.facts.identifier,
-        "is_extended": told.facts.is_extended,
-        "frames": told.frames,
-        "rate_hz": round(told.rate_hz, 2),
+        "message": message.facts.name,
+        "identifier": message.facts.identifier,
+        "is_extended": message.facts.is_extended,
+        "frames": message.frames,
+        "rate_hz": round(message.rate_hz, 2),
         "signals": {
             name: {
                 "value": value,
@@ -140,8 +142,8 @@ def _message_data(told: MessageSummary) -> dict[str, Any]:
                 "name": None if value is None else signals[name].names.get(signals[name].number(value)),
                 "unverified": signals[name].is_unverified,
             }
-            for name, value in told.values.items()
+            for name, value in message.values.items()
         },
-        "changed": told.changed,
-        "wrong": told.wrong,
+        "changed": message.changed,
+        "wrong": message.wrong,
     }

@@ -1,4 +1,4 @@
-"""`lavt client`: the remote side."""
+"""`lavt client`: the operator's side."""
 
 from __future__ import annotations
 
@@ -27,24 +27,26 @@ def client(
     config: Annotated[Path, typer.Argument(help="A client config in YAML, such as configs/client.yaml.")],
     out: console.Out = None,
     changes: console.Set = None,
-    take_over: Annotated[bool, typer.Option("--take-over", help="Ask who holds the vehicle to hand it over.")] = False,
+    take_over: Annotated[
+        bool, typer.Option("--take-over", help="Ask the client in control to hand over the vehicle.")
+    ] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Ask for the vehicle, arm it, and drive it by the video that comes.
+    """Run the operator's side: acquire control, arm and drive.
 
-    SIGUSR1 is an emergency stop, SIGUSR2 releases the vehicle and hands it to who asks for it, Ctrl-C releases it and
-    ends.
+    The controller drives the vehicle by its video. SIGUSR1 triggers an emergency stop. SIGUSR2 releases the vehicle, to
+    the client that requests control if there is one. Ctrl-C releases the vehicle and exits.
 
     Example: lavt client configs/client.yaml --set video.server=192.0.2.7
     """
-    console.keep_stdout_for_results()
-    process_priority.take()
+    console.reserve_stdout()
+    process_priority.raise_priority()
     settings = load_config(ClientConfig, config, [*(changes or []), *(["take_over=true"] if take_over else [])])
     clock = MachineClock()
     with Side(settings, out, clock) as side:
         side.open_video("rtp", bind=("", 0), remote=(settings.video.server, settings.video.port))
         side.open_probe("probe_reply", bind=("", 0), remote=(settings.video.server, settings.clock.probe_port))
         nodes = build_client(settings, clock.now, MachineEntropy())
-        signal.signal(signal.SIGUSR1, lambda *_: side.tell("operator", "emergency_stop"))
-        signal.signal(signal.SIGUSR2, lambda *_: side.tell("operator", "release"))
+        signal.signal(signal.SIGUSR1, lambda *_: side.send("operator", "emergency_stop"))
+        signal.signal(signal.SIGUSR2, lambda *_: side.send("operator", "release"))
         run_side(side, nodes.all, once=False, as_json=as_json, ready={}, session=nodes.driver.session)

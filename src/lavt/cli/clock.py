@@ -1,4 +1,4 @@
-"""`lavt clock`: how good the clocks are, before anything is measured with them."""
+"""`lavt clock`: measure how well two machines' clocks are synchronised."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from lavt.errors import BadMessage, WorkError
 from lavt.node import Send
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import DEFAULT_PORT, ClockProbe, ProbeReply, decode_reply, encode_request
-from lavt.transport.udp_link import UdpLink, look_up
+from lavt.transport.udp_link import UdpLink, resolve_host
 
 PROBE_PERIOD_NS = 50 * NS_PER_MS
 LAST_REPLY_NS = 500 * NS_PER_MS
-"""How long the last reply may take."""
+"""How long to wait for the last reply."""
 
 
 def register(app: typer.Typer) -> None:
@@ -34,62 +34,63 @@ def register(app: typer.Typer) -> None:
 
 
 def clock(
-    server: Annotated[str | None, typer.Option(help="Also probe the `lavt server` on this host.")] = None,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Its clock.probe_port.")] = DEFAULT_PORT,
-    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="For how long to probe.")] = 3.0,
+    server: Annotated[str | None, typer.Option(help="Host of a running `lavt server` whose clock to probe.")] = None,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="The server's clock.probe_port.")] = DEFAULT_PORT,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Duration of the probing.")] = 3.0,
     source: Annotated[
-        Literal["chrony", "ptp", "external"], typer.Option(help="Who is asked about this machine's clock.")
+        Literal["chrony", "ptp", "external"], typer.Option(help="The time source of this machine's clock.")
     ] = "chrony",
     correction_ms: Annotated[
-        float | None, typer.Option(help="With external: reference time less this machine's wall clock.")
+        float | None, typer.Option(help="For external: reference time minus this machine's wall clock.")
     ] = None,
-    bound_ms: Annotated[
-        float | None, typer.Option(help="With external: how far the correction can be from the truth.")
-    ] = None,
+    bound_ms: Annotated[float | None, typer.Option(help="For external: the largest error of the correction.")] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Say how this machine's clock is and, with --server, how far from the vehicle's; ends with 1 if not good enough.
+    """Report the error of this machine's clock.
+
+    With --server, the command also measures the offset to the vehicle's clock. It exits with 1 if the accuracy is not
+    good enough for one-way latencies.
 
     Example: lavt clock --server 192.0.2.7
     """
     requested = {"source": source, "correction_ms": correction_ms, "bound_ms": bound_ms}
     config = parse_config(ClockConfig, requested, "lavt clock")
-    address = None if server is None else look_up("--server", server)
+    address = None if server is None else resolve_host("--server", server)
     machine = MachineClock()
-    with closing(interpreter(config)) as requested_by:
-        ask = clock_source(config, machine, requested_by.run)
-        report = _answer(ask, source)
+    with closing(interpreter(config)) as process:
+        read_source = clock_source(config, machine, process.run)
+        report = _read_report(read_source, source)
         if address is None:
             finding = check_host(report)
         else:
             probes, latest = probe(machine, address, port, round(seconds * NS_PER_S))
             if latest is None:
                 raise WorkError(
-                    f"nobody answered at {server}:{port} (UDP): is `lavt server` running there, is its "
+                    f"no answer from {server}:{port} (UDP): is `lavt server` running there, is its "
                     f"clock.probe_port {port}, and does the firewall let it through?"
                 )
-            before, report = report, _answer(ask, source)
+            before, report = report, _read_report(read_source, source)
             finding = compare(before, report, probes, latest, address)
     if as_json:
-        console.show_json({**asdict(finding), "clock": asdict(report)})
+        console.print_json({**asdict(finding), "clock": asdict(report)})
     else:
         for sentence in finding.says:
-            console.show(f"{sentence}.")
+            console.print_result(f"{sentence}.")
     if not finding.good:
         raise typer.Exit(1)
 
 
-def _answer(ask: Callable[[], ClockReport | None], source: str) -> ClockReport:
-    report = ask()
+def _read_report(read_source: Callable[[], ClockReport | None], source: str) -> ClockReport:
+    report = read_source()
     if report is None:
-        raise WorkError(f"{source} did not answer in time: is this machine very busy?")
+        raise WorkError(f"{source} did not answer in time: is this machine overloaded?")
     return report
 
 
 def probe(
     machine: MachineClock, address: str, port: int, duration_ns: int
 ) -> tuple[list[ClockProbe], ProbeReply | None]:
-    """Probe a server for a while: all whole exchanges, and the last reply; what is no reply to a request is dropped."""
+    """Probe a server; return all complete exchanges and the last reply. Other datagrams are ignored."""
     replies: queue.SimpleQueue[tuple[bytes, Now]] = queue.SimpleQueue()
 
     def deliver(_channel: str, payload: Any, arrived: Now, _peer: Any) -> None:

@@ -1,4 +1,4 @@
-"""What all commands share: results on standard output, messages on standard error, exit codes, and a clean end."""
+"""Output, exit codes and signal handling shared by all commands."""
 
 from __future__ import annotations
 
@@ -16,109 +16,114 @@ import typer
 
 from lavt.errors import LavtError, UserError, WorkError
 
-Out = Annotated[Path | None, typer.Option(help="Directory for what is written.")]
-Set = Annotated[list[str] | None, typer.Option("--set", help="Change a config value: a.b=value, as often as needed.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+Out = Annotated[Path | None, typer.Option(help="Output directory.")]
+Set = Annotated[list[str] | None, typer.Option("--set", help="Override a config value, as a.b=value; repeatable.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
-def say(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a message for the user to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
-def show(text: str) -> None:
+def print_result(text: str) -> None:
     """Print a result to standard output."""
     print(text, flush=True)
 
 
-def show_json(value: Any) -> None:
-    """Print a result as one line of JSON."""
-    show(json.dumps(value, allow_nan=False))
+def print_json(value: Any) -> None:
+    """Print a result to standard output as one line of JSON."""
+    print_result(json.dumps(value, allow_nan=False))
 
 
-def keep_stdout_for_results() -> None:
-    """Send what libraries print (Zenoh's log) to standard error; `show` still writes to standard output."""
+def reserve_stdout() -> None:
+    """Redirect the output of libraries (Zenoh's log) to standard error; `print_result` keeps standard output."""
     results = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     sys.stdout = results
 
 
 def run_command(command: Callable[[], None]) -> None:
-    """Run a command and end the process: 0 it did its job, 2 the input was wrong, 1 the work failed."""
+    """Run a command and map its errors to exit codes: 0 for success, 1 for failed work, 2 for invalid input."""
     try:
         command()
     except UserError as error:
-        say(f"lavt: {error}")
+        print_message(f"lavt: {error}")
         raise SystemExit(2) from None
     except LavtError as error:
-        say(f"lavt: {error}")
+        print_message(f"lavt: {error}")
         raise SystemExit(1) from None
-    except OSError as error:  # a disk or a right that no check has foreseen
-        say(f"lavt: {error}")
+    except OSError as error:  # such as a full disk or a missing permission that no check anticipated
+        print_message(f"lavt: {error}")
         raise SystemExit(1) from None
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM or a closed terminal in the middle of long work be an end that says so."""
+    """Raise `WorkError` when Ctrl-C, SIGTERM or a closed terminal interrupts long work."""
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     try:
-        with _handled(interrupt, signal.SIGTERM):
+        with _signal_handlers(interrupt, signal.SIGTERM):
             yield
     except KeyboardInterrupt:
-        raise WorkError("stopped; what was finished is kept") from None
+        raise WorkError("stopped; the finished results are kept") from None
 
 
 class StopEvent:
-    """An event that a signal sets.
+    """An event that a signal handler can set without a deadlock.
 
-    Its handler interrupts whatever the main thread does, another handler as well: a second signal often comes with the
-    first. `threading.Event.set` waits for a lock that the interrupted one may have, and so for ever; here nothing does.
+    A signal handler interrupts the main thread anywhere, even inside another handler: a second signal often follows the
+    first at once. `threading.Event.set` waits for a lock that the interrupted code may own, and so would wait for ever.
+    The methods of this class wait for no such lock.
     """
 
     def __init__(self) -> None:
-        self._not_yet = threading.Lock()
-        self._not_yet.acquire()
+        self._is_clear = threading.Lock()
+        """Locked while the event is clear."""
+        self._is_clear.acquire()
 
     def set(self) -> None:
-        """Tell; to tell twice is to tell once."""
-        with suppress(RuntimeError):  # it was told already
-            self._not_yet.release()
+        """Set the event; setting it again changes nothing."""
+        with suppress(RuntimeError):  # it was already set
+            self._is_clear.release()
 
     def is_set(self) -> bool:
-        """Whether it was told."""
-        return not self._not_yet.locked()
+        """Return whether the event is set."""
+        return not self._is_clear.locked()
 
     def clear(self) -> None:
-        """Forget that it was told."""
-        self._not_yet.acquire(blocking=False)
+        """Clear the event."""
+        self._is_clear.acquire(blocking=False)
 
-    def wait(self, pause_s: float | None = None) -> bool:
-        """Wait until told, and for `pause_s` at most; None: until told. Tells whether it was."""
-        told = self._not_yet.acquire(timeout=-1 if pause_s is None else pause_s)
-        if told:
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the event is set or `timeout_s` has passed (None: no timeout); return whether it is set."""
+        is_set = self._is_clear.acquire(timeout=-1 if timeout_s is None else timeout_s)
+        if is_set:
             self.set()
-        return told
+        return is_set
 
 
 @contextmanager
-def until_told() -> Iterator[StopEvent]:
-    """Give an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until told to stop."""
-    told = StopEvent()
-    with _handled(lambda *_: told.set(), signal.SIGINT, signal.SIGTERM):
-        yield told
+def stop_on_signals() -> Iterator[StopEvent]:
+    """Yield an event that Ctrl-C, SIGTERM or a closed terminal sets, for programs that run until they are stopped."""
+    stop = StopEvent()
+    with _signal_handlers(lambda *_: stop.set(), signal.SIGINT, signal.SIGTERM):
+        yield stop
 
 
 @contextmanager
-def _handled(handler: Callable[..., None], *numbers: signal.Signals) -> Iterator[None]:
-    """Handle these signals, and a closed terminal's SIGHUP but where it is ignored (by `nohup`): it stays ignored."""
-    closed = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
-    before = {number: signal.signal(number, handler) for number in (*numbers, *closed)}
+def _signal_handlers(handler: Callable[..., None], *numbers: signal.Signals) -> Iterator[None]:
+    """Install `handler` for these signals and for SIGHUP (a closed terminal), and restore the former handlers.
+
+    SIGHUP stays ignored if it was ignored before, as under `nohup`.
+    """
+    hangup = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+    former = {number: signal.signal(number, handler) for number in (*numbers, *hangup)}
     try:
         yield
     finally:
-        for number, former in before.items():
-            signal.signal(number, former)
+        for number, former_handler in former.items():
+            signal.signal(number, former_handler)

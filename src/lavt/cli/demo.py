@@ -1,4 +1,4 @@
-"""`lavt demo`: the main job, small."""
+"""`lavt demo`: a short example of the testbed's main job."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def register(app: typer.Typer) -> None:
 
 
 def demo(out: console.Out = None, as_json: console.Json = False) -> None:
-    """Drive by video on this machine: in real time at L0 and L5, in virtual time from L0 to L5; then report.
+    """Run the demo: drive by video under L0 to L5 and report.
+
+    The demo drives in real time under L0 and L5, and in virtual time under L0 to L5, all on this machine.
 
     Example: lavt demo --out out/demo
     """
@@ -44,10 +46,10 @@ def demo(out: console.Out = None, as_json: console.Json = False) -> None:
     page = write_report(out, speed=speed)
     summary = read_json(out / "summary.json")
     if as_json:
-        console.show_json(summary)
+        console.print_json(summary)
     else:
         _show(summary)
-        console.show(f"the report is {page}")
+        console.print_result(f"the report is {page}")
     if failed:
         raise typer.Exit(1)
 
@@ -58,18 +60,18 @@ def _drive_real(config: Path, out: Path) -> None:
         planned = plan_run(run, name=f"real_{run.vehicle.route}_{name}_00")
         with LiveView(f"real time, {name}") as view:
             result = run_once(planned, out / "runs" / planned.name, progress=view.update)
-        console.say(f"real time, {name}: {result['ending']}")
+        console.print_message(f"real time, {name}: {result['ending']}")
 
 
 def _drive_virtual(config: Path, out: Path) -> tuple[bool, dict[str, Any] | None]:
-    """Drive the same under all conditions; tell whether any run failed, and the speed."""
+    """Drive the same route under all conditions; return whether any run failed, and the speed of virtual time."""
     base = load_config(RunConfig, config, ["time=virtual"])
     axes = {"routes": [base.vehicle.route], "conditions": list(VIRTUAL_CONDITIONS)}
     planned = plan_sweep(parse_config(SweepConfig, {**base.model_dump(mode="json"), **axes}, str(config)))
     from lavt.experiment.sweep.sweep import run_all  # noqa: PLC0415 (slow: scipy, matplotlib)
 
-    with progress("virtual time, L0 to L5", len(planned)) as tell:
-        driven, speed = run_all(planned, out / "runs", jobs=None, tell=tell)
+    with progress("virtual time, L0 to L5", len(planned)) as report_done:
+        driven, speed = run_all(planned, out / "runs", jobs=None, on_progress=report_done)
     return bool(driven.failed), speed
 
 
@@ -79,12 +81,12 @@ def _show(summary: dict[str, Any]) -> None:
     units = ("", "", "", "video + control, ms", "ms", "ms", "ms", "cross-track, m")
     table = Table(*("\n".join(each) for each in zip(columns, units, strict=True)))
     for run in summary["runs"]:
-        requested = run["injected_ms"]
+        injected_ms = run["injected_ms"]
         table.add_row(
             run["time"],
             run["condition"],
             run["ending"] + ("" if run["valid"] else ", not valid"),
-            f"{requested['video']:g} + {requested['control']:g}",
+            f"{injected_ms['video']:g} + {injected_ms['control']:g}",
             _ms(run["tau_v_ms"]),
             _ms(run["tau_c_ms"]),
             _ms(run["loop_ms"]),

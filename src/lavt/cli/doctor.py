@@ -1,4 +1,4 @@
-"""`lavt doctor`: whether a machine, or a pair, is fit for driving, and what to do about what is not."""
+"""`lavt doctor`: check whether a machine, or a pair of machines, is ready to drive, and suggest fixes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lavt.assembly.by_wire import listen
 from lavt.assembly.cameras import client_camera
 from lavt.cli import console
 from lavt.cli.clock import probe
-from lavt.cli.router import find
+from lavt.cli.router import find_file
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerCameraConfig, ServerConfig
 from lavt.config_file import load_config, read_yaml, split_change
@@ -31,16 +31,16 @@ from lavt.domain import NS_PER_S
 from lavt.errors import LavtError, UserError
 from lavt.runtime import process_priority
 from lavt.transport.clock_sync.clock_report import ClockReport
-from lavt.transport.udp_link import look_up
+from lavt.transport.udp_link import resolve_host
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 PROBING_NS = NS_PER_S
 LISTEN_NS = NS_PER_S
-"""A kit's slowest report comes each 0.1 s."""
+"""How long to listen to a CAN bus; a kit's slowest report comes every 0.1 s."""
 WHO = "doctor"
-EVERYWHERE = "0.0.0.0"  # noqa: S104 (compared with, not bound)
+ANY_ADDRESS = "0.0.0.0"  # noqa: S104 (compared with, not bound)
 Settings = ServerConfig | ClientConfig
-CLIENT_ONLY = {*(ClientConfig.model_fields.keys() - ServerConfig.model_fields.keys()), "video.server"}
+CLIENT_ONLY_KEYS = {*(ClientConfig.model_fields.keys() - ServerConfig.model_fields.keys()), "video.server"}
 
 
 def register(app: typer.Typer) -> None:
@@ -50,43 +50,44 @@ def register(app: typer.Typer) -> None:
 
 def doctor(
     config: Annotated[
-        Path | None, typer.Argument(help="A server or client config; without one this machine alone is looked at.")
+        Path | None, typer.Argument(help="A server or client config; default: check this machine only.")
     ] = None,
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
-    """Look at this machine and, with a config, at its side and the peer; ends with 1 where there is a problem.
+    """Check whether this machine is ready to drive.
 
-    With a client's config the vehicle's side is asked too; nobody takes the vehicle, and nothing is changed.
+    With a config, the command also checks the requirements of that side and, for a client, the connection to the
+    vehicle. It changes nothing and does not acquire control. It exits with 1 if there is a problem.
 
     Example: lavt doctor configs/client.yaml --set video.server=192.0.2.7
     """
-    console.keep_stdout_for_results()
-    process_priority.take()
+    console.reserve_stdout()
+    process_priority.raise_priority()
     if config is None and changes:
         raise UserError("--set changes a config: name one before it")
     settings = None if config is None else _load(config, changes or [])
     quiet_logs()
-    answers = []
+    results = []
     for check in _checks(settings, MachineClock()):
-        answers.append(check)
+        results.append(check)
         if not as_json:
             _show(check)
-    problems = sum(check.verdict == "problem" for check in answers)
+    problems = sum(check.verdict == "problem" for check in results)
     if as_json:
-        console.show_json({"good": problems == 0, "checks": [asdict(check) for check in answers]})
+        console.print_json({"good": problems == 0, "checks": [asdict(check) for check in results]})
     if problems:
         raise typer.Exit(1)
 
 
 def _load(path: Path, changes: list[str]) -> Settings:
-    """Read a config: a client's where it has what only a client's has, else a server's."""
+    """Read a config, as a client's if it has a key that only a client's has, else as a server's."""
     data = read_yaml(path)
     video = data.get("video")
     keys = {*data, *(f"video.{key}" for key in (video if isinstance(video, dict) else {}))}
     for parts, _ in map(split_change, changes):
         keys |= {parts[0], ".".join(parts[:2])}
-    if keys & CLIENT_ONLY:
+    if keys & CLIENT_ONLY_KEYS:
         return load_config(ClientConfig, path, changes)
     return load_config(ServerConfig, path, changes)
 
@@ -124,18 +125,18 @@ def _machine(config: Settings, side: str, clock: MachineClock) -> Iterator[Check
     yield checks.check_buffer(probes.receive_buffer_bytes())
     yield checks.check_arrival(probes.arrivals_are_stamped())
     yield checks.check_timer(*probes.timer(clock))
-    yield checks.check_precedence(probes.niceness())
+    yield checks.check_process_priority(probes.niceness())
     yield checks.check_governor(probes.governors())
 
 
 def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
-    """Time the codec at the config's own settings; what a client does not know of the video is as shipped."""
-    server = config if isinstance(config, ServerConfig) else _as_sent(config)
+    """Time the codec at the config's settings; for a client, settings of the server have their defaults."""
+    server = config if isinstance(config, ServerConfig) else _assumed_server(config)
     size = f"{server.camera.width_px}x{server.camera.height_px}"
     try:
         times = probes.codec_times(server, clock)
-    except (LavtError, OSError, ValueError) as error:  # PyAV's own errors are both of these
-        do = "see that PyAV has libx264 (`pip install --force-reinstall av`), and that the camera's size is possible"
+    except (LavtError, OSError, ValueError) as error:  # PyAV's errors derive from OSError or ValueError
+        do = "check that PyAV has libx264 (`pip install --force-reinstall av`) and that the picture size is supported"
         return Check("processor", "problem", f"pictures of {size} cannot be encoded and decoded here: {error}", do)
     cores = len(os.sched_getaffinity(0))
     return checks.check_codec(times, size=size, rate_hz=server.camera.rate_hz, side=side, cores=cores)
@@ -144,20 +145,21 @@ def _codec(config: Settings, side: str, clock: MachineClock) -> Check:
 def _camera(settings: ServerConfig, clock: MachineClock) -> Check:
     camera = settings.camera
     size = f"{camera.width_px}x{camera.height_px}"
-    seen = probes.camera_seen(settings, clock)
-    return checks.check_camera(seen, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
+    sample = probes.sample_camera(settings, clock)
+    return checks.check_camera(sample, name=str(camera.device), size=size, rate_hz=camera.rate_hz)
 
 
 def _by_wire(settings: ServerConfig, clock: MachineClock) -> Check:
     bus = f"{settings.vehicle.dbw.interface} {settings.vehicle.dbw.channel}"
     try:
-        heard, inhibit_reason = listen(settings.vehicle, clock, LISTEN_NS)
+        frames, inhibit_reason = listen(settings.vehicle, clock, LISTEN_NS)
     except UserError as error:
-        heard, inhibit_reason = 0, str(error)
-    return checks.check_by_wire(heard, inhibit_reason, name=bus)
+        frames, inhibit_reason = 0, str(error)
+    return checks.check_by_wire(frames, inhibit_reason, name=bus)
 
 
-def _as_sent(config: ClientConfig) -> ServerConfig:
+def _assumed_server(config: ClientConfig) -> ServerConfig:
+    """Return a server config with the client's camera settings."""
     camera = client_camera(config.camera)
     return ServerConfig(
         camera=ServerCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=config.camera.rate_hz)
@@ -166,13 +168,13 @@ def _as_sent(config: ClientConfig) -> ServerConfig:
 
 def _security(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     files = probes.key_files(settings.security)
-    yield checks.check_plain(bool(files))
+    yield checks.check_keys_configured(bool(files))
     for key, path, private in files:
         rejection, mode = probes.file_state(path)
         yield checks.check_key_file(key, path, rejection=rejection, mode=mode, private=private)
     rejection = probes.keys_rejection(settings)
     if rejection:
-        yield Check("keys", "problem", rejection, "copy what `lavt keys` made for this machine (docs/deployment.md)")
+        yield Check("keys", "problem", rejection, "copy this machine's files from `lavt keys` (docs/deployment.md)")
     for folder in sorted({path.parent for _, path, _ in files}):
         for path, days_left in probes.certificates(folder, clock.now().wall_ns):
             yield checks.check_certificate(path, days_left)
@@ -182,25 +184,25 @@ def _ports(settings: ServerConfig, clock: MachineClock) -> Iterator[Check]:
     host, probe_port = settings.video.bind, settings.clock.probe_port
     ports = (("video port", "video.port", settings.video.port), ("probe port", "clock.probe_port", probe_port))
     rejections = {key: probes.bind_rejection(host, port) for _, key, port in ports}
-    served = False
+    is_served = False
     if any(rejections.values()) and probe_port:
-        served = bool(probe(clock, "127.0.0.1" if host == EVERYWHERE else host, probe_port, PROBING_NS // 10)[0])
+        is_served = bool(probe(clock, "127.0.0.1" if host == ANY_ADDRESS else host, probe_port, PROBING_NS // 10)[0])
     for name, key, port in ports:
-        yield checks.check_port(name, key, host, port, rejection=rejections[key], served=served)
+        yield checks.check_port(name, key, host, port, rejection=rejections[key], is_served=is_served)
 
 
 def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     endpoint = settings.zenoh.router or f"the endpoint of {settings.zenoh.session}"
     if probes.keys_rejection(settings):
-        yield Check("router", "not checked", "the keys must be put right before")
+        yield Check("router", "not checked", "fix the keys first")
         return
-    listener = probes.Listener(settings)
+    listener = probes.StateListener(settings)
     try:
         link = ZenohLink(
             clock,
             listener.receive,
             side="client",
-            path=find(Path(settings.zenoh.session)),
+            path=find_file(Path(settings.zenoh.session)),
             router=settings.zenoh.router,
             vehicle=settings.vehicle_id,
             who=WHO,
@@ -211,19 +213,19 @@ def _zenoh(settings: Settings, clock: MachineClock) -> Iterator[Check]:
     with closing(link):
         yield checks.check_router(endpoint, "")
         if isinstance(settings, ServerConfig):
-            yield checks.check_link(link.routers(), heard=False)
+            yield checks.check_link(link.routers(), has_vehicle=False)
             return
-        heard = listener.hear(link, clock)
-        yield checks.check_vehicle(heard, settings.vehicle_id, lavt.__version__)
-        yield checks.check_link(link.routers(), heard=bool(heard.states or heard.unreadable))
+        received = listener.listen(link, clock)
+        yield checks.check_vehicle(received, settings.vehicle_id, lavt.__version__)
+        yield checks.check_link(link.routers(), has_vehicle=bool(received.states or received.unreadable))
 
 
 def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClock) -> Check:
     host, port = settings.video.server, settings.clock.probe_port
     try:
-        address = look_up("video.server", host)
+        address = resolve_host("video.server", host)
     except UserError as error:
-        return Check("clock probe", "problem", str(error), "put the vehicle's address into video.server")
+        return Check("clock probe", "problem", str(error), "set video.server to the vehicle's address")
     probed, latest = probe(clock, address, port, PROBING_NS)
     report = probes.clock_report(settings.clock, clock)
     if latest is None or report is None:
@@ -232,9 +234,9 @@ def _probe(settings: ClientConfig, before: ClockReport | None, clock: MachineClo
 
 
 def _show(check: Check) -> None:
-    """Print one line for a program; for a person fold what is long."""
+    """Print a check, wrapped to the width of the terminal if there is one."""
     indent = " " * 30
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 10**6
     lines = [check.found, *([f"-> {check.do}"] if check.do else [])]
-    folded = [part for line in lines for part in textwrap.wrap(line, max(30, width - len(indent)))]
-    console.show(f"{check.verdict:<12}{check.name:<17} " + f"\n{indent}".join(folded))
+    wrapped = [part for line in lines for part in textwrap.wrap(line, max(30, width - len(indent)))]
+    console.print_result(f"{check.verdict:<12}{check.name:<17} " + f"\n{indent}".join(wrapped))

@@ -1,4 +1,4 @@
-"""`lavt join`: two machines' directories made into one run."""
+"""`lavt join`: join the records of two machines into one run."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from lavt.cli import console
-from lavt.cli.run import tell
-from lavt.experiment.runs.join import join as join_sides
+from lavt.cli.run import print_run
+from lavt.experiment.runs.join import join_sides
 
 
 def register(app: typer.Typer) -> None:
@@ -18,13 +18,15 @@ def register(app: typer.Typer) -> None:
 
 
 def join(
-    server: Annotated[Path, typer.Argument(help="What `lavt server --out` wrote.")],
-    client: Annotated[Path, typer.Argument(help="What `lavt client --out` wrote.")],
-    out: Annotated[Path, typer.Option(help="Directory of the run.")],
+    server: Annotated[Path, typer.Argument(help="The output directory of `lavt server`.")],
+    client: Annotated[Path, typer.Argument(help="The output directory of `lavt client`.")],
+    out: Annotated[Path, typer.Option(help="Output directory of the run.")],
     as_json: console.Json = False,
 ) -> None:
-    """Make one run of the records of two machines, and compute its result.
+    """Join the records of two machines into one run.
+
+    The command also computes the result of the run.
 
     Example: lavt join out/server out/client --out out/run; lavt report out/run
     """
-    tell(join_sides(server, client, out), out, as_json=as_json)
+    print_run(join_sides(server, client, out), out, as_json=as_json)

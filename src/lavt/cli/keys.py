@@ -1,4 +1,4 @@
-"""`lavt keys`: a test authority with certificates and keys, and which file goes to which machine."""
+"""`lavt keys`: create certificates and signing keys with a test authority, and list the files for each machine."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 AUTHORITY: Final = "authority"
 DEFAULT_DAYS: Final = 365
-LONGEST_DAYS: Final = 3650
-DIALLED: Final = ("vehicle", "cloud")
-"""Whose routers others dial: their certificates name the addresses."""
-PINNED: Final[Mapping[str, tuple[str, ...]]] = {
+MAX_DAYS: Final = 3650
+LISTENING_ROLES: Final = ("vehicle", "cloud")
+"""Roles whose routers accept connections: their certificates contain their addresses."""
+PINNED_ROLES: Final[Mapping[str, tuple[str, ...]]] = {
     "vehicle": ("operator",),
     "operator": ("vehicle",),
     "monitor": ("vehicle",),
     "cloud": (),
 }
-"""Whose signatures each role checks: it needs their public keys."""
+"""The roles whose signatures each role verifies with their public keys."""
 
 Names = list[str] | None
 
@@ -41,20 +41,21 @@ def register(app: typer.Typer) -> None:
 
 
 def keys(
-    directory: Annotated[Path, typer.Argument(help="Where the authority is, or will be made.")],
-    vehicle: Annotated[Names, typer.Option(help="A vehicle's name, as in its config; as often as needed.")] = None,
-    operator: Annotated[Names, typer.Option(help="An operator: may drive; as often as needed.")] = None,
-    monitor: Annotated[Names, typer.Option(help="Someone who may only watch the state; as often as needed.")] = None,
-    cloud: Annotated[Names, typer.Option(help="A router between the others; as often as needed.")] = None,
+    directory: Annotated[Path, typer.Argument(help="The authority's directory; created if it does not exist.")],
+    vehicle: Annotated[Names, typer.Option(help="A vehicle's name, as in its config; repeatable.")] = None,
+    operator: Annotated[Names, typer.Option(help="An operator's name: may drive; repeatable.")] = None,
+    monitor: Annotated[Names, typer.Option(help="A monitor's name: may watch the state only; repeatable.")] = None,
+    cloud: Annotated[Names, typer.Option(help="The name of a router in the cloud; repeatable.")] = None,
     host: Annotated[
         Names,
-        typer.Option(help="Address or host name at which these vehicles and clouds are dialled; as often as needed."),
+        typer.Option(help="An address or host name of these vehicles and clouds; repeatable."),
     ] = None,
-    days: Annotated[int, typer.Option(help="For how many days the certificates hold.")] = DEFAULT_DAYS,
+    days: Annotated[int, typer.Option(help="Validity of the certificates in days.")] = DEFAULT_DAYS,
 ) -> None:
-    """Make a test authority, and certificates and signing keys for names; run again to add names.
+    """Create certificates and signing keys with a test authority.
 
-    It is an authority for tests: its key lies in a file without a password. Nothing that exists is overwritten.
+    Run the command again to add names. The authority is for tests only: its private key has no password. The command
+    overwrites nothing.
 
     Example: lavt keys keys --vehicle vehicle-1 --operator operator-1 --host 192.0.2.7
     """
@@ -67,20 +68,18 @@ def keys(
     authority = _authority(certificates, directory, now_wall_ns, days)
     for role, names in roles.items():
         for name in names:
-            dialled_at = hosts if role in DIALLED else None
+            server_hosts = hosts if role in LISTENING_ROLES else None
             pair = certificates.new_certificate(
-                authority, name, role, dialled_at=dialled_at, now_wall_ns=now_wall_ns, days=days
+                authority, name, role, server_hosts=server_hosts, now_wall_ns=now_wall_ns, days=days
             )
             _write_pair(directory, name, (".key", ".pem"), pair)
             _write_pair(directory, name, (".sign.key", ".sign.pub"), certificates.new_signing_pair())
-    console.show(
-        "\n".join(
-            _told(directory, certificates.described(authority.shown, AUTHORITY), _everybody(certificates, directory))
-        )
-    )
+    summary = certificates.summarize(authority.public, AUTHORITY)
+    console.print_result("\n".join(_instructions(directory, summary, _list_certificates(certificates, directory))))
 
 
 def _certificates() -> ModuleType:
+    """Import the certificates module; raise `UserError` if its dependency is not installed."""
     try:
         from lavt.transport.security import certificates  # noqa: PLC0415 (an extra)
     except ImportError as error:
@@ -89,50 +88,50 @@ def _certificates() -> ModuleType:
 
 
 def _check(certificates: ModuleType, roles: Mapping[str, list[str]], hosts: Iterable[str], days: int) -> None:
-    """Raise `UserError` for what nothing can be made of."""
+    """Raise `UserError` for missing, invalid or repeated names, invalid hosts, and an invalid number of days."""
     names = [name for each in roles.values() for name in each]
     if not names:
-        raise UserError("keys for nobody: give names, such as --vehicle vehicle-1 --operator operator-1")
+        raise UserError("no names: give some, such as --vehicle vehicle-1 --operator operator-1")
     for name in names:
         if not NAME.match(name) or name == AUTHORITY:
             raise UserError(
-                f"nobody can be called {name!r}: use 1 to 32 letters, digits, _ or -, not _ or - first, and not "
-                f"{AUTHORITY!r}"
+                f"{name!r} is not a valid name: use 1 to 32 letters, digits, _ or -, begin with a letter or digit, "
+                f"and do not use {AUTHORITY!r}"
             )
-    twice = [name for name, times in Counter(names).items() if times > 1]
-    if twice:
-        raise UserError(f"{twice[0]!r} is there twice: access is by name, so each needs one of its own")
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        raise UserError(f"{repeated[0]!r} is given twice: access is by name, so names must be unique")
     for host in hosts:
         if not certificates.is_host(host):
             raise UserError(f"--host {host!r} is neither an address nor a host name: leave out port and protocol")
-    if hosts and not any(roles[role] for role in DIALLED):
-        raise UserError("--host is where a vehicle or a cloud is dialled: name one with --vehicle or --cloud")
-    if not 1 <= days <= LONGEST_DAYS:
-        raise UserError(f"--days {days}: choose 1 to {LONGEST_DAYS}")
+    if hosts and not any(roles[role] for role in LISTENING_ROLES):
+        raise UserError("--host is the address of a vehicle or cloud: name one with --vehicle or --cloud")
+    if not 1 <= days <= MAX_DAYS:
+        raise UserError(f"--days {days}: choose 1 to {MAX_DAYS}")
 
 
 def _check_directory(directory: Path, names: Iterable[str]) -> None:
-    """Raise `UserError` where something would be overwritten, half of an authority is missing, or others may look."""
+    """Raise `UserError` for existing files, an incomplete authority, or a directory that others can read."""
     if not directory.exists():
         return
     if not directory.is_dir():
         raise UserError(f"{directory} is a file: name a directory")
     if directory.stat().st_mode & 0o077:
-        raise UserError(f"others may look into {directory}, where private keys shall be: chmod 700 {directory}")
-    halves = [directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem")]
-    missing = [half for half in halves if not half.exists()]
+        raise UserError(f"other users can read {directory}, which is for private keys: chmod 700 {directory}")
+    files = [directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem")]
+    missing = [file for file in files if not file.exists()]
     if len(missing) == 1:
-        raise UserError(f"{missing[0]} is missing: copy it back, or make a new authority in another directory")
+        raise UserError(f"{missing[0]} is missing: restore it, or create a new authority in another directory")
     for name in names:
         for ending in (".key", ".pem", ".sign.key", ".sign.pub"):
             if (directory / (name + ending)).exists():
                 raise UserError(
-                    f"{directory / (name + ending)} exists and is not overwritten: choose another name, or move it away"
+                    f"{directory / (name + ending)} already exists: choose another name, or move the file away"
                 )
 
 
 def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days: int) -> KeyPair:
-    """Read the authority of the directory, or make one."""
+    """Read the authority of the directory, or create one."""
     key, shown = (directory / f"{AUTHORITY}{ending}" for ending in (".key", ".pem"))
     if key.exists():
         pair: KeyPair = certificates.KeyPair(key.read_bytes(), shown.read_bytes())
@@ -144,32 +143,33 @@ def _authority(certificates: ModuleType, directory: Path, now_wall_ns: int, days
 
 
 def _write_pair(directory: Path, name: str, endings: tuple[str, str], pair: KeyPair) -> None:
-    """Write a private file, which only its owner may read, and the one that may be shown."""
-    for ending, content, mode in zip(endings, (pair.private, pair.shown), (0o600, 0o644), strict=True):
+    """Write a private file, readable by its owner only, and its public file."""
+    for ending, content, mode in zip(endings, (pair.private, pair.public), (0o600, 0o644), strict=True):
         created = os.open(directory / (name + ending), os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(created, "wb") as file:
             file.write(content)
 
 
-def _everybody(certificates: ModuleType, directory: Path) -> list[CertificateSummary]:
-    """Give all whose certificates are in the directory, by role and name."""
+def _list_certificates(certificates: ModuleType, directory: Path) -> list[CertificateSummary]:
+    """Return the summaries of all certificates in the directory, sorted by role and name."""
     found = [
-        certificates.described(path.read_bytes(), str(path))
+        certificates.summarize(path.read_bytes(), str(path))
         for path in directory.glob("*.pem")
         if path.name != f"{AUTHORITY}.pem"
     ]
-    order = list(PINNED)
+    order = list(PINNED_ROLES)
     return sorted((each for each in found if each.role in order), key=lambda each: (order.index(each.role), each.name))
 
 
-def _told(directory: Path, authority: CertificateSummary, everybody: list[CertificateSummary]) -> list[str]:
-    lines = [f"{directory} is a test authority until {authority.expires}; {AUTHORITY}.key never leaves this machine."]
-    for one in everybody:
+def _instructions(directory: Path, authority: CertificateSummary, summaries: list[CertificateSummary]) -> list[str]:
+    """Return the lines that list which files to copy to which machine."""
+    lines = [f"{directory} is a test authority, valid until {authority.expires}; keep {AUTHORITY}.key on this machine."]
+    for one in summaries:
         own = f"{AUTHORITY}.pem {one.name}.pem {one.name}.key"
-        signing = f" {one.name}.sign.key" if PINNED[one.role] else ""
-        pinned = "".join(f" {other.name}.sign.pub" for other in everybody if other.role in PINNED[one.role])
-        at = f", dialled at {', '.join(one.hosts)}" if one.hosts else ""
-        lines.append(f"{one.role} {one.name}, until {one.expires}{at}")
+        signing = f" {one.name}.sign.key" if PINNED_ROLES[one.role] else ""
+        pinned = "".join(f" {other.name}.sign.pub" for other in summaries if other.role in PINNED_ROLES[one.role])
+        hosts = f", reachable at {', '.join(one.hosts)}" if one.hosts else ""
+        lines.append(f"{one.role} {one.name}, valid until {one.expires}{hosts}")
         lines.append(f"  copy to its machine: {own}{signing}{pinned}")
-    lines.append("Each .key goes to that one machine only, readable by LAVT's user only (mode 0600).")
+    lines.append("Copy each .key to that one machine only, and make it readable by LAVT's user only (mode 0600).")
     return lines

@@ -1,4 +1,4 @@
-"""What a person sees while a drive goes on: one line that changes on a terminal, a line now and then elsewhere."""
+"""The live status of a drive: one line that is updated on a terminal, a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-LINE_EVERY = 25
-"""Off a terminal: one line for so many updates (5 s)."""
+UPDATES_PER_LINE = 25
+"""Without a terminal, one line is printed per this many updates (5 s)."""
 
 
 class LiveView:
-    """Shows speed, latencies and cross-track error of a drive on one machine, where both sides share a clock."""
+    """A view of speed, latencies and cross-track error of a drive on one machine, whose sides share a clock."""
 
     def __init__(self, title: str) -> None:
         self._title = title
@@ -37,11 +37,11 @@ class LiveView:
             self._live.stop()
 
     def update(self, server: dict[str, Any], client: dict[str, Any]) -> None:
-        """Show the newest figures of both sides."""
+        """Show the newest status of both sides."""
         text = f"{self._title}: {_line(server, client)}"
         if self._live is not None:
             self._live.update(Text(text))
-        elif self._updates % LINE_EVERY == 0:
+        elif self._updates % UPDATES_PER_LINE == 0:
             self._console.print(text, highlight=False, soft_wrap=True)
         self._updates += 1
 

@@ -35,7 +35,7 @@ from lavt.cli import (
 
 app = typer.Typer(
     name="lavt",
-    help="Measures what network delay does to driving by video.",
+    help="Measure how network latency affects vision-based teleoperation.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -69,21 +69,21 @@ for command in COMMANDS:
     command.register(app)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        console.show(f"lavt {lavt.__version__}")
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
+        console.print_result(f"lavt {lavt.__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Measures what network delay does to driving by video."""
+    """Measure how network latency affects vision-based teleoperation."""
 
 
 def main() -> None:
-    """Run the command line; the exit code is that of the command."""
+    """Run the command line and exit with the command's exit code."""
     console.run_command(app)

@@ -1,4 +1,4 @@
-"""`lavt netem`: delay injected by the kernel of this machine."""
+"""`lavt netem`: inject network latency with the kernel's queues (tc netem)."""
 
 from __future__ import annotations
 
@@ -19,96 +19,104 @@ from lavt.transport.netem.probe import ProbeResult
 from lavt.transport.netem.state import DIRECTORY
 from lavt.transport.netem.tc import Command, as_typed, first_commands
 
-Interface = Annotated[str, typer.Option(help="The network interface, such as eth0: the one that faces the other side.")]
+Interface = Annotated[str, typer.Option(help="The network interface towards the other side, such as eth0.")]
 ProbePort = Annotated[int, typer.Option(help="UDP port of the clock probe, which is never delayed.", min=1, max=65535)]
-MADE_BY_HAND = "what was made by hand"
+MADE_BY_HAND = "queues that were set up by hand"
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    netem = typer.Typer(no_args_is_help=True, help="Delay injected by the kernel (tc netem), see docs/netem.md.")
+    netem = typer.Typer(no_args_is_help=True, help="Inject latency with tc netem (docs/netem.md).")
     for command in (show, apply, verify, clear):
         netem.command(command.__name__)(command)
     app.add_typer(netem, name="netem")
 
 
 def show(interface: Interface, as_json: console.Json = False) -> None:
-    """Show what an interface holds, as the kernel tells it.
+    """Show the delay queues of an interface.
 
     Example: lavt netem show --interface eth0
     """
-    shown = NetemInterface(interface).shown()
+    shown = NetemInterface(interface).status()
     applied = shown["applied"] if shown["ours"] else None
-    laws = {name: asdict(law) for name, law in shown["laws"].items()} if shown["ours"] else {}
+    impairments = {name: asdict(each) for name, each in shown["impairments"].items()} if shown["ours"] else {}
     if as_json:
-        whose = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
-        console.show_json({**shown, "laws": laws, "applied": whose})
+        owner = None if applied is None else {"condition": applied.condition, "owner_pid": applied.owner[0] or None}
+        console.print_json({**shown, "impairments": impairments, "applied": owner})
         return
     if not shown["ours"]:
-        console.show(f"{interface} holds nothing of ours: {', '.join(shown['queues']) or 'no queue'}")
+        console.print_result(f"{interface} has no delay queues of LAVT: {', '.join(shown['queues']) or 'no queue'}")
         return
-    console.show(f"{interface} holds {MADE_BY_HAND if applied is None else applied.words}")
-    for name, law in laws.items():
-        told = ", ".join(f"{key} {value:g}" for key, value in law.items() if isinstance(value, int | float) and value)
-        console.show(f"  {name}: {told or 'nothing'}")
+    console.print_result(f"{interface} has {MADE_BY_HAND if applied is None else applied.description}")
+    for name, impairment in impairments.items():
+        values = [f"{key} {value:g}" for key, value in impairment.items() if isinstance(value, int | float) and value]
+        console.print_result(f"  {name}: {', '.join(values) or 'no impairment'}")
 
 
 def apply(
     name: Annotated[str, typer.Argument(metavar="CONDITION", help="A condition of netem/conditions.yaml, such as L4.")],
     interface: Interface,
-    role: Annotated[Role, typer.Option(help="What this machine is; both: server and client on one machine.")],
-    video_port: Annotated[int, typer.Option(help="The server's UDP port of the video.", min=1, max=65535)] = 5600,
-    control_port: Annotated[
-        int, typer.Option(help="Port of the server's router, to which the client's dials.", min=1, max=65535)
-    ] = 7448,
-    protocol: Annotated[Protocol, typer.Option(help="What the routers talk by: udp (also QUIC) or tcp.")] = "udp",
+    role: Annotated[Role, typer.Option(help="This machine's role; both: server and client on one machine.")],
+    video_port: Annotated[int, typer.Option(help="The server's UDP port for video.", min=1, max=65535)] = 5600,
+    control_port: Annotated[int, typer.Option(help="The port of the server's router.", min=1, max=65535)] = 7448,
+    protocol: Annotated[Protocol, typer.Option(help="The routers' protocol: udp (also for QUIC) or tcp.")] = "udp",
     probe_port: ProbePort = probe.DEFAULT_PORT,
     state_delay: Annotated[StateDelay, typer.Option(help="with_video: delay the state like the video.")] = "none",
-    hold: Annotated[bool, typer.Option("--hold", help="Stay, and put the interface back at the end (Ctrl-C).")] = False,
+    hold: Annotated[bool, typer.Option("--hold", help="Run until Ctrl-C, then restore the interface.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the commands for a free interface only.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Delay what this machine sends as a condition asks, verify it by reading back and by measuring, and leave it so.
+    """Apply a network condition to an interface and verify it.
 
-    What is there already is changed without losing a packet. Where the verification fails, the interface is put back;
-    where the change itself fails, and a delay was there before, it is said that something is left.
+    The condition delays packets that this machine sends, and stays in force after the command. The command reads the
+    queues back and measures the delay. An existing condition is replaced without packet loss. If the verification
+    fails, the command restores the interface. If the change fails on an interface that was already delayed, the command
+    says that some queues may be left.
 
     Example: lavt netem apply L4 --role server --interface eth0
     """
     flows = netem_flows(
-        condition(name), role, video_port=video_port, control_port=control_port, protocol=protocol,
+        condition(name),
+        role,
+        video_port=video_port,
+        control_port=control_port,
+        protocol=protocol,
         state_delay=state_delay,
-    )  # fmt: skip
-    never = [ExemptPort("udp", probe_port, "the clock probe")]
-    check_flows(flows, never)
-    netem = NetemInterface(interface, stays=not hold)
+    )
+    exempt = [ExemptPort("udp", probe_port, "the clock probe")]
+    check_flows(flows, exempt)
+    netem = NetemInterface(interface, persistent=not hold)
     if dry_run:
-        _tell_commands(first_commands(interface, flows, tables=str(DIRECTORY)), as_json, interface, name)
+        _print_commands(first_commands(interface, flows, tables=str(DIRECTORY)), as_json, interface, name)
         return
-    _say_restored(netem.check())
-    with console.until_told() as told:
-        was_held = netem.shown()["ours"]
+    _print_messages(netem.check())
+    with console.stop_on_signals() as stop:
+        was_delayed = netem.status()["ours"]
         try:
-            commands = netem.apply(flows, never=never, condition=name)
+            commands = netem.apply(flows, exempt=exempt, condition=name)
             if not as_json:
-                _show_commands(commands)
-            found = netem.verify(flows, never=never)
-            _tell(found, as_json, {"interface": interface, "condition": name, "commands": commands})
-            if hold and not found.reasons:
-                told.wait()
+                _print_command_lines(commands)
+            verification = netem.verify(flows, exempt=exempt)
+            _print_verification(
+                verification, as_json, {"interface": interface, "condition": name, "commands": commands}
+            )
+            if hold and not verification.reasons:
+                stop.wait()
         except BaseException:
-            _put_back(netem, was_held)
+            _restore(netem, was_delayed)
             raise
-        if hold or found.reasons or told.is_set():
+        if hold or verification.reasons or stop.is_set():
             for command in netem.clear():
-                console.say(as_typed(command))
-    _fail(found)
-    if told.is_set() and not hold:
-        raise WorkError(f"stopped; {interface} is as it was")
+                console.print_message(as_typed(command))
+    _raise_if_failed(verification)
+    if stop.is_set() and not hold:
+        raise WorkError(f"stopped; {interface} is restored")
 
 
 def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_json: console.Json = False) -> None:
-    """Verify what was applied to an interface by reading back and by measuring.
+    """Verify the condition that was applied to an interface.
+
+    The command reads the queues back and measures the delay.
 
     Example: lavt netem verify --interface eth0
     """
@@ -116,73 +124,77 @@ def verify(interface: Interface, probe_port: ProbePort = probe.DEFAULT_PORT, as_
     applied = netem.applied()
     if applied is None:
         raise UserError(f"nothing was applied to {interface}: apply a condition first (`lavt netem apply`)")
-    never = [ExemptPort("udp", probe_port, "the clock probe")]
-    found = netem.verify(applied.flows, never=never)
-    _tell(found, as_json, {"interface": interface, "condition": applied.condition})
-    _fail(found)
+    exempt = [ExemptPort("udp", probe_port, "the clock probe")]
+    verification = netem.verify(applied.flows, exempt=exempt)
+    _print_verification(verification, as_json, {"interface": interface, "condition": applied.condition})
+    _raise_if_failed(verification)
 
 
 def clear(
     interface: Interface,
-    at_once: Annotated[bool, typer.Option("--at-once", help="Do not wait for what is under way: it is lost.")] = False,
+    at_once: Annotated[
+        bool, typer.Option("--at-once", help="Drop the packets that are queued instead of waiting for them.")
+    ] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Put an interface back as it was, whoever delays it, and say who did; what is under way is waited for.
+    """Remove the delay from an interface, whoever applied it.
+
+    The command waits until queued packets have left, and prints whose delay it has removed.
 
     Example: lavt netem clear --interface eth0
     """
     netem = NetemInterface(interface)
-    _say_restored(netem.restore())
+    _print_messages(netem.restore())
     applied = netem.applied()
-    commands = netem.clear(at_once=at_once, of_anybody=True)
+    commands = netem.clear(at_once=at_once, any_owner=True)
     if commands:
-        console.say(f"lavt: taken away: {MADE_BY_HAND if applied is None else applied.words}")
-    _tell_commands(commands, as_json, interface, "")
+        console.print_message(f"lavt: removed: {MADE_BY_HAND if applied is None else applied.description}")
+    _print_commands(commands, as_json, interface, "")
     if not as_json:
-        console.show(f"{interface} is as it was" if commands else f"{interface} holds nothing of ours")
+        console.print_result(f"{interface} is restored" if commands else f"{interface} has no delay queues of LAVT")
 
 
-def _put_back(netem: NetemInterface, was_held: bool) -> None:
-    """Leave an interface as it was before a change that failed; where it was held, say how to find out what is left."""
-    if not was_held:
+def _restore(netem: NetemInterface, was_delayed: bool) -> None:
+    """Clear an interface after a failed change; if it was already delayed, explain how to find what is left."""
+    if not was_delayed:
         netem.clear()
         return
-    console.say(
-        f"lavt: {netem.interface} was held before, and is left as it is now: `lavt netem show --interface "
-        f"{netem.interface}` tells what is left, `lavt netem clear --interface {netem.interface}` takes it away"
+    console.print_message(
+        f"lavt: {netem.interface} was delayed before and is left as it is now: `lavt netem show --interface "
+        f"{netem.interface}` shows its queues, `lavt netem clear --interface {netem.interface}` removes them"
     )
 
 
-def _tell_commands(commands: Sequence[Command], as_json: bool, interface: str, name: str) -> None:
+def _print_commands(commands: Sequence[Command], as_json: bool, interface: str, name: str) -> None:
     if as_json:
-        console.show_json({"interface": interface, "condition": name, "commands": commands})
+        console.print_json({"interface": interface, "condition": name, "commands": commands})
     else:
-        _show_commands(commands)
+        _print_command_lines(commands)
 
 
-def _show_commands(commands: Sequence[Command]) -> None:
+def _print_command_lines(commands: Sequence[Command]) -> None:
     for command in commands:
-        console.show(as_typed(command))
+        console.print_result(as_typed(command))
 
 
-def _say_restored(sentences: Sequence[str]) -> None:
+def _print_messages(sentences: Sequence[str]) -> None:
     for sentence in sentences:
-        console.say(f"lavt: {sentence}")
+        console.print_message(f"lavt: {sentence}")
 
 
-def _tell(found: Verification, as_json: bool, what: Mapping[str, Any]) -> None:
-    """Tell what was measured and what is wrong with it."""
+def _print_verification(verification: Verification, as_json: bool, context: Mapping[str, Any]) -> None:
+    """Print the measured delays; as JSON, print the reasons for failure too."""
     if as_json:
-        measured = {name: asdict(each) for name, each in found.measured.items()}
-        console.show_json({**what, "measured": measured, "reasons": found.reasons})
+        measured = {name: asdict(each) for name, each in verification.measured.items()}
+        console.print_json({**context, "measured": measured, "reasons": verification.reasons})
         return
-    for name, each in found.measured.items():
-        console.show(f"measured: {name}: {_words(each)}")
-    if not found.reasons:
-        console.show("read back and measured as asked")
+    for name, each in verification.measured.items():
+        console.print_result(f"measured: {name}: {_format_probe(each)}")
+    if not verification.reasons:
+        console.print_result("verified: the queues and the measured delays match the condition")
 
 
-def _words(measured: ProbeResult) -> str:
+def _format_probe(measured: ProbeResult) -> str:
     parts = ["no delay measured"]
     if measured.median_ms is not None:
         parts = [f"{measured.median_ms:.2f} ms (p5 {measured.p5_ms:.2f}, p95 {measured.p95_ms:.2f})"]
@@ -190,6 +202,6 @@ def _words(measured: ProbeResult) -> str:
     return ", ".join(parts + [f"{count} of {measured.sent} {name}" for name, count in counts.items() if count])
 
 
-def _fail(found: Verification) -> None:
-    if found.reasons:
-        raise WorkError("netem does not do as asked: " + "; ".join(found.reasons))
+def _raise_if_failed(verification: Verification) -> None:
+    if verification.reasons:
+        raise WorkError("netem does not match the condition: " + "; ".join(verification.reasons))

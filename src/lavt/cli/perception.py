@@ -1,4 +1,4 @@
-"""`lavt perception`: what perception does with a picture, step by step."""
+"""`lavt perception`: draw the steps of perception."""
 
 from __future__ import annotations
 
@@ -17,48 +17,54 @@ from lavt.errors import UserError
 from lavt.perception.calibration import CalibratedCamera
 from lavt.perception.lane_detector import GRID, LANE_WIDTH_M, LaneDetector
 from lavt.perception.panel import panel
-from lavt.transport.video.stamp import holds_stamp
+from lavt.transport.video.stamp import has_stamp
 
 
 def register(app: typer.Typer) -> None:
     """Add the group of commands."""
-    group = typer.Typer(help="What perception does with pictures.", no_args_is_help=True, rich_markup_mode=None)
+    group = typer.Typer(help="Inspect lane detection.", no_args_is_help=True, rich_markup_mode=None)
     group.callback()(_group)
     group.command("show")(show)
     app.add_typer(group, name="perception")
 
 
 def _group() -> None:
-    """What perception does with pictures."""
+    """Inspect lane detection."""
 
 
 def show(
     source: Annotated[Path, typer.Argument(help="PNG, JPEG, MP4, MKV, or a run's client.mcap.")],
     camera: Annotated[Path, typer.Option(help="A calibration in YAML, or a config with a camera section.")],
     out: Annotated[
-        Path | None, typer.Option(help=".png or .jpg, for a video .mp4 or .mkv; default: NAME-steps.")
+        Path | None,
+        typer.Option(help="Output file: .png or .jpg for a picture, .mp4 or .mkv for a video; default: NAME-steps."),
     ] = None,
-    lane_width_m: Annotated[float, typer.Option(min=2.0, max=5.0, help="Where it cannot be seen.")] = LANE_WIDTH_M,
+    lane_width_m: Annotated[
+        float, typer.Option(min=2.0, max=5.0, help="The assumed lane width if only one marking is visible.")
+    ] = LANE_WIDTH_M,
 ) -> None:
-    """Draw all steps from a picture to the lane in it, side by side; for a video, one such picture for each.
+    """Draw the steps from a picture to its lane.
+
+    The steps are drawn side by side. For a video, the output is a video with the steps of each picture.
 
     Example: lavt perception show out/run/client.mcap --camera configs/demo.yaml --out steps.mp4
     """
-    known = camera_of_file(camera)
-    found = read_pictures(source)
-    out = out or Path(f"{source.stem}-steps{'.mp4' if found.moving else '.png'}")
-    check_output(out, source=source, moving=found.moving)
-    first = next(found.pictures, None)
+    calibrated_camera = camera_of_file(camera)
+    file = read_pictures(source)
+    out = out or Path(f"{source.stem}-steps{'.mp4' if file.is_video else '.png'}")
+    check_output(out, source=source, is_video=file.is_video)
+    first = next(file.pictures, None)
     if first is None:
-        raise UserError(f"{source} holds no picture: name another")
-    panels = _panels(chain([first], found.pictures), known, lane_width_m, stamped=holds_stamp(first), source=source)
-    if found.moving:
+        raise UserError(f"{source} has no picture: name another file")
+    pictures = chain([first], file.pictures)
+    panels = _panels(pictures, calibrated_camera, lane_width_m, stamped=has_stamp(first), source=source)
+    if file.is_video:
         with console.interruptible():
-            count = write_video(out, panels, found.rate_hz)
-        console.show(f"the steps of {count} pictures are in {out}")
+            count = write_video(out, panels, file.rate_hz)
+        console.print_result(f"the steps of {count} pictures are in {out}")
     else:
         write_picture(out, next(panels))
-        console.show(f"the steps are in {out}")
+        console.print_result(f"the steps are in {out}")
 
 
 def _panels(

@@ -1,4 +1,4 @@
-"""Picture and video files: reading what people have, and writing what they can open."""
+"""Reading and writing of picture and video files."""
 
 from __future__ import annotations
 
@@ -17,28 +17,27 @@ from lavt.transport.video.h264 import Decoder
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 VIDEO_SUFFIXES = (".mp4", ".mkv")
-USUAL_RATE_HZ = 30.0
+DEFAULT_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class PictureFile:
-    """A file's pictures, one after another, read as they are asked for."""
+    """The pictures of a file, read lazily."""
 
     pictures: Iterator[Picture]
-    moving: bool
-    rate_hz: float = USUAL_RATE_HZ
+    is_video: bool
+    rate_hz: float = DEFAULT_RATE_HZ
 
 
 def read_pictures(path: Path) -> PictureFile:
-    """Open a picture, a video or a record (`client.mcap` of a run); raises `UserError` for what is none of them."""
+    """Open a picture, a video or a record (`client.mcap` of a run); raise `UserError` for any other file."""
     if not path.is_file():
-        raise UserError(f"{path} is not there: name a picture, a video or a record")
+        raise UserError(f"{path} does not exist: name a picture, a video or a record")
     if path.suffix == ".mcap":
-        return PictureFile(_of_record(path), moving=True)
+        return PictureFile(_read_record(path), is_video=True)
+    # OpenCV does not log errors: the errors below describe them in one sentence.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    cv2.utils.logging.setLogLevel(
-        cv2.utils.logging.LOG_LEVEL_SILENT
-    )  # what is wrong with a file is said below, in one sentence
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         data = np.fromfile(path, dtype=np.uint8)
         still = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
@@ -47,45 +46,48 @@ def read_pictures(path: Path) -> PictureFile:
     except cv2.error:
         still = None
     if still is not None:
-        return PictureFile(iter([np.asarray(still, dtype=np.uint8)]), moving=False)
+        return PictureFile(iter([np.asarray(still, dtype=np.uint8)]), is_video=False)
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise UserError(f"{path} is neither a picture nor a video that can be read: give PNG, JPEG, MP4, MKV or MCAP")
+        raise UserError(f"{path} is not a readable picture or video: give PNG, JPEG, MP4, MKV or MCAP")
     rate_hz = video.get(cv2.CAP_PROP_FPS)
-    return PictureFile(_of_video(path, video), moving=True, rate_hz=rate_hz if 1 <= rate_hz <= 240 else USUAL_RATE_HZ)
+    if not 1 <= rate_hz <= 240:
+        rate_hz = DEFAULT_RATE_HZ
+    return PictureFile(_read_video(path, video), is_video=True, rate_hz=rate_hz)
 
 
-def _of_video(path: Path, video: cv2.VideoCapture) -> Iterator[Picture]:
-    there, picture = video.read()
-    if not there:
-        raise UserError(f"{path} holds no picture that can be read: give PNG, JPEG, MP4, MKV or MCAP")
-    while there:
+def _read_video(path: Path, video: cv2.VideoCapture) -> Iterator[Picture]:
+    is_read, picture = video.read()
+    if not is_read:
+        raise UserError(f"{path} has no readable picture: give PNG, JPEG, MP4, MKV or MCAP")
+    while is_read:
         yield np.asarray(picture, dtype=np.uint8)
-        there, picture = video.read()
+        is_read, picture = video.read()
 
 
-def _of_record(path: Path) -> Iterator[Picture]:
-    decoder, found = Decoder(), False
+def _read_record(path: Path) -> Iterator[Picture]:
+    decoder, is_any = Decoder(), False
     for _, unit in read_record(path, channels=()).video():
         decoded = decoder.decode(unit)
         if decoded is not None:
-            found = True
+            is_any = True
             yield decoded.picture
-    if not found:
+    if not is_any:
         raise UserError(
-            f"{path} holds no picture: name a run's client.mcap or server.mcap, whole and made with record.video"
+            f"{path} has no picture: name the complete client.mcap or server.mcap of a run with record.video"
         )
 
 
-def check_output(out: Path, *, source: Path, moving: bool) -> None:
-    """Raise `UserError` for a name from which nobody could tell what to write, and for that of the source itself."""
-    known = VIDEO_SUFFIXES if moving else PICTURE_SUFFIXES
-    if out.suffix.lower() not in known:
-        raise UserError(f"{out} cannot be written: a {'video' if moving else 'picture'} ends with {' or '.join(known)}")
+def check_output(out: Path, *, source: Path, is_video: bool) -> None:
+    """Raise `UserError` if `out` has an unknown suffix, is in no directory, or is the source itself."""
+    suffixes = VIDEO_SUFFIXES if is_video else PICTURE_SUFFIXES
+    if out.suffix.lower() not in suffixes:
+        kind = "video" if is_video else "picture"
+        raise UserError(f"{out} cannot be written: the name of a {kind} ends with {' or '.join(suffixes)}")
     if not out.parent.is_dir():
-        raise UserError(f"{out.parent} is not a directory: make it, or name another with --out")
+        raise UserError(f"{out.parent} is not a directory: create it, or name another with --out")
     if out.exists() and out.samefile(source):
-        raise UserError(f"{out} is what is read, and would be lost: name another file with --out")
+        raise UserError(f"{out} is the input and would be overwritten: name another file with --out")
 
 
 def write_picture(out: Path, picture: Picture) -> None:
@@ -95,7 +97,7 @@ def write_picture(out: Path, picture: Picture) -> None:
 
 
 def write_video(out: Path, pictures: Iterable[Picture], rate_hz: float) -> int:
-    """Write a video and give its number of pictures."""
+    """Write a video and return its number of pictures."""
     writer: cv2.VideoWriter | None = None
     count = 0
     try:

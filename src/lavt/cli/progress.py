@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of long work: a bar on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from lavt.domain import NS_PER_S
 
 @contextmanager
 def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[Callable[[str], None]]:
-    """Give a function to be called with a line for each of `total` pieces that is done."""
+    """Yield a function to call with a line for each of the `total` runs that is done."""
     if not sys.stderr.isatty():
-        console.say(f"{title}: {total} runs")
-        yield _lines(total, clock or MachineClock())
+        console.print_message(f"{title}: {total} runs")
+        yield _line_printer(total, clock or MachineClock())
         return
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -33,21 +33,21 @@ def progress(title: str, total: int, *, clock: Clock | None = None) -> Iterator[
         yield lambda line: bar.update(task, advance=1, last=line)
 
 
-def _lines(total: int, clock: Clock) -> Callable[[str], None]:
-    """Say each line with how many are done and about how long the rest will take, at the pace so far."""
+def _line_printer(total: int, clock: Clock) -> Callable[[str], None]:
+    """Return a function that prints a line with the number of runs done and the estimated time left."""
     begin_ns, done = clock.now().mono_ns, 0
 
-    def tell(line: str) -> None:
+    def print_line(line: str) -> None:
         nonlocal done
         done += 1
         left_s = (clock.now().mono_ns - begin_ns) / done * (total - done) / NS_PER_S
-        console.say(f"{done} of {total}, {left_words(left_s)}: {line}")
+        console.print_message(f"{done} of {total}, {format_time_left(left_s)}: {line}")
 
-    return tell
+    return print_line
 
 
-def left_words(left_s: float) -> str:
-    """Say a time that is left, about."""
+def format_time_left(left_s: float) -> str:
+    """Format the time left in round numbers."""
     minutes = left_s / 60
     if minutes < 1:
         return f"{left_s:.0f} s left"

@@ -1,4 +1,4 @@
-"""`lavt relay`: delay without netem and without root."""
+"""`lavt relay`: inject network latency without netem and without root."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lavt.config import DelayConfig, ImpairmentConfig, LinkConfig, RelayConfig
 from lavt.config_file import load_config
 from lavt.errors import UserError
 from lavt.runtime import process_priority
-from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.impairment import Impairment
 from lavt.transport.emulation.link import LinkInjection
 from lavt.transport.emulation.relay import NONE, Relay, RelayedFlow, is_delayed_video, video_index
@@ -31,56 +31,62 @@ def relay(
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
-    """Carry video and control between two sides and hold back what the config says, until Ctrl-C.
+    """Forward video and control with injected latency.
+
+    The relay runs between the two sides until Ctrl-C and delays packets as its config says.
 
     Example: lavt relay configs/relay.yaml --set video.constant_ms=75
     """
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(RelayConfig, config, changes or [])
-    opened = Relay(MachineClock(), flows(settings))
-    with console.until_told() as told:
-        ports = opened.ports()
+    running = Relay(MachineClock(), flows(settings))
+    with console.stop_on_signals() as stop:
+        ports = running.ports()
         if as_json:
-            console.show_json({"ports": ports})
+            console.print_json({"ports": ports})
         else:
-            console.show(
+            console.print_result(
                 f"relaying video at port {ports['video']} and control at port {ports['control']}; Ctrl-C ends it"
             )
-        while not told.is_set():
-            opened.step()
+        while not stop.is_set():
+            running.step()
     if as_json:
-        console.show_json({"held_ms": opened.held_ms(), "late_ms": opened.late_ms(), "counts": opened.counts()})
-    opened.close()
+        console.print_json({"held_ms": running.held_ms(), "late_ms": running.late_ms(), "counts": running.counts()})
+    running.close()
 
 
 def flows(config: RelayConfig) -> list[RelayedFlow]:
-    """Give the two flows that are relayed; raises `UserError` for addresses, links and traces that cannot be used."""
+    """Return the flows to relay, video and control; raise `UserError` for invalid addresses, links and traces."""
     seed = config.seed
-    return [
-        RelayedFlow(
-            "video", _resolved("video_listen", config.video_listen), _resolved("video_server", config.video_server),
-            upstream=NONE, downstream=_law(config.video, seed, "video inherent"),
-            held_downstream=is_delayed_video, index_downstream=video_index,
-            downstream_injected=_link("video", config.video, seed),
-        ),
-        RelayedFlow(
-            "control", _resolved("control_listen", config.control_listen),
-            _resolved("control_server", config.control_server),
-            upstream=_law(config.control, seed, "control inherent"),
-            downstream=_law(config.state, seed, "state inherent"),
-            upstream_injected=_link("control", config.control, seed),
-            downstream_injected=_link("state", config.state, seed),
-        ),
-    ]  # fmt: skip
+    video = RelayedFlow(
+        "video",
+        _resolve("video_listen", config.video_listen),
+        _resolve("video_server", config.video_server),
+        upstream=NONE,
+        downstream=_delay_law(config.video, seed, "video inherent"),
+        delays_downstream=is_delayed_video,
+        index_downstream=video_index,
+        downstream_injected=_link_injection("video", config.video, seed),
+    )
+    control = RelayedFlow(
+        "control",
+        _resolve("control_listen", config.control_listen),
+        _resolve("control_server", config.control_server),
+        upstream=_delay_law(config.control, seed, "control inherent"),
+        downstream=_delay_law(config.state, seed, "state inherent"),
+        upstream_injected=_link_injection("control", config.control, seed),
+        downstream_injected=_link_injection("state", config.state, seed),
+    )
+    return [video, control]
 
 
-def _law(config: DelayConfig, seed: int, name: str) -> DelayLaw:
+def _delay_law(config: DelayConfig, seed: int, name: str) -> DelayModel:
     jitter = Lognormal(config.jitter_median_ms, config.jitter_sigma) if config.jitter_median_ms > 0 else None
-    return DelayLaw(config.constant_ms, jitter, seed, name)
+    return DelayModel(config.constant_ms, jitter, seed, name)
 
 
-def _link(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
-    """Give what `link` asks for, if it asks for anything."""
+def _link_injection(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
+    """Return the impairment of the config's `link`; None if it has none."""
     if config.link == LinkConfig():
         return None
     impairment = ImpairmentConfig(**config.link.model_dump(exclude={"delay_ms"}))
@@ -89,10 +95,10 @@ def _link(name: str, config: DelayConfig, seed: int) -> LinkInjection | None:
     )
 
 
-def _resolved(key: str, text: str) -> tuple[str, int]:
-    """Read an address of a UDP flow and look its host up."""
+def _resolve(key: str, text: str) -> tuple[str, int]:
+    """Parse the address of a UDP flow and resolve its host."""
     if text.startswith(("tcp/", "tls/", "quic/")):
         raise UserError(
-            f"{key}: the relay carries UDP only, not {text!r}: let the routers talk by udp/...?rel=1;mixed_rel=1"
+            f"{key}: the relay forwards UDP only, not {text!r}: connect the routers by udp/...?rel=1;mixed_rel=1"
         )
     return resolved_address(key, text)

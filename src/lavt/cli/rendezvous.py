@@ -1,4 +1,4 @@
-"""`lavt rendezvous`: where a client meets a vehicle behind a NAT that forwards nothing."""
+"""`lavt rendezvous`: connect clients to a vehicle behind a NAT without port forwarding."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lavt.config_file import load_config
 from lavt.runtime import process_priority
 from lavt.transport.rendezvous.forwarder import Address, FlowName
 
-LOOK_S = 0.2
+POLL_PERIOD_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
@@ -28,39 +28,43 @@ def rendezvous(
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
-    """Carry video and clock probe between clients and a vehicle that dials here, until Ctrl-C.
+    """Forward video to clients from a vehicle behind NAT.
+
+    The command also forwards the clock probe. It runs in the cloud, where the vehicle registers, until Ctrl-C.
 
     Example: lavt rendezvous configs/rendezvous.yaml --set vehicle_key=keys/vehicle-1.sign.pub
     """
-    process_priority.take()
+    process_priority.raise_priority()
     settings = load_config(RendezvousConfig, config, changes or [])
-    opened = open_rendezvous(settings, MachineClock())
-    ports = {f"{flow}_port": each.port for flow, each in opened.items()}
-    there: dict[FlowName, Address | None] = dict.fromkeys(opened)
-    with console.until_told() as told:
-        for each in opened.values():
+    forwarders = open_rendezvous(settings, MachineClock())
+    ports = {f"{flow}_port": each.port for flow, each in forwarders.items()}
+    known: dict[FlowName, Address | None] = dict.fromkeys(forwarders)
+    with console.stop_on_signals() as stop:
+        for each in forwarders.values():
             each.start()
         if as_json:
-            console.show_json({"ready": ports})
+            console.print_json({"ready": ports})
         else:
-            console.show(f"forwarding video at port {opened['video'].port} and probes at {opened['probe'].port}; "
-                         "Ctrl-C ends it")  # fmt: skip
-        while not told.wait(LOOK_S):
-            now_there = {flow: each.vehicle_at() for flow, each in opened.items()}
-            for flow in (each for each in opened if now_there[each] != there[each]):
-                _tell(settings.vehicle_id, flow, now_there[flow], as_json=as_json)
-            there.update(now_there)
-    for each in opened.values():
+            console.print_result(
+                f"forwarding video at port {forwarders['video'].port} and probes at port {forwarders['probe'].port}; "
+                "Ctrl-C ends it"
+            )
+        while not stop.wait(POLL_PERIOD_S):
+            addresses = {flow: each.vehicle_address() for flow, each in forwarders.items()}
+            for flow in (each for each in forwarders if addresses[each] != known[each]):
+                _print_address(settings.vehicle_id, flow, addresses[flow], as_json=as_json)
+            known.update(addresses)
+    for each in forwarders.values():
         each.close()
     if as_json:
-        console.show_json({"counts": {flow: each.counts for flow, each in opened.items()}})
+        console.print_json({"counts": {flow: each.counts for flow, each in forwarders.items()}})
 
 
-def _tell(vehicle: str, flow: str, at: Address | None, *, as_json: bool) -> None:
-    """Print from where the vehicle can be reached now, or that it cannot."""
+def _print_address(vehicle: str, flow: str, address: Address | None, *, as_json: bool) -> None:
+    """Print the vehicle's address; None if it does not register any more."""
     if as_json:
-        console.show_json({"flow": flow, "vehicle_at": at})
-    elif at is None:
-        console.show(f"{flow}: {vehicle} is not heard any more")
+        console.print_json({"flow": flow, "vehicle_at": address})
+    elif address is None:
+        console.print_result(f"{flow}: {vehicle} no longer registers")
     else:
-        console.show(f"{flow}: {vehicle} is at {at[0]}:{at[1]}")
+        console.print_result(f"{flow}: {vehicle} is at {address[0]}:{address[1]}")

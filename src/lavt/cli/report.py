@@ -1,4 +1,4 @@
-"""`lavt report`: the report of runs that were driven, made again from their records."""
+"""`lavt report`: write the report of finished runs from their records."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    directories: Annotated[
-        list[Path], typer.Argument(help="Run directories, sweep directories of runs, and those of `lavt boundary`.")
-    ],
+    directories: Annotated[list[Path], typer.Argument(help="Directories of runs, of sweeps, and of `lavt boundary`.")],
     out: console.Out = None,
 ) -> None:
-    """Compute the results of runs again from their records, and write summary.json and report/index.html.
+    """Write a report of finished runs.
+
+    The command computes the results from the records again, and writes summary.json and report/index.html.
 
     Example: lavt report out/paper out/designed --out out/both
     """
@@ -39,24 +39,24 @@ def report(
     from lavt.experiment.report.report import read_failed, write_report  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     boundaries = [_read_boundary(directory) for directory in directories if (directory / BOUNDARY).is_file()]
-    driven = {directory: _runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
-    if not driven:
-        raise UserError(f"{directories[0]} holds a boundary and no runs: name the directory of a sweep beside it")
-    runs = [run for runs in driven.values() for run in runs]
-    results = [_read_result(run / RESULT) for run in runs]  # all of them, before any is written
+    run_dirs = {directory: _find_runs(directory) for directory in directories if not (directory / BOUNDARY).is_file()}
+    if not run_dirs:
+        raise UserError(f"{directories[0]} has a boundary and no runs: name the directory of a sweep, too")
+    runs = [run for runs in run_dirs.values() for run in runs]
+    results = [_read_result(run / RESULT) for run in runs]  # read all before writing any
     for run, result in zip(runs, results, strict=True):
         compute_result(run, result, result.get("digest"))
-    names = _sweep_names(list(driven))
-    sweeps = {run: name for directory, name in names.items() for run in driven[directory]}
+    names = _sweep_names(list(run_dirs))
+    sweeps = {run: name for directory, name in names.items() for run in run_dirs[directory]}
     make_directory(out)
-    failed = [each for directory in driven for each in read_failed(directory)]
-    base = _base(list(driven), names)
+    failed = [each for directory in run_dirs for each in read_failed(directory)]
+    base = _base(list(run_dirs), names)
     page = write_report(out, run_dirs=runs, base=base, sweeps=sweeps, boundaries=boundaries, failed=failed)
-    console.show(f"the report is {page}")
+    console.print_result(f"the report is {page}")
 
 
 def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any] | None:
-    """Tell what the runs of the first sweep's base config have in common; None where all runs are reported alike."""
+    """Return the base config of the first sweep, by which the report groups its runs; None if there is no sweep."""
     from lavt.experiment.sweep.sweep import recorded_base  # noqa: PLC0415 (slow: scipy, matplotlib)
 
     if len(directories) == 1:
@@ -66,7 +66,7 @@ def _base(directories: Sequence[Path], names: dict[Path, str]) -> dict[str, Any]
 
 
 def _sweep_names(directories: Sequence[Path]) -> dict[Path, str]:
-    """Name each sweep after its directory, with those above it where two would have one name; none for one alone."""
+    """Name each sweep after its directory, with parent directories if needed to be unique; no names for one sweep."""
     sweeps = [directory for directory in directories if not (directory / RESULT).is_file()]
     if len(sweeps) < 2:
         return {}
@@ -81,29 +81,29 @@ def _read_boundary(directory: Path) -> dict[str, Any]:
     boundary: Any = read_json(directory / BOUNDARY)
     lists = [boundary.get(key) for key in ("runs", "groups")] if isinstance(boundary, dict) else []
     if not lists or not all(isinstance(each, list) and each for each in lists):
-        raise WorkError(f"{directory / BOUNDARY} holds no boundary: it lacks runs or groups")
+        raise WorkError(f"{directory / BOUNDARY} is not a boundary: it lacks runs or groups")
     return dict(boundary)
 
 
-def _runs(directory: Path) -> list[Path]:
-    """Give the run directories in `directory`, which may be one itself."""
+def _find_runs(directory: Path) -> list[Path]:
+    """Return the run directories in `directory`, or the directory itself if it is a run."""
     if (directory / RESULT).is_file():
         return [directory]
     runs = sorted(result.parent for result in directory.glob(f"runs/*/{RESULT}"))
     if not runs:
-        raise UserError(f"{directory} holds no finished run: name a run directory or that of a sweep")
+        raise UserError(f"{directory} has no finished run: name the directory of a run or a sweep")
     return runs
 
 
 def _read_result(path: Path) -> dict[str, Any]:
-    """Read what a run was; raises `WorkError` where the file does not say that."""
+    """Read the result of a run; raise `WorkError` if the file is not a result."""
     result = read_json(path)
     if not isinstance(result, dict):
-        raise WorkError(f"{path} is not the result of a run: it holds no JSON object")
+        raise WorkError(f"{path} is not the result of a run: it is not a JSON object")
     missing = [key for key in IDENTITY if key not in result]
     if missing:
         raise WorkError(f"{path} is not the result of a run: it lacks {', '.join(missing)}")
     for key in ("axes", "injected_ms", "injected_least_ms"):
         if not isinstance(result.get(key, {}), dict):
-            raise WorkError(f"{path} is not the result of a run: {key!r} is no JSON object")
+            raise WorkError(f"{path} is not the result of a run: {key!r} is not a JSON object")
     return result

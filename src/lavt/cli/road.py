@@ -1,4 +1,4 @@
-"""`lavt road`: look at roads."""
+"""`lavt road`: draw roads."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from lavt.vehicle.sim.road.road import load_road
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    road = typer.Typer(no_args_is_help=True, help="Look at roads: those that come with LAVT, and your own.")
-    road.callback()(_roads)  # a single command stays a sub-command
+    road = typer.Typer(no_args_is_help=True, help="Draw roads: shipped ones and your own.")
+    road.callback()(_group)  # with a callback, Typer keeps a single command as a subcommand
     road.command("draw")(draw)
     app.add_typer(road, name="road")
 
 
-def _roads() -> None:
-    """Look at roads: those that come with LAVT, and your own (docs/roads.md)."""
+def _group() -> None:
+    """Draw roads: shipped ones and your own (docs/roads.md)."""
 
 
 def draw(
     name: Annotated[
-        str, typer.Argument(metavar="FILE_OR_NAME", help="A road's YAML file, or a road that comes with LAVT.")
+        str, typer.Argument(metavar="FILE_OR_NAME", help="A road's YAML file, or the name of a shipped road.")
     ],
-    out: Annotated[Path | None, typer.Option(help="The picture, a PNG; default: out/road_NAME.png.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output file, a PNG; default: out/road_NAME.png.")] = None,
 ) -> None:
     """Draw a road from above and from the driver's seat.
 
@@ -38,9 +38,9 @@ def draw(
     road = load_road(name)
     out = out or Path("out") / f"road_{Path(name).stem}.png"
     if out.suffix != ".png":
-        raise UserError(f"--out {out}: the picture is a PNG, so let the name end with .png")
+        raise UserError(f"--out {out}: the picture is a PNG, so its name must end with .png")
     from lavt.vehicle.sim.rendering.drawing import draw_road  # noqa: PLC0415 (slow: matplotlib)
 
     out.parent.mkdir(parents=True, exist_ok=True)
     draw_road(road, model=CameraModel()).savefig(out)
-    console.show(f"the picture is {out}")
+    console.print_result(f"the picture is {out}")

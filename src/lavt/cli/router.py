@@ -1,4 +1,4 @@
-"""`lavt router`: a Zenoh router in this process."""
+"""`lavt router`: run a Zenoh router in this process."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from lavt.cli import console
 from lavt.config_file import shipped, split_change
 from lavt.runtime import process_priority
 
-LOOK_S = 0.5
-"""A signal that the kernel gives to one of Zenoh's threads does not end the wait of this one, which then looks."""
+POLL_PERIOD_S = 0.5
+"""How often the main thread wakes to run signal handlers; a signal to one of Zenoh's threads does not wake it."""
 
 
 def register(app: typer.Typer) -> None:
@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 
 
 def router(
-    file: Annotated[Path, typer.Argument(help="A JSON5 config, yours or one of zenoh-configs/.")],
+    file: Annotated[Path, typer.Argument(help="A Zenoh config in JSON5, such as one of zenoh-configs/.")],
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
@@ -29,30 +29,30 @@ def router(
 
     Example: lavt router zenoh-configs/router-server.json5 --set 'listen.endpoints=[tcp/127.0.0.1:7447]'
     """
-    console.keep_stdout_for_results()
-    process_priority.take()
-    from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (nobody else should wait for Zenoh)
+    console.reserve_stdout()
+    process_priority.raise_priority()
+    from lavt.transport.zenoh_link import Router, quiet_logs  # noqa: PLC0415 (slow: Zenoh)
 
     quiet_logs()
-    opened = Router(find(file), overrides(changes or []))
+    running = Router(find_file(file), parse_overrides(changes or []))
     try:
-        with console.until_told() as told:
-            locators = opened.locators()
+        with console.stop_on_signals() as stop:
+            locators = running.locators()
             if as_json:
-                console.show_json({"locators": locators})
+                console.print_json({"locators": locators})
             else:
-                console.show(f"routing at {', '.join(locators)}; Ctrl-C ends it")
-            while not told.wait(LOOK_S):
+                console.print_result(f"routing at {', '.join(locators)}; Ctrl-C ends it")
+            while not stop.wait(POLL_PERIOD_S):
                 pass
     finally:
-        opened.close()  # without it the process would not end
+        running.close()  # an open router would keep the process alive
 
 
-def find(file: Path) -> Path:
-    """Give the file itself or, where there is none of that name, the one that comes with LAVT."""
+def find_file(file: Path) -> Path:
+    """Return the file itself if it exists, otherwise the shipped file of that name."""
     return file if file.exists() else shipped(str(file))
 
 
-def overrides(changes: list[str]) -> dict[str, Any]:
-    """Read `--set a.b=value` as Zenoh's keys with slashes."""
+def parse_overrides(changes: list[str]) -> dict[str, Any]:
+    """Parse `--set a.b=value` into values by Zenoh's keys with slashes."""
     return {"/".join(parts): value for parts, value in map(split_change, changes)}

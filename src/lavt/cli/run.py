@@ -1,4 +1,4 @@
-"""`lavt run`: one run on this machine."""
+"""`lavt run`: execute one run on this machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def run(
     out: console.Out = None,
     as_json: console.Json = False,
 ) -> None:
-    """Drive one route once under one condition, in virtual or real time.
+    """Drive one route under one network condition.
+
+    The run is in virtual or real time, as the config says.
 
     Example: lavt run configs/demo.yaml --set network.condition=L2 --out out/l2
     """
@@ -36,31 +38,31 @@ def run(
     out = out or Path("out") / "run"
     check_directory(out)
     with console.interruptible():
-        for restored in check_netem(planned):
-            console.say(f"lavt: {restored}")
+        for message in check_netem(planned):
+            console.print_message(f"lavt: {message}")
     title = f"driving {planned.config.vehicle.route} under {planned.config.network.condition}"
     with console.interruptible(), LiveView(title) as view:
         result = run_once(planned, out, progress=view.update)
-    tell(result, out, as_json=as_json)
+    print_run(result, out, as_json=as_json)
 
 
-def tell(result: dict[str, Any], out: Path, *, as_json: bool) -> None:
-    """Print the result of a run."""
+def print_run(result: dict[str, Any], out: Path, *, as_json: bool) -> None:
+    """Print the result of a run, as JSON or as text with its directory."""
     if as_json:
-        console.show_json(result)
+        console.print_json(result)
     else:
-        console.show(sentence(result))
-        console.show(f"records and result.json are in {out}")
+        console.print_result(_summarize(result))
+        console.print_result(f"records and result.json are in {out}")
 
 
-def sentence(result: dict[str, Any]) -> str:
-    """Say in a few lines how a run went."""
+def _summarize(result: dict[str, Any]) -> str:
+    """Return a summary of a run in a few lines."""
     loop, age, p95_m = result["loop_ms"], result["picture_age_ms"], result["p95_m"]
     lines = [
         f"{result['route']} under {result['condition']}, seed {result['seed']}: {result['ending']} after "
         f"{_number(result['distance_m'], 'm')}, cross-track P95 {_number(p95_m, 'm', 2)}",
         f"loop latency {_number(loop['p50'], 'ms')} (p95 {_number(loop['p95'], 'ms')}), "
-        f"picture age {_number(age['mean'], 'ms')} in the mean",
+        f"mean picture age {_number(age['mean'], 'ms')}",
         f"tau_v {_latency(result['tau_v_ms'])}, tau_c {_latency(result['tau_c_ms'])}",
     ]
     if not result["valid"]:

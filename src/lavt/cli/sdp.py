@@ -1,4 +1,4 @@
-"""`lavt sdp`: what players need to show the video that a server sends them."""
+"""`lavt sdp`: print the session description (SDP) with which players show the video."""
 
 from __future__ import annotations
 
@@ -25,27 +25,30 @@ def register(app: typer.Typer) -> None:
 def sdp(
     config: Annotated[Path, typer.Argument(help="A server config in YAML, such as configs/server.yaml.")],
     receiver: Annotated[
-        str, typer.Option(help="Which of several receivers in video.send_to it is for, as host:port.")
+        str, typer.Option(help="The receiver in video.send_to, as host:port; required if there are several.")
     ] = "",
     changes: console.Set = None,
 ) -> None:
-    """Print the SDP file with which ffplay, VLC and others show the video sent to a receiver in video.send_to.
+    """Print the SDP file for watching the video in a player.
 
-    Give it the same --set as the server. On the receiver's machine: ffplay -protocol_whitelist file,udp,rtp
-    -fflags nobuffer -flags low_delay lavt.sdp (docs/watching.md has more players)
+    The file is for a receiver in video.send_to. Pass the same --set options as to the server. Play it on the receiver's
+    machine: ffplay -protocol_whitelist file,udp,rtp -fflags nobuffer -flags low_delay lavt.sdp (docs/watching.md has
+    more players).
 
     Example: lavt sdp configs/server.yaml --set 'video.send_to=["127.0.0.1:5004"]' > lavt.sdp
     """
     settings = load_config(ServerConfig, config, changes or [])
-    to = _chosen(settings.video.send_to, receiver)
-    described = session_description(to, rate_hz=settings.camera.rate_hz, profile_level_id=_profile_level_id(settings))
-    console.show(described.removesuffix("\n"))
+    address = _choose_receiver(settings.video.send_to, receiver)
+    description = session_description(
+        address, rate_hz=settings.camera.rate_hz, profile_level_id=_profile_level_id(settings)
+    )
+    console.print_result(description.removesuffix("\n"))
 
 
-def _chosen(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
-    """Give the address of the only receiver, or of the one that was asked for."""
+def _choose_receiver(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
+    """Return the address of the named receiver, or of the only one."""
     if not send_to:
-        raise UserError("the video is sent to no plain receiver: name one in video.send_to, as host:port")
+        raise UserError("video.send_to is empty: name a receiver in it, as host:port")
     known = [resolved_address("video.send_to", each) for each in send_to]
     if not receiver:
         if len(known) > 1:
@@ -53,12 +56,12 @@ def _chosen(send_to: tuple[str, ...], receiver: str) -> tuple[str, int]:
         return known[0]
     requested = resolved_address("--receiver", receiver)
     if requested not in known:
-        raise UserError(f"no video is sent to {receiver}: add it to video.send_to, or choose {', '.join(send_to)}")
+        raise UserError(f"{receiver} is not in video.send_to: add it, or choose {', '.join(send_to)}")
     return requested
 
 
 def _profile_level_id(settings: ServerConfig) -> str:
-    """Ask the server's encoder itself: its level follows from size, rates and buffer."""
+    """Return the profile and level of the server's encoder: the level depends on size, rates and buffer."""
     black = np.zeros((settings.camera.height_px, settings.camera.width_px, 3), np.uint8)
     sender = VIDEO.sender(settings)
     planes, _ = sender.prepare(black)

@@ -28,15 +28,17 @@ def server(
     config: Annotated[Path, typer.Argument(help="A server config in YAML, such as configs/server.yaml.")],
     out: console.Out = None,
     changes: console.Set = None,
-    once: Annotated[bool, typer.Option("--once", help="End when the first drive has ended.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Exit when the first drive has ended.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Stream the camera, obey the client that holds the vehicle, and stop it when no good command comes.
+    """Run the vehicle's side: stream video and execute commands.
+
+    The server executes the commands of the client that has control. If no valid command arrives, it stops the vehicle.
 
     Example: lavt server configs/server.yaml --out out/server
     """
-    console.keep_stdout_for_results()
-    process_priority.take()
+    console.reserve_stdout()
+    process_priority.raise_priority()
     settings = load_config(ServerConfig, config, changes or [])
     clock = MachineClock()
     with Side(settings, out, clock) as side:
@@ -46,7 +48,7 @@ def server(
         nodes = build_server(settings, clock.now, MachineEntropy(), host=host, video_port=port)
         ready = {"video_port": port, "probe_port": probe_port}
         if nodes.actuator is None:
-            side.elsewhere = actuator = start_actuator(settings, host=host, video_port=port)
+            side.actuator = actuator = start_actuator(settings, host=host, video_port=port)
             side.in_force = lambda: actuator.in_force
             ready |= {"actuator_pid": actuator.pid}
         else:

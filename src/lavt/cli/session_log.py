@@ -1,4 +1,4 @@
-"""What a side tells a person, in words: one line for each change, made of states, refusals and the client's phase."""
+"""The log lines of a session: one line per change of the vehicle's state, of the client's phase, or of a rejection."""
 
 from __future__ import annotations
 
@@ -8,150 +8,151 @@ from dataclasses import replace
 from lavt.domain import NS_PER_S, State
 from lavt.nodes.client_session import Phase
 
-OFTEN_NS = NS_PER_S
-"""What happens again and again is told at most so often, and is over when it has not happened for so long."""
-QUIET_NS = NS_PER_S
-"""A vehicle that has not told its state for so long is said to be quiet; it tells it 50 times a second."""
-FIRST_STATE_NS = 3 * NS_PER_S
-"""Before the first state there is this much patience: routers find each other meanwhile."""
+REPEAT_NS = NS_PER_S
+"""A recurring event is logged at most once in this time, and counts as new after this time without it."""
+STATE_TIMEOUT_NS = NS_PER_S
+"""A client logs that the state is missing after this time; the vehicle sends its state 50 times a second."""
+FIRST_STATE_TIMEOUT_NS = 3 * NS_PER_S
+"""The same before the first state: longer, because the routers need time to find each other."""
 NO_STATE_YET = (
-    "no state from the vehicle yet: does its server run, do the routers reach each other, and do the keys fit? "
-    "`lavt doctor CONFIG` finds out"
+    "no state from the vehicle yet: is its server running, do the routers reach each other, and do the keys match? "
+    "Run `lavt doctor CONFIG` to find out"
 )
-STATE_AGAIN = "the vehicle tells its state again"
+STATE_AGAIN = "vehicle state received again"
 
 PHASES: dict[Phase, str] = {
-    "seeking": "waiting for the vehicle: {because}",
-    "arming": "the vehicle was granted to this client: arming{waits}",
+    "seeking": "waiting for the vehicle: {reason}",
+    "arming": "control granted: arming the vehicle{waits}",
     "driving": "",
-    "stopped": "this client does not drive any more: {because}",
-    "watching": "{because}; this client only watches now",
+    "stopped": "control lost: {reason}",
+    "watching": "{reason}; this client now only watches",
 }
-"""The client's own phases; of driving the vehicle's state tells."""
+"""The line for each phase of the client; the vehicle's state reports driving."""
 
 
-def phase_words(phase: Phase, reason: str) -> str:
-    """Say the client's phase; empty where there is nothing to say."""
+def phase_line(phase: Phase, reason: str) -> str:
+    """Return the log line for the client's phase; empty if the phase needs none."""
     if phase == "seeking" and not reason:
         return ""
     return PHASES[phase].format(reason=reason, waits=f", but {reason}" if reason else "")
 
 
-def state_words(before: State | None, after: State, *, this_client: str) -> list[str]:
-    """Say what has changed from one state of the vehicle to another, or how it is, where there was none before.
+def state_lines(before: State | None, after: State, *, operator: str) -> list[str]:
+    """Return one log line for each difference between two vehicle states; without a state before, describe `after`.
 
-    `this_client` is the name of the client for whose person this is, while it holds the vehicle; empty elsewhere.
+    `operator` is the name of this side's client while it has control of the vehicle; empty otherwise.
     """
-    words = []
+    lines = []
     if before is None:
         before = replace(after, safety="disarmed", reason="", active_operator="", requested_by="")
     elif after.instance != before.instance:
-        words.append("the server was started anew")
+        lines.append("the server has restarted")
     if after.active_operator != before.active_operator:
-        words.append(
-            f"{after.active_operator} holds the vehicle"
-            if after.active_operator
-            else "nobody holds the vehicle any more"
+        lines.append(
+            f"{after.active_operator} has control" if after.active_operator else "no operator has control any more"
         )
     if (after.safety, after.reason) != (before.safety, before.reason):
         who = after.active_operator or before.active_operator or "the client"
-        words.append(f"{after.safety}: {after.reason.replace('the client', who)}")
+        lines.append(f"{after.safety}: {after.reason.replace('the client', who)}")
     if after.requested_by and after.requested_by != before.requested_by:
-        hands_over = after.active_operator == this_client
-        words.append(
-            f"{after.requested_by} asks for the vehicle; SIGUSR2 hands it over"
-            if hands_over
-            else f"{after.requested_by} asks {after.active_operator} for the vehicle"
+        lines.append(
+            f"{after.requested_by} requests control; SIGUSR2 hands the vehicle over"
+            if after.active_operator == operator
+            else f"{after.requested_by} requests control from {after.active_operator}"
         )
     if before.requested_by and not after.requested_by and after.active_operator == before.active_operator:
-        words.append(f"{before.requested_by} does not ask for the vehicle any more")
-    return words
+        lines.append(f"{before.requested_by} no longer requests control")
+    return lines
 
 
-def release_words(*, released: bool) -> str:
-    """Say how a client that held the vehicle leaves it."""
+def client_end_line(*, released: bool) -> str:
+    """Return the last line of a client that had control, by whether the vehicle's side confirmed the release."""
     if released:
         return "the client ends; the vehicle is released"
-    return "the client ends; nobody confirms that the vehicle is released: it stops for want of commands"
+    return "the client ends; the release was not confirmed: the vehicle stops on command timeout"
 
 
-def end_words(speed_mps: float | None) -> str:
-    """Say how a server that ends leaves its vehicle; None: it stands."""
+def server_end_line(speed_mps: float | None) -> str:
+    """Return the last line of a server; `speed_mps` is None if its vehicle is stationary."""
     if speed_mps is None:
-        return "the vehicle stands; the server ends"
+        return "the vehicle is stationary; the server ends"
     return f"the server ends while the vehicle is still stopping, at {speed_mps:.1f} m/s"
 
 
 class SessionLog:
-    """Remembers what was told, and so tells each change once. Times are of this machine's monotonic clock.
+    """A log that turns states, rejections and phases into lines, one line per change.
 
-    `client` is the client's name; empty on the server.
+    Times are of this machine's monotonic clock. `client` is the client's name; empty on the server.
     """
 
     def __init__(self, client: str = "") -> None:
         self._client = client
         self._lines: list[str] = []
         self._state: State | None = None
-        self._told_phase = ""
-        self._told_ending: str | None = None
+        self._logged_phase = ""
+        self._logged_ending: str | None = None
         self._start_ns: int | None = None
         self._state_ns: int | None = None
-        self._quiet = False
+        self._state_missing = False
         self._rejected: Counter[str] = Counter()
-        self._told_rejections_ns: int | None = None
+        self._logged_rejections_ns: int | None = None
         self._limited_ns: dict[str, int] = {}
 
-    def state(self, state: State, now_ns: int, *, holds: bool = False) -> None:
-        """The vehicle told its state at `now_ns`; `holds`: this client holds the vehicle, as far as it knows."""
-        if self._quiet and self._state_ns is not None:
+    def add_state(self, state: State, now_ns: int, *, has_control: bool = False) -> None:
+        """Log the changes of a state received at `now_ns`; `has_control`: this client believes it has control."""
+        if self._state_missing and self._state_ns is not None:
             self._lines.append(STATE_AGAIN)
-        self._quiet, self._state_ns = False, now_ns
+        self._state_missing, self._state_ns = False, now_ns
         before, self._state = self._state, state
-        self._lines += state_words(before, state, this_client=self._client if holds else "")
+        self._lines += state_lines(before, state, operator=self._client if has_control else "")
         for limit in state.limited.split(", ") if state.limited else ():
-            if now_ns - self._limited_ns.get(limit, now_ns - OFTEN_NS) >= OFTEN_NS:
+            if now_ns - self._limited_ns.get(limit, now_ns - REPEAT_NS) >= REPEAT_NS:
                 self._lines.append(f"limited: {limit}")
             self._limited_ns[limit] = now_ns
         if self._client and state.rejected and (before is None or state.rejected != before.rejected):
-            self.rejection(state.rejected)
+            self.add_rejection(state.rejected)
 
-    def rejection(self, reason: str) -> None:
-        """A command was refused."""
+    def add_rejection(self, reason: str) -> None:
+        """Count a rejected command."""
         self._rejected[reason] += 1
 
-    def phase(self, phase: Phase, reason: str) -> None:
-        """The client's phase is this."""
-        words = phase_words(phase, reason)
-        if words and words != self._told_phase:
-            self._lines.append(words)
-        self._told_phase = words
+    def set_phase(self, phase: Phase, reason: str) -> None:
+        """Log the client's phase if its line has changed."""
+        line = phase_line(phase, reason)
+        if line and line != self._logged_phase:
+            self._lines.append(line)
+        self._logged_phase = line
 
-    def ending(self, ending: str | None) -> None:
-        """The last drive has ended so; None: none has, or another has begun."""
-        if ending is not None and ending != self._told_ending:
-            self._lines.append(f"the drive is over: {ending}")
-        self._told_ending = ending
+    def set_ending(self, ending: str | None) -> None:
+        """Log how the last drive ended; None before its end, or after the start of another."""
+        if ending is not None and ending != self._logged_ending:
+            self._lines.append(f"the drive has ended: {ending}")
+        self._logged_ending = ending
 
-    def take(self, now_ns: int) -> list[str]:
-        """Take what there is to tell at `now_ns`."""
-        self._look_at_the_clock(now_ns)
+    def take_lines(self, now_ns: int) -> list[str]:
+        """Return the lines since the last call, including those that are due at `now_ns`."""
+        self._add_rejection_counts(now_ns)
+        self._add_missing_state(now_ns)
         lines, self._lines = self._lines, []
         return lines
 
-    def _look_at_the_clock(self, now_ns: int) -> None:
-        if self._rejected and (self._told_rejections_ns is None or now_ns - self._told_rejections_ns >= OFTEN_NS):
-            self._told_rejections_ns = now_ns
+    def _add_rejection_counts(self, now_ns: int) -> None:
+        last_ns = self._logged_rejections_ns
+        if self._rejected and (last_ns is None or now_ns - last_ns >= REPEAT_NS):
+            self._logged_rejections_ns = now_ns
             for reason, count in self._rejected.items():
-                many = "a command was" if count == 1 else f"{count} commands were"
-                self._lines.append(f"{many} refused: {reason}")
+                commands = "a command was" if count == 1 else f"{count} commands were"
+                self._lines.append(f"{commands} rejected: {reason}")
             self._rejected.clear()
+
+    def _add_missing_state(self, now_ns: int) -> None:
         if self._start_ns is None:
             self._start_ns = now_ns
-        if self._quiet or not self._client:
+        if self._state_missing or not self._client:
             return
-        if self._state_ns is None and now_ns - self._start_ns >= FIRST_STATE_NS:
-            self._quiet = True
+        if self._state_ns is None and now_ns - self._start_ns >= FIRST_STATE_TIMEOUT_NS:
+            self._state_missing = True
             self._lines.append(NO_STATE_YET)
-        elif self._state_ns is not None and now_ns - self._state_ns >= QUIET_NS:
-            self._quiet = True
+        elif self._state_ns is not None and now_ns - self._state_ns >= STATE_TIMEOUT_NS:
+            self._state_missing = True
             self._lines.append(f"no state from the vehicle for {(now_ns - self._state_ns) / NS_PER_S:.1f} s")

@@ -1,4 +1,4 @@
-"""What `lavt server` and `lavt client` share: links, record, runtime, and the lines they print."""
+"""The code shared by `lavt server` and `lavt client`: links, record, runtime and printed status."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lavt.assembly.clock_source import clock_source, interpreter
 from lavt.assembly.rendezvous import open_flow
 from lavt.assembly.security import gateway_of
 from lavt.cli import console
-from lavt.cli.router import find
-from lavt.cli.session_log import SessionLog, end_words, release_words
+from lavt.cli.router import find_file
+from lavt.cli.session_log import SessionLog, client_end_line, server_end_line
 from lavt.clock import MachineClock
 from lavt.config import ClientConfig, ServerConfig
 from lavt.domain import NS_PER_S, Now, State
@@ -28,8 +28,8 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.realtime import RealRuntime
 from lavt.runtime.recorder import QueuedRecorder
-from lavt.safety.gate import ACTIVE
 from lavt.safety.limits import LIMITS
+from lavt.safety.state_machine import ACTIVE
 from lavt.transport.emulation.impairment import ExemptPort
 from lavt.transport.netem.injector import Injector
 from lavt.transport.netem.netem import NetemInterface
@@ -39,22 +39,23 @@ from lavt.transport.udp_link import UdpLink
 from lavt.transport.zenoh_link import ZenohLink, quiet_logs
 
 STATUS_PERIOD_S = 0.2
-LOOK_S = 0.02
-RELEASE_S = 1.0
-"""So long a client that ends waits for the answer to its release; over any network that one can drive by it comes."""
-STOP_S = 6.0
-"""So long a server that ends waits for standstill: from 40 km/h with 4 m/s2 it takes 2.8 s."""
+POLL_PERIOD_S = 0.02
+RELEASE_TIMEOUT_S = 1.0
+"""How long a client that ends waits for the answer to its release; any network that is good enough to drive over is
+faster."""
+STOP_TIMEOUT_S = 6.0
+"""How long a server that ends waits for standstill: from 40 km/h with 4 m/s2 it takes 2.8 s."""
 
 
 class NoRecorder:
-    """Keeps nothing."""
+    """A recorder that discards every entry."""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Forget one entry."""
+        """Discard one entry."""
 
 
 class Side:
-    """One side's links and record, opened before its nodes are built and closed after its runtime has ended."""
+    """The links and the record of one side, opened before its nodes are built and closed after its runtime."""
 
     def __init__(
         self,
@@ -65,7 +66,7 @@ class Side:
         self.clock = clock
         self.runtime: RealRuntime | None = None
         self.name = config.who if isinstance(config, ClientConfig) else "server"
-        """What the other side knows this one by."""
+        """This side's name in messages: the operator's name, or "server"."""
         self._name: Literal["server", "client"] = "client" if isinstance(config, ClientConfig) else "server"
         self._config = config
         self._out = out
@@ -78,7 +79,7 @@ class Side:
         queues = _queues(config)
         quiet_logs()
         self.in_force: Callable[[], tuple[int, int]] = lambda: (0, -1)
-        """The server's: epoch in force, and sequence of the command last obeyed."""
+        """The server's function that returns the epoch in force and the sequence of the last accepted command."""
         self._gateway = gateway_of(
             config, self._deliver, lambda *sends: self._zenoh.send(*sends), lambda: self.in_force()
         )
@@ -86,23 +87,23 @@ class Side:
             clock,
             self._gateway.receive,
             side=self._name,
-            path=find(Path(config.zenoh.session)),
+            path=find_file(Path(config.zenoh.session)),
             router=config.zenoh.router,
             vehicle=config.vehicle_id,
             who=self.name,
-            waiting=lambda reason: console.say(f"lavt: {reason}; waiting until one does"),
+            waiting=lambda reason: console.print_message(f"lavt: {reason}; waiting for one"),
         )
-        self._injector = Injector(clock, self._deliver, queues, _never_delayed(config))
+        self._injector = Injector(clock, self._deliver, queues, _exempt_ports(config))
         self.tap = LiveTap(NoRecorder())
-        self.elsewhere: ActuatorProcess | None = None
-        """The server's actuator, where it is in a process of its own."""
+        self.actuator: ActuatorProcess | None = None
+        """The server's actuator if it runs in a process of its own."""
 
     def open_video(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
-        """Open the video's socket, whose datagrams come in on `channel`, and tell its port."""
+        """Open the video socket, deliver its datagrams on `channel`, and return its port."""
         return self._open("video", channel, bind, remote)
 
     def open_probe(self, channel: str, *, bind: tuple[str, int], remote: tuple[str, int] | None = None) -> int:
-        """Open the socket over which the clocks are compared, and tell its port."""
+        """Open the socket of the clock probe, deliver its datagrams on `channel`, and return its port."""
         return self._open("probe", channel, bind, remote)
 
     def _open(self, name: FlowName, channel: str, bind: tuple[str, int], remote: tuple[str, int] | None) -> int:
@@ -111,28 +112,28 @@ class Side:
         return link.port
 
     def start(self, nodes: Sequence[Node]) -> RealRuntime:
-        """Begin the record, start the runtime, then let messages in."""
+        """Open the record, start the runtime, then receive messages."""
         if self._out is not None:
             self._writer = self._open_record(self._out)
             self.tap = LiveTap(self._writer)
         self._queue = QueuedRecorder(self.tap)
         source = clock_source(self._config.clock, self.clock, self._interpreter.run)
-        away = {} if self.elsewhere is None else {self.elsewhere.name: self.elsewhere}
-        self.runtime = RealRuntime(self.clock, nodes, self._queue, source, away)
+        remote_nodes = {} if self.actuator is None else {self.actuator.name: self.actuator}
+        self.runtime = RealRuntime(self.clock, nodes, self._queue, source, remote_nodes)
         self._zenoh.start()
         self.runtime.start({**self._udp, "zenoh": self._gateway, "netem": self._injector})
-        if self.elsewhere is not None:
-            self.elsewhere.start(self.runtime)
+        if self.actuator is not None:
+            self.actuator.start(self.runtime)
         for link in self._udp.values():
             link.start()
         return self.runtime
 
-    def tell(self, channel: str, payload: Any) -> None:
-        """Hand a message to a node of this side."""
+    def send(self, channel: str, payload: Any) -> None:
+        """Deliver a message to a node of this side."""
         self._deliver(channel, payload, self.clock.now(), None)
 
     def _open_record(self, out: Path) -> RecordWriter:
-        """Begin the record only now that nothing can be wrong with the input any more."""
+        """Create the output directory and the record, after all input has been checked."""
         prepare_directory(out)
         (out / "config.yaml").write_text(yaml.safe_dump(self._config.model_dump(mode="json"), sort_keys=False))
         writer = RecordWriter(out / f"{self._name}.mcap", self._name, left_out=self._config.record.left_out)
@@ -150,8 +151,8 @@ class Side:
     def __exit__(
         self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
     ) -> None:
-        if self.elsewhere is not None:
-            self.elsewhere.end()
+        if self.actuator is not None:
+            self.actuator.end()
         if self.runtime is not None:
             self.runtime.stop()
         self._injector.close()
@@ -172,16 +173,16 @@ class Side:
 
 
 def _queues(config: ServerConfig | ClientConfig) -> NetemInterface | None:
-    """Give the queues of the configured interface; raises `UserError` where nothing could be applied to it."""
+    """Return the queues of the configured interface, if any; raise `UserError` if netem cannot be applied to it."""
     if not config.injection.interface:
         return None
     netem = NetemInterface(config.injection.interface)
     for sentence in netem.check():
-        console.say(sentence)
+        console.print_message(sentence)
     return netem
 
 
-def _never_delayed(config: ServerConfig | ClientConfig) -> list[ExemptPort]:
+def _exempt_ports(config: ServerConfig | ClientConfig) -> list[ExemptPort]:
     port = config.clock.probe_port
     return [ExemptPort("udp", port, "the clock probe")] if port else []
 
@@ -195,73 +196,75 @@ def run_side(
     ready: Mapping[str, Any],
     session: ClientSession | None = None,
 ) -> None:
-    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print what happens.
+    """Run until Ctrl-C, until a node fails or, with `once`, until the drive has ended; print the session's log.
 
-    Before it ends a client releases the vehicle, and a server stops it; a second Ctrl-C does not wait for that.
+    Before it ends, a client releases the vehicle and a server stops it. A second Ctrl-C ends the process immediately.
     """
-    narrator = SessionLog(side.name if session is not None else "")
-    with console.until_told() as told:
+    log = SessionLog(side.name if session is not None else "")
+    with console.stop_on_signals() as stop:
         runtime = side.start(nodes)
         if as_json:
-            console.show_json({"ready": dict(ready)})
-        while not told.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
-            _tell(side, narrator, session, as_json=as_json)
+            console.print_json({"ready": dict(ready)})
+        while not stop.wait(STATUS_PERIOD_S) and not runtime.stopped.is_set():
+            _print_status(side, log, session, as_json=as_json)
             if once and side.tap.ending is not None:
                 break
         if not runtime.stopped.is_set():
-            told.clear()
-            last = _stop_vehicle(side, told) if session is None else _release(side, told, session)
-            _tell(side, narrator, session, as_json=as_json, last=last)
+            stop.clear()
+            last_line = _stop_vehicle(side, stop) if session is None else _release(side, stop, session)
+            _print_status(side, log, session, as_json=as_json, last_line=last_line)
     if runtime.failed is not None:
-        raise WorkError(f"stopped because a part failed: {runtime.failed}")
+        raise WorkError(f"stopped because a node failed: {runtime.failed}")
 
 
-def _tell(side: Side, narrator: SessionLog, session: ClientSession | None, *, as_json: bool, last: str = "") -> None:
-    """Print what is new, and `last` at the very end; as JSON also how everything is."""
-    for heard, at in side.tap.take_heard():
+def _print_status(
+    side: Side, log: SessionLog, session: ClientSession | None, *, as_json: bool, last_line: str = ""
+) -> None:
+    """Print the new lines of the log and then `last_line`; as JSON, print the status too."""
+    for heard, at in side.tap.take_updates():
         if isinstance(heard, State):
-            narrator.state(heard, at.mono_ns, holds=session is not None and session.holds)
+            log.add_state(heard, at.mono_ns, has_control=session is not None and session.has_control)
         else:
-            narrator.rejection(heard)
-    narrator.ending(side.tap.ending)
+            log.add_rejection(heard)
+    log.set_ending(side.tap.ending)
     status = side.tap.status()
     if session is not None:
-        if not last:
-            narrator.phase(session.phase, session.reason)
+        if not last_line:
+            log.set_phase(session.phase, session.reason)
         status |= {"phase": session.phase, "session": session.reason}
-    lines = narrator.take(side.clock.now().mono_ns) + [last] * bool(last)
+    lines = log.take_lines(side.clock.now().mono_ns) + [last_line] * bool(last_line)
     if as_json:
-        console.show_json({"status": status, "ending": side.tap.ending, "said": lines})
+        console.print_json({"status": status, "ending": side.tap.ending, "said": lines})
         return
     for line in lines:
-        console.show(line)
+        console.print_result(line)
 
 
-def _release(side: Side, told: console.StopEvent, session: ClientSession) -> str:
-    """Release the vehicle while the link is open: it stops at once, and somebody else may have it."""
-    if not session.holds:
-        return "the client ends; it held no vehicle"
-    side.tell("operator", "release")
-    _wait(side, told, RELEASE_S, lambda: session.released)
-    return release_words(released=session.released)
+def _release(side: Side, stop: console.StopEvent, session: ClientSession) -> str:
+    """Release the vehicle while the link is open, so that it stops and is free; return the last log line."""
+    if not session.has_control:
+        return "the client ends; it had no control"
+    side.send("operator", "release")
+    _wait(side, stop, RELEASE_TIMEOUT_S, lambda: session.released)
+    return client_end_line(released=session.released)
 
 
-def _stop_vehicle(side: Side, told: console.StopEvent) -> str:
-    """Stop the vehicle, and wait until it stands."""
-    side.tell("server_ends", None)
-    _wait(side, told, STOP_S, lambda: _moves_mps(side) is None)
-    return end_words(_moves_mps(side))
+def _stop_vehicle(side: Side, stop: console.StopEvent) -> str:
+    """Stop the vehicle, wait until it is stationary, and return the last log line."""
+    side.send("server_ends", None)
+    _wait(side, stop, STOP_TIMEOUT_S, lambda: _moving_speed_mps(side) is None)
+    return server_end_line(_moving_speed_mps(side))
 
 
-def _moves_mps(side: Side) -> float | None:
-    """Speed of a vehicle that is not at rest."""
+def _moving_speed_mps(side: Side) -> float | None:
+    """Return the speed of the vehicle; None if it is stationary and not driven."""
     status = side.tap.status()
     speed_mps: float = status.get("speed_mps", 0.0)
     return speed_mps if status.get("safety") in ACTIVE or abs(speed_mps) >= LIMITS.standstill_mps else None
 
 
-def _wait(side: Side, told: console.StopEvent, limit_s: float, done: Callable[[], bool]) -> None:
-    """Wait until it is done, but not for long, and not for whom is told once more to end."""
-    end_ns = side.clock.now().mono_ns + round(limit_s * NS_PER_S)
-    while not done() and side.clock.now().mono_ns < end_ns and not told.wait(LOOK_S):
+def _wait(side: Side, stop: console.StopEvent, timeout_s: float, is_done: Callable[[], bool]) -> None:
+    """Wait until `is_done()`, until the timeout, or until another stop signal."""
+    end_ns = side.clock.now().mono_ns + round(timeout_s * NS_PER_S)
+    while not is_done() and side.clock.now().mono_ns < end_ns and not stop.wait(POLL_PERIOD_S):
         pass

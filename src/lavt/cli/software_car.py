@@ -1,4 +1,4 @@
-"""`lavt software-car`: a by-wire kit on a CAN bus whose wheels are the built-in simulator's."""
+"""`lavt software-car`: simulate a car with a by-wire kit on a CAN bus."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from lavt.vehicle.dbw.bus import CanPort, is_virtual
 from lavt.vehicle.dbw.profile import Profile
 from lavt.vehicle.sim.road.road import load_road
 from lavt.vehicle.software_car.event_log import KitEvent
-from lavt.vehicle.software_car.runner import Runner
+from lavt.vehicle.software_car.runner import SoftwareCarRunner
 
-LONGEST_LINE: Final = 1000
+MAX_LINE_BYTES: Final = 1000
 INSIDE: Final = "inside"
 
 
@@ -45,121 +45,123 @@ def software_car(
     changes: console.Set = None,
     as_json: console.Json = False,
 ) -> None:
-    """Be a car with a by-wire kit on the bus of vehicle.dbw, until Ctrl-C; words on standard input act on it.
+    """Simulate a car with a by-wire kit on a CAN bus.
 
-    It runs on the server's machine and tells it the truth at vehicle.dbw.truth. `help` lists the words.
+    The car runs on the bus of vehicle.dbw until Ctrl-C. It accepts commands on standard input; `help` lists them. It
+    runs on the server's machine and sends its true position to vehicle.dbw.truth.
 
     Example: lavt software-car configs/server-by-wire.yaml --set vehicle.dbw.channel=vcan0
     """
-    process_priority.take(process_priority.OF_THE_CAR)
+    process_priority.raise_priority(process_priority.VEHICLE_NICENESS)
     settings = load_config(ServerConfig, config, changes or [])
     dbw = settings.vehicle.dbw
     if dbw.interface == INSIDE:
         raise UserError(
-            f"vehicle.dbw.interface {INSIDE} is a software car in the server itself: name a bus, such as udp_multicast"
+            f"vehicle.dbw.interface {INSIDE} runs the software car in the server: name a bus, such as udp_multicast"
         )
     profile = load_profile(dbw.profile, dbw.dbc, dbw.steering_sign)
     road = load_road(settings.vehicle.route)
     truth = resolved_address("vehicle.dbw.truth", dbw.truth) if dbw.truth else None
     clock = MachineClock()
-    build_software_car(settings, profile, road, start_ns=0)  # what is wrong with it is wrong before the bus is opened
+    build_software_car(settings, profile, road, start_ns=0)  # raises errors before the bus is opened
     port = CanPort(dbw.interface, dbw.channel, dbw.options, clock=clock)
     try:
         if not is_virtual(dbw.interface, dbw.channel):
-            console.say(f"lavt: {dbw.channel} is no virtual bus: see to it that no real kit is on it")
+            console.print_message(f"lavt: {dbw.channel} is not a virtual bus: make sure that no real kit is on it")
         start_ns = clock.now().mono_ns
-        runner = Runner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)
-        tell = _tell_json if as_json else _tell_in_words(start_ns)
-        with console.until_told() as told, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
-            speaker.setblocking(False)
-            _show_ready(profile, dbw, as_json=as_json)
-            _live(runner, clock, told, InputLines(), tell, lambda datagram: _send(speaker, truth, datagram))
+        runner = SoftwareCarRunner(build_software_car(settings, profile, road, start_ns), port, start_ns=start_ns)
+        print_event = _print_event_json if as_json else _event_printer(start_ns)
+        with console.stop_on_signals() as stop, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setblocking(False)
+            _print_ready(profile, dbw, as_json=as_json)
+            _run(runner, clock, stop, InputLines(), print_event, lambda datagram: _send(sender, truth, datagram))
     finally:
         port.close()
     if as_json:
         counts = {**runner.counts, **port.counts}
-        console.show_json({"counts": counts, "latest_ms": runner.latest_ns / NS_PER_MS})
+        console.print_json({"counts": counts, "latest_ms": runner.latest_ns / NS_PER_MS})
 
 
-def _live(
-    runner: Runner,
+def _run(
+    runner: SoftwareCarRunner,
     clock: MachineClock,
-    told: console.StopEvent,
+    stop: console.StopEvent,
     lines: InputLines,
-    tell: Callable[[KitEvent], None],
+    print_event: Callable[[KitEvent], None],
     send: Callable[[bytes], None],
 ) -> None:
-    """Let the car live until told to stop."""
-    while not told.is_set():
+    """Run the car until the stop event."""
+    while not stop.is_set():
         now_ns = clock.now().mono_ns
         runner.step(now_ns)
-        datagram = runner.truth()
+        datagram = runner.make_truth_datagram()
         if datagram is not None:
             send(datagram)
-        for events in runner.take_events():
-            tell(events)
+        for event in runner.take_events():
+            print_event(event)
         pause_ns = max(runner.next_wake_ns() - clock.now().mono_ns, 0)
-        for line in lines.wait(told, pause_ns / NS_PER_S):
-            runner.act(line, clock.now().mono_ns)
+        for line in lines.wait(stop, pause_ns / NS_PER_S):
+            runner.execute(line, clock.now().mono_ns)
 
 
 class InputLines:
-    """Lines on standard input, as long as there is one; in the background nobody reads the terminal."""
+    """The lines on standard input, until it is closed; a background process reads no terminal."""
 
     def __init__(self) -> None:
         self._is_open = sys.stdin is not None
-        self._begun = b""
+        self._incomplete = b""
         signal.signal(signal.SIGTTIN, signal.SIG_IGN)
 
-    def wait(self, told: console.StopEvent, pause_s: float) -> list[str]:
-        """Wait for lines, at most so long."""
+    def wait(self, stop: console.StopEvent, timeout_s: float) -> list[str]:
+        """Wait for lines for at most `timeout_s`; return those that arrived."""
         if not self._is_open:
-            told.wait(pause_s)
+            stop.wait(timeout_s)
             return []
-        ready, _, _ = select.select([sys.stdin], [], [], pause_s)
+        ready, _, _ = select.select([sys.stdin], [], [], timeout_s)
         return self._read() if ready else []
 
     def _read(self) -> list[str]:
         try:
-            came = os.read(sys.stdin.fileno(), 4096)
+            data = os.read(sys.stdin.fileno(), 4096)
         except OSError:
-            came = b""
-        self._is_open = bool(came)
-        *lines, self._begun = (self._begun + came).split(b"\n")
-        if len(self._begun) > LONGEST_LINE:
-            lines, self._begun = [*lines, self._begun], b""
+            data = b""
+        self._is_open = bool(data)
+        *lines, self._incomplete = (self._incomplete + data).split(b"\n")
+        if len(self._incomplete) > MAX_LINE_BYTES:
+            lines, self._incomplete = [*lines, self._incomplete], b""
         return [line.decode(errors="replace") for line in lines]
 
 
-def _send(speaker: socket.socket, truth: tuple[str, int] | None, datagram: bytes) -> None:
+def _send(sender: socket.socket, truth: tuple[str, int] | None, datagram: bytes) -> None:
     if truth is not None:
-        with suppress(OSError):  # the next one says it again
-            speaker.sendto(datagram, truth)
+        with suppress(OSError):  # the next datagram replaces this one
+            sender.sendto(datagram, truth)
 
 
-def _show_ready(profile: Profile, dbw: DbwConfig, *, as_json: bool) -> None:
+def _print_ready(profile: Profile, dbw: DbwConfig, *, as_json: bool) -> None:
     generation = GENERATIONS[profile.kit]
     if as_json:
         keys = {"interface": dbw.interface, "channel": dbw.channel, "truth": dbw.truth}
         ready: dict[str, Any] = {"generation": generation, "commands": profile.commands, **keys}
-        console.show_json({"ready": ready})
+        console.print_json({"ready": ready})
         return
     commands = f", {profile.commands} commands" if profile.commands else ""
-    console.show(
+    console.print_result(
         f"a car with a kit of generation {generation}{commands} on {dbw.interface} {dbw.channel}; "
-        f"the truth goes {f'to {dbw.truth}' if dbw.truth else 'nowhere'}; help lists the words, Ctrl-C ends it"
+        f"its true position is sent {f'to {dbw.truth}' if dbw.truth else 'nowhere'}; type help for the commands, "
+        "Ctrl-C ends it"
     )
 
 
-def _tell_json(events: KitEvent) -> None:
-    console.show_json({"mono_ns": events.mono_ns, "kind": events.kind, "text": events.text})
+def _print_event_json(event: KitEvent) -> None:
+    console.print_json({"mono_ns": event.mono_ns, "kind": event.kind, "text": event.text})
 
 
-def _tell_in_words(start_ns: int) -> Callable[[KitEvent], None]:
-    """Tell news with the time since the start."""
+def _event_printer(start_ns: int) -> Callable[[KitEvent], None]:
+    """Return a function that prints an event with the time since the start."""
 
-    def tell(events: KitEvent) -> None:
-        at = "" if events.kind == "help" else f"{(events.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
-        console.show(f"{at}{events.text}")
+    def print_event(event: KitEvent) -> None:
+        time = "" if event.kind == "help" else f"{(event.mono_ns - start_ns) / NS_PER_S:9.3f} s  "
+        console.print_result(f"{time}{event.text}")
 
-    return tell
+    return print_event

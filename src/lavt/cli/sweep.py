@@ -1,4 +1,4 @@
-"""`lavt sweep`: many runs, their summary and their report."""
+"""`lavt sweep`: execute many runs and write their summary and report."""
 
 from __future__ import annotations
 
@@ -25,38 +25,39 @@ def sweep(
     config: Annotated[Path, typer.Argument(help="A sweep config in YAML, such as configs/sweep.yaml.")],
     changes: console.Set = None,
     out: console.Out = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at a time; default: one for each core.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on where a sweep into --out was stopped.")] = False,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of parallel runs; default: one per core.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a stopped sweep in --out.")] = False,
     cluster: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS|local", help="Have Dask's workers drive: those of a scheduler, or local ones."),
+        typer.Option(metavar="ADDRESS|local", help="Run on Dask workers: those of a scheduler, or local ones."),
     ] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Drive routes under conditions, repeated, and report.
+    """Drive routes under network conditions and report.
+
+    Each combination is repeated as the config says. Finished runs of a stopped sweep are kept; see --resume.
 
     Example: lavt sweep configs/sweep.yaml --set 'conditions=[L0, L3]' --out out/sweep
     """
     from lavt.experiment.sweep.cluster import check_cluster  # noqa: PLC0415 (slow: scipy)
-    from lavt.experiment.sweep.sweep import is_finished, open_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
-    from lavt.experiment.sweep.sweep import sweep as drive_sweep  # noqa: PLC0415 (slow: scipy, matplotlib)
+    from lavt.experiment.sweep.sweep import drive_sweep, is_finished, open_sweep  # noqa: PLC0415 (slow: scipy)
 
     requested = load_config(SweepConfig, config, changes or [])
     planned = plan_sweep(requested)
     if cluster and any(each.config.time == "real" for each in planned):
-        raise UserError("--cluster is for virtual time: real time is driven on this machine, set time: virtual")
+        raise UserError("--cluster is for virtual time: set time: virtual, or run without --cluster")
     out = out or Path("out") / "sweep"
     if cluster:
         check_cluster(cluster, jobs)
     open_sweep(out, resume=resume)
     missing = sum(not is_finished(out / "runs" / each.name) for each in planned)
-    with console.interruptible(), progress(f"sweep into {out}", missing) as tell:
-        page, driven = drive_sweep(requested, planned, out, jobs=jobs, tell=tell, cluster_at=cluster)
+    with console.interruptible(), progress(f"sweep into {out}", missing) as report_done:
+        page, driven = drive_sweep(requested, planned, out, jobs=jobs, on_progress=report_done, cluster_address=cluster)
     for name, why in driven.failed:
-        console.say(f"failed: {name}: {why}")
+        console.print_message(f"failed: {name}: {why}")
     if as_json:
-        console.show_json(read_json(out / "summary.json"))
+        console.print_json(read_json(out / "summary.json"))
     else:
-        console.show(f"the report is {page}")
+        console.print_result(f"the report is {page}")
     if driven.failed:
         raise typer.Exit(1)

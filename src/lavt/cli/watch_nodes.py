@@ -1,4 +1,4 @@
-"""The nodes of `lavt watch`, and what it knows of the stream."""
+"""The nodes of `lavt watch`, and the statistics of the stream."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Sender = Literal["lavt", "foreign"]
 
 
 class WatchNodes:
-    """A receiver without a path, so that it sends nothing, a watcher, and the recorder that both report to."""
+    """A receiver that sends nothing, a watcher, and the recorder of both that keeps the stream's statistics."""
 
     def __init__(self, sender: Sender, reorder_hold_ms: int | None) -> None:
         self._reader = _reader(sender)
@@ -37,21 +37,21 @@ class WatchNodes:
         self._reason = ""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (the protocol's)
-        """Keep the latency of a picture, or why it has none, and the jitter of a second."""
+        """Record the latency of a picture, or why it has none, and the jitter of a second."""
         if topic == "picture":
-            self._note(payload)
+            self._record_latency(payload)
         elif topic == "reception":
             sample: ReceptionSample = payload
             self._jitter_us = sample.jitter_us
 
-    def _note(self, picture: PictureRead) -> None:
+    def _record_latency(self, picture: PictureRead) -> None:
         if picture.stamp_ns is None:
             self._reason = picture.reason
         else:
             self._latencies_ms.append((picture.read_wall_ns - picture.stamp_ns) / NS_PER_MS)
 
     def totals(self) -> Counter[str]:
-        """Count everything since the beginning."""
+        """Return the counts since the start."""
         received, pictures = Counter(self._receiver.counts), self._reader.counts
         return Counter(
             pictures=pictures["frames_decoded"],
@@ -64,7 +64,7 @@ class WatchNodes:
         )
 
     def between(self, before: Counter[str], after: Counter[str]) -> dict[str, Any]:
-        """Say what happened between two totals: latency from stamp to reading, None where no stamp was accepted."""
+        """Return the statistics between two totals; without an accepted stamp, latencies are None."""
         latencies_ms = self._latencies_ms[before["stamps_accepted"] : after["stamps_accepted"]]
         median_ms, p95_ms = np.percentile(latencies_ms, (50, 95)).tolist() if latencies_ms else (None, None)
         return {
@@ -77,7 +77,7 @@ class WatchNodes:
 
 
 def _reader(sender: Sender) -> PictureReader:
-    """Give what the stamps of a sender are read with: of a foreign one only what its weaker check may be shown."""
+    """Return the reader for a sender's stamps; it reads no doubtful stamps of a foreign sender (weaker check)."""
     if sender == "lavt":
         return PictureReader(VideoReceiver(Decoder(), None))
     pictures = VideoReceiver(Decoder(), None, read_clear_stamp)

@@ -1,4 +1,4 @@
-"""What can be configured of a camera, by its vehicle's machine and by the client."""
+"""The schema of a camera, on the vehicle's machine and on the client."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lavt.config.section import Section
 
 
 class CameraConfig(Section):
-    """The camera: where it sits (vehicle's frame) and what it gives."""
+    """The camera: its picture size and rate, and its pose in the vehicle's frame."""
 
     width_px: int = Field(640, ge=128, le=3840, multiple_of=2)
     height_px: int = Field(480, ge=128, le=2160, multiple_of=2)
@@ -24,15 +24,15 @@ class CameraConfig(Section):
     pitch_deg: float = Field(0.0, ge=-20, le=45)
     """Positive downwards."""
     roll_deg: float = Field(0.0, ge=-45, le=45)
-    """Positive leaning to the right."""
+    """Positive when the camera leans to the right."""
     exposure_ms: float = Field(0.0, ge=0, le=500)
-    """A simulated camera's: how long the shutter is open; 0 is a moment."""
+    """For a simulated camera: how long the shutter is open; 0: an instantaneous exposure."""
     sensor_delay_ms: float = Field(0.0, ge=0, le=500)
-    """A simulated camera's: from the end of the exposure to the picture being there."""
+    """For a simulated camera: from the end of the exposure until the picture is available."""
 
     @field_validator("exposure_ms")
     @classmethod
-    def _fits(cls, exposure_ms: float, info: Any) -> float:
+    def _check_exposure(cls, exposure_ms: float, info: Any) -> float:
         period_ms = 1000.0 / info.data.get("rate_hz", 1.0)
         if exposure_ms > period_ms:
             raise ValueError(f"must be at most the time between two frames, {period_ms:.3g} ms at camera.rate_hz")
@@ -40,18 +40,18 @@ class CameraConfig(Section):
 
 
 class ServerCameraConfig(CameraConfig):
-    """The camera as the vehicle's machine has it."""
+    """The camera in the config of the vehicle's machine."""
 
     source: str = "simulated"
-    """simulated: the vehicle's own; device: one that is plugged in (`docs/camera.md`)."""
+    """simulated: the simulator's camera; device: a real camera (`docs/camera.md`)."""
     device: str | int = "/dev/video0"
-    """With source device: a V4L2 device or its number, or a file or address of a video."""
+    """For source device: a V4L2 device or its number, or the file or address of a video."""
     format: str = Field("", pattern="^([!-~]{4})?$")
-    """With a V4L2 device: its name of a pixel format, such as MJPG; empty: the driver's choice."""
+    """For a V4L2 device: the pixel format, such as MJPG; empty: the driver's choice."""
 
 
 class ClientCameraConfig(CameraConfig):
-    """The camera as the client knows it."""
+    """The camera in the client's config."""
 
     calibration: str = ""
-    """File of a calibration, which then says everything but the rate; empty: the keys above say it."""
+    """A calibration file, which replaces all keys above except the rate; empty: the keys above apply."""

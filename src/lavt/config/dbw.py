@@ -1,4 +1,4 @@
-"""Schema of by-wire vehicles: a profile's YAML file, and the section `vehicle.dbw` that names one and its bus."""
+"""The schema of by-wire vehicles: the profile of a kit, and the section `vehicle.dbw` with a profile and a bus."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ Word = Literal["enabled", "angle", "command", "speed", "gear"]
 
 
 class CommandConfig(Section):
-    """How one thing is commanded: a message, and which of its signals says what; an empty name: it has none."""
+    """A command: its message, and the names of its signals by role; an empty name: no such signal."""
 
     message: str | dict[CommandSet, str] = ""
-    """Of each set of commands, where the kit has more than one."""
+    """The message; by set of commands if the kit has several sets."""
     value: str = ""
-    """What is asked for; its unit is the DBC's, and its multiplexer follows from it."""
+    """The commanded value, in the DBC's unit; its multiplexer follows from it."""
     enable: str = ""
     clear: str = ""
     rate: str = ""
-    """How fast the steering wheel may turn."""
+    """The maximum rate of the steering wheel."""
     rate_unit_degps: float = Field(1.0, gt=0)
-    """What one of the rate stands for, where the DBC gives it no unit."""
+    """The unit of the rate, if the DBC has none."""
     count: str = ""
-    """Counts frames, as far as its bits reach."""
+    """The frame counter, which wraps around."""
     checksum: str = ""
     """CRC-8 of SAE J1850 over identifier and data; the last byte."""
 
 
 class SystemCommandConfig(Section):
-    """How the kit as a whole is enabled and disabled; an empty message: it needs no such command."""
+    """The command that enables and disables the kit as a whole; an empty message: the kit needs none."""
 
     message: str = ""
     value: str = ""
@@ -43,7 +43,7 @@ class SystemCommandConfig(Section):
 
 
 class SentConfig(Section):
-    """Everything that is sent."""
+    """All commands."""
 
     steering: CommandConfig
     brake: CommandConfig
@@ -51,40 +51,40 @@ class SentConfig(Section):
     gear: CommandConfig
     system: SystemCommandConfig = SystemCommandConfig()
     clearing_bytes: int | None = Field(None, ge=1, le=8)
-    """So many bytes of a command are sent to clear an override; null: all, with counter and checksum."""
+    """The number of bytes of a command that clears an override; null: all, with counter and checksum."""
     gears: dict[Literal["park", "reverse", "neutral", "drive"], int] = Field(default_factory=dict)
 
 
 class ReportConfig(Section):
-    """How one report is read; an empty message: there is none.
+    """A report of the kit; an empty message: no such report.
 
-    The keys of `override`, `trip`, `lapse` and `fault` are signs, the values what they mean in words: `SIGNAL` is a
-    sign where it is not 0, `SIGNAL=7` where it is 7.
+    The keys of `override`, `trip`, `command_error` and `fault` are conditions, their values texts: `SIGNAL` is true if
+    the signal is not 0, `SIGNAL=7` if it is 7.
     """
 
     message: str = ""
     timeout_ms: int = Field(200, ge=10, le=5000)
-    """Without the report for so long there is no driving."""
+    """Driving is inhibited if the report is missing for longer than this."""
     values: dict[Word, str] = Field(default_factory=dict)
-    """Which signal has which value; in the DBC's unit."""
+    """The signal of each value, in the DBC's unit."""
     override: dict[str, str] = Field(default_factory=dict)
-    """The driver has taken over; CLEAR takes it back."""
+    """The driver has taken over; CLEAR resets it."""
     trip: dict[str, str] = Field(default_factory=dict)
-    """The kit's watchdog has tripped; CLEAR takes it back, once somebody has taken over."""
-    lapse: dict[str, str] = Field(default_factory=dict)
-    """What the kit found wrong with our commands, until the next right one."""
+    """The kit's watchdog has tripped; CLEAR resets it after a driver has taken over."""
+    command_error: dict[str, str] = Field(default_factory=dict)
+    """An error that the kit found in our commands, until the next correct command."""
     fault: dict[str, str] = Field(default_factory=dict)
-    """What hinders driving as long as it is reported."""
+    """A fault that inhibits driving while it is reported."""
     needs: dict[str, list[int] | dict[CommandSet, list[int]]] = Field(default_factory=dict)
-    """Numbers that a signal must have; any other hinders driving."""
+    """The values that a signal must have; any other value inhibits driving."""
     reasons: list[str] = Field(default_factory=list)
-    """Signals that tell why, wherever something is refused: by the names that the DBC has for their numbers."""
+    """Signals whose value, by its name in the DBC, explains why something is inhibited."""
     checksum: str = ""
-    """As in a command; a report with a wrong one is dropped."""
+    """As in a command; a report with a wrong checksum is dropped."""
 
 
 class ReportsConfig(Section):
-    """Everything that is read."""
+    """All reports."""
 
     steering: ReportConfig
     brake: ReportConfig
@@ -96,27 +96,27 @@ class ReportsConfig(Section):
 
 
 class OwnBrakeConfig(Section):
-    """How the brake's report tells that the kit brakes by itself; an empty signal: it does not."""
+    """How the brake's report shows that the kit brakes by itself; an empty signal: it does not."""
 
     signal: str = ""
     above: float = Field(0.0, ge=0)
-    """It brakes where the signal is more, and the brake is not reported enabled."""
+    """The kit brakes by itself if the signal is above this value while the brake is reported as not enabled."""
 
 
 class ByWireCarConfig(Section):
-    """The car that the kit is in."""
+    """The car with the kit."""
 
     wheelbase_m: float = Field(gt=0.5, lt=10)
     steering_ratio: float = Field(gt=1, lt=50)
-    """Angle of the steering wheel over that of the road wheels."""
+    """The angle of the steering wheel divided by the angle of the road wheels."""
     steering_sign: Literal[1, -1] | None = None
-    """1: left is positive on the bus; null: not known."""
+    """1: left is positive on the bus; null: unknown."""
     max_acceleration_mps2: float = Field(gt=0, le=20)
     max_braking_mps2: float = Field(gt=0, le=20)
 
 
 class ByWireLimitsConfig(Section):
-    """What is never exceeded on the bus, whatever is asked. Rates of pedals are of pressing; letting go is free."""
+    """The limits of all commands on the bus. Rates of pedals apply to pressing; releasing is not limited."""
 
     steering_wheel_deg: float = Field(gt=0, le=3000)
     steering_wheel_rate_degps: float = Field(gt=0, le=3000)
@@ -125,63 +125,63 @@ class ByWireLimitsConfig(Section):
     throttle_rate_per_s: float = Field(gt=0, le=1000)
     brake_rate_per_s: float = Field(gt=0, le=1000)
     holding_brake: float = Field(0.3, gt=0, le=1)
-    """The least brake while the kit is being enabled and while the car is being parked."""
+    """The minimum brake while the kit is being enabled and while the car is being parked."""
 
 
 class ProfileConfig(Section):
-    """How one kind of by-wire kit is spoken to (`docs/by_wire.md`)."""
+    """The profile of a kind of by-wire kit (`docs/by_wire.md`)."""
 
     kit: Literal["dataspeed_1", "dataspeed_2"]
-    """What a software car has to play to be driven by this profile."""
+    """The kind of kit that a software car must simulate for this profile."""
     dbc: str
-    """The file with the bits, beside the profile."""
+    """The DBC file, in the directory of the profile."""
     commands: CommandSet | None = None
-    """Which of the kit's sets of commands; null: it has one."""
+    """The set of commands to use; null: the kit has only one."""
     vehicle: ByWireCarConfig
     limits: ByWireLimitsConfig
     command_step_deg: float = Field(0.1, gt=0)
-    """One of the reported `command` of the steering."""
+    """The step of the steering's reported `command`."""
     sent: SentConfig
     reports: ReportsConfig
     watchdog: OwnBrakeConfig = OwnBrakeConfig()
-    """By what `lavt can prove` sees that the kit's watchdog brakes."""
+    """How `lavt can test-watchdog` detects that the kit's watchdog brakes."""
 
 
 class DbwConfig(Section):
-    """A by-wire kit and the bus it is on."""
+    """A by-wire kit and its bus."""
 
     profile: str = "dataspeed_gen2"
-    """A profile that comes with LAVT, or the path of one's YAML file; `:user` behind it takes its other commands."""
+    """The name of a shipped profile or the path of a profile; the suffix `:user` selects the other set of commands."""
     dbc: str = ""
-    """The vendor's DBC file instead of the profile's."""
+    """The vendor's DBC file, to use instead of the profile's."""
     interface: str = "socketcan"
-    """python-can's name, or `inside`: a software car in this very process."""
+    """The interface by python-can's name, or `inside`: a software car in the server's process."""
     channel: str = "can0"
     options: dict[str, Any] = Field(default_factory=dict)
     """Further arguments of python-can's `Bus`."""
     truth: str = ""
-    """`host:port` of UDP where a software car's truth is heard; empty: a real car."""
+    """The UDP address, as `host:port`, at which a software car's ground truth is received; empty: a real car."""
     watchdog_proof: str = ""
-    """File that `lavt can prove` wrote."""
+    """The file that `lavt can test-watchdog` wrote."""
     steering_sign: Literal[1, -1] | None = None
-    """1: left is positive on the bus; for a profile that leaves it open."""
+    """1: left is positive on the bus; for a profile without a sign."""
 
     @property
     def is_inside(self) -> bool:
-        """Whether the kit is a software car in the server's own process, also in virtual time."""
+        """Whether the kit is a software car in the server's process, which is possible in virtual time, too."""
         return self.interface == "inside"
 
     def __hash__(self) -> int:
-        """Hash what is written: `options` has no hash of its own."""
+        """Return the hash of the JSON, because `options` is not hashable."""
         return hash(self.model_dump_json())
 
 
 class WatchdogProof(Section):
-    """The file of `lavt can prove`: on this bus, by this profile, the kit's watchdog was seen to brake."""
+    """The file of a passed `lavt can test-watchdog`: the kit's watchdog braked, on this bus, with this profile."""
 
     version: Literal[1] = 1
     at: str
-    """Day and time (UTC)."""
+    """The date and time (UTC)."""
     profile: str
     commands: CommandSet | None
     digest: str
@@ -192,12 +192,12 @@ class WatchdogProof(Section):
     is_virtual: bool
     gear: str
     brake: float
-    """What was asked before the silence."""
+    """The brake command before the commands stopped."""
     release_ms: float = Field(ge=0)
-    """From the last frame until the brake was reported not enabled."""
+    """From the last frame until the brake was reported as not enabled."""
     braked_ms: float = Field(ge=0)
     """From the last frame until the kit was reported to brake by itself."""
     reports: int
-    """So many reports of the brake came in the silence."""
+    """The number of brake reports after the commands stopped."""
     said: str
-    """What else the kit reported."""
+    """The kit's other reports, as text."""

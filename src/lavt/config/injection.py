@@ -1,4 +1,4 @@
-"""What is injected under a condition, and how two machines have it done."""
+"""The schema of network conditions, and of their injection on two machines."""
 
 from __future__ import annotations
 
@@ -10,68 +10,70 @@ from lavt.config.section import Section
 from lavt.transport.emulation.link import QUEUE_PACKETS
 
 EARLY_SHARE: Final = {"video": 0.0, "control": 0.5}
-"""With more packets that overtake, the median need not be delayed: a repair packet brings its frame early."""
+"""The largest share of undelayed packets with which the median must be delayed; a repair packet brings its frame early.
+"""
 
 
 class InjectionConfig(Section):
-    """How a side of two machines injects delay by `tc netem` into what its machine sends; it takes root."""
+    """How a side on its own machine injects latency into the packets it sends, by `tc netem`; requires root."""
 
     interface: str = ""
-    """The one towards the other machine; empty: this machine delays nothing."""
+    """The interface towards the other machine; empty: this machine injects nothing."""
     control_protocol: Literal["udp", "tcp"] = "udp"
-    """Of the link between the routers, and the port at which the vehicle's router listens."""
+    """The protocol of the link between the routers."""
     control_port: int = Field(7448, ge=1, le=65535)
+    """The port of the vehicle's router."""
 
 
 class ServerInjectionConfig(InjectionConfig):
-    """The server's: what it sends is delayed when a client asks for it."""
+    """The server's injection, which a client can request."""
 
     remote: bool = False
-    """Whether a client may: for a simulated vehicle at any time, for another one while it stands disarmed."""
+    """Whether a client may request it: for a simulated vehicle at any time, otherwise while stationary and disarmed."""
 
 
 class ClientInjectionConfig(InjectionConfig):
-    """The client's: which condition it drives under."""
+    """The client's injection: the condition under which it drives."""
 
     condition: str = ""
-    """Of `netem/conditions.yaml`; empty: the network is taken as it is."""
+    """A condition of `netem/conditions.yaml`; empty: no injection."""
     state_delay: Literal["none", "with_video"] = "none"
 
 
 class ImpairmentConfig(Section):
-    """What the network does to a flow beside a constant delay; see `docs/network.md`."""
+    """The impairments of a flow in addition to a constant delay; see `docs/network.md`."""
 
     jitter_ms: float = Field(0.0, ge=0, le=10_000)
-    """Standard deviation of the delay; of a uniform law the half width."""
+    """The standard deviation of the delay; for the uniform distribution, its half width."""
     jitter_correlation: float = Field(0.0, ge=0, lt=1)
-    """Of the delay with itself 20 ms before."""
+    """The correlation of the delay with the delay 20 ms earlier."""
     jitter_distribution: Literal["normal", "uniform", "pareto", "paretonormal"] = "normal"
     loss: float = Field(0.0, ge=0, lt=1)
     loss_burst_packets: float = Field(0.0, ge=0, le=10_000)
-    """Mean length of a burst of lost packets; 0 or 1: each is lost by itself."""
+    """The mean length of a burst of lost packets; 0 or 1: independent losses."""
     rate_bps: int = Field(0, ge=0, le=10_000_000_000)
     """0: no limit."""
     reorder: float = Field(0.0, ge=0, lt=1)
-    """Share of packets that are not delayed, and so overtake."""
+    """The share of packets that are not delayed, and so overtake others."""
     trace: str = ""
-    """A delay (a name that ends in .csv) or a capacity (Mahimahi) over time: one of `netem/traces`, or a path."""
+    """A delay (a name that ends in .csv) or a capacity (Mahimahi) over time: a file of `netem/traces`, or a path."""
     queue_packets: int = Field(QUEUE_PACKETS, ge=1, le=1_000_000)
-    """So many wait for `rate_bps` or a capacity; what comes then is dropped."""
+    """The length of the queue for `rate_bps` or a capacity; further packets are dropped."""
 
     @property
     def has_delay_trace(self) -> bool:
-        """Whether the delay changes by a trace."""
+        """Whether the delay follows a trace."""
         return self.trace.endswith(".csv")
 
 
 class LinkConfig(ImpairmentConfig):
-    """What is injected into one direction of a relayed flow, as a condition has it."""
+    """The delay and the impairments of one direction of a relayed flow."""
 
     delay_ms: float = Field(0.0, ge=0, le=60_000)
 
 
 class FlowChanges(Section):
-    """What a run changes of its condition in one direction; where nothing is given, it is as the condition says."""
+    """The values with which a run replaces those of its condition in one direction; null: the condition's value."""
 
     delay_ms: float | None = Field(None, ge=0, le=60_000)
     jitter_ms: float | None = Field(None, ge=0, le=10_000)
@@ -86,18 +88,18 @@ class FlowChanges(Section):
 
     @property
     def given(self) -> dict[str, Any]:
-        """What is asked for instead of what the condition says."""
+        """The values that replace those of the condition, by name."""
         return self.model_dump(exclude_none=True)
 
-    def of(self, delay_ms: float, impairment: ImpairmentConfig) -> tuple[float, ImpairmentConfig]:
-        """Give delay and impairment as changed."""
+    def apply_to(self, delay_ms: float, impairment: ImpairmentConfig) -> tuple[float, ImpairmentConfig]:
+        """Return the changed delay and impairment."""
         given = self.given
         delay_ms = given.pop("delay_ms", delay_ms)
         return delay_ms, ImpairmentConfig(**{**impairment.model_dump(), **given})
 
 
 class Condition(Section):
-    """What is injected under a condition."""
+    """A network condition: the delay and impairments of both flows."""
 
     video_ms: float = Field(ge=0, le=60_000)
     control_ms: float = Field(ge=0, le=60_000)
@@ -106,17 +108,17 @@ class Condition(Section):
 
     @property
     def flows(self) -> dict[str, tuple[float, ImpairmentConfig]]:
-        """The delay of each flow, and what else happens to it."""
+        """The delay and the impairment of each flow."""
         return {"video": (self.video_ms, self.video), "control": (self.control_ms, self.control)}
 
     @property
     def constant_ms(self) -> dict[str, float | None]:
-        """The delay of each flow; None where it changes by a trace."""
+        """The delay of each flow; None if it follows a trace."""
         return {name: None if each.has_delay_trace else delay_ms for name, (delay_ms, each) in self.flows.items()}
 
     @property
     def least_ms(self) -> dict[str, float]:
-        """A delay that next to no median of each flow is below: jitter and overtaking make it less than was asked."""
+        """A lower bound of each flow's median delay, which jitter and reordering can make smaller than requested."""
         return {
             name: 0.0 if each.reorder > EARLY_SHARE[name] else max(0.0, delay_ms - 4 * each.jitter_ms)
             for name, (delay_ms, each) in self.flows.items()

@@ -1,4 +1,4 @@
-"""How a vehicle behind a NAT is reached: through a rendezvous, a machine that both ends reach (`lavt rendezvous`)."""
+"""The schema of a rendezvous (`lavt rendezvous`), through which clients reach a vehicle behind NAT."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from lavt.transport.clock_sync import probe
 
 
 class ServerRendezvousConfig(Section):
-    """The rendezvous as the vehicle knows it; clients that reach the vehicle directly go on doing so."""
+    """The rendezvous in the server's config; clients can still reach the vehicle directly."""
 
     host: str = ""
-    """Empty: there is none."""
+    """The host of the rendezvous; empty: none."""
     video_port: int = Field(5600, ge=1, le=65535)
     probe_port: int = Field(probe.DEFAULT_PORT, ge=1, le=65535)
 
 
 class RendezvousConfig(Section):
-    """The rendezvous itself: two UDP ports, for one vehicle."""
+    """The rendezvous itself: two UDP ports for one vehicle."""
 
     vehicle_id: str = "vehicle-1"
     vehicle_key: str = ""
-    """File of the vehicle's key (NAME.sign.pub of `lavt keys`); empty: whoever knows its name can stand in for it."""
-    bind: str = "0.0.0.0"  # noqa: S104 (it is for whoever wants to reach the vehicle)
-    """On a machine with several addresses the one that is dialled: a NAT lets in only what comes from there."""
+    """The file of the vehicle's key (NAME.sign.pub of `lavt keys`); empty: anyone can register under its name."""
+    bind: str = "0.0.0.0"  # noqa: S104 (clients connect from anywhere)
+    """The public address, on a machine with several addresses: a NAT admits only replies from that address."""
     video_port: int = Field(5600, ge=0, le=65535)
     probe_port: int = Field(probe.DEFAULT_PORT, ge=0, le=65535)

@@ -1,4 +1,4 @@
-"""What every part of a config is."""
+"""The base class of all parts of a config."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Section(BaseModel):
-    """A part of a config: no unknown keys, no silent conversion, not changed once read."""
+    """A part of a config, immutable, without unknown keys and without silent conversions."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

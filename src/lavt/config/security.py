@@ -1,4 +1,4 @@
-"""Who may drive, and which vehicle is the right one: keys on both sides."""
+"""The schema of keys on both sides."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from lavt.config.section import Section
 
 
 class ServerSecurityConfig(Section):
-    """Who may drive; where nothing is said, whoever reaches the router may."""
+    """The operators who may drive; without keys, anyone who can reach the router can drive."""
 
     key: str = ""
-    """File of the vehicle's signing key (NAME.sign.key of `lavt keys`)."""
+    """The file of the vehicle's signing key (NAME.sign.key of `lavt keys`)."""
     operators: dict[str, str] = Field(default_factory=dict)
-    """Names of operators, and files of their keys (NAME.sign.pub)."""
+    """The files of the operators' keys (NAME.sign.pub) by name."""
 
     @model_validator(mode="after")
-    def _both(self) -> ServerSecurityConfig:
+    def _check_complete(self) -> ServerSecurityConfig:
         if bool(self.key) != bool(self.operators):
-            raise ValueError("key and operators belong together: give both, or none where nothing shall be signed")
+            raise ValueError("key and operators belong together: give both, or neither for unsigned messages")
         return self
 
 
 class ClientSecurityConfig(Section):
-    """Who one is, and which vehicle is the right one."""
+    """The operator's own key, and the key of the expected vehicle."""
 
     key: str = ""
-    """File of the operator's signing key (NAME.sign.key of `lavt keys`)."""
+    """The file of the operator's signing key (NAME.sign.key of `lavt keys`)."""
     vehicle: str = ""
-    """File of the vehicle's key (NAME.sign.pub)."""
+    """The file of the vehicle's key (NAME.sign.pub)."""
 
     @model_validator(mode="after")
-    def _both(self) -> ClientSecurityConfig:
+    def _check_complete(self) -> ClientSecurityConfig:
         if bool(self.key) != bool(self.vehicle):
-            raise ValueError("key and vehicle belong together: give both, or none where nothing is signed")
+            raise ValueError("key and vehicle belong together: give both, or neither for unsigned messages")
         return self

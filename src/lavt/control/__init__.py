@@ -1,1 +1,1 @@
-"""From a lane to a command, and which commands a vehicle obeys: steps 10 and 12."""
+"""The lane keeping controller: from a detected lane and a speed to steering and pedals (step 10)."""

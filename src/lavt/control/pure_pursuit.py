@@ -1,6 +1,6 @@
-"""Steering by pure pursuit, and the path that follows from it.
+"""Pure pursuit steering, and the path that it would follow.
 
-The car aims at the point of the lane's centre that is a lookahead away from its rear axle, and takes the circle that
+The car aims at the point of the lane's centre at the lookahead distance from its rear axle, and takes the circle that
 leads there: curvature = 2 sin(angle to that point) / lookahead (R. C. Coulter, Implementation of the Pure Pursuit Path
 Tracking Algorithm, CMU-RI-TR-92-01).
 """
@@ -11,22 +11,22 @@ import math
 
 from lavt.domain import PATH_POINTS, PATH_STEP_M, Lane
 
-LOOKAHEAD_WITHIN_M = (4.0, 20.0)
-"""Nearer than 4 m the camera sees no road, and the wheel would twitch at low speed; beyond 20 m it sees no marks."""
-CLOSE_M2 = 1e-6
-"""So far the goal's squared distance may be off the lookahead's: 0.1 micrometres at the nearest."""
+LOOKAHEAD_RANGE_M = (4.0, 20.0)
+"""Below 4 m the camera sees no road, and the wheel would twitch at low speed; beyond 20 m it sees no marks."""
+TOLERANCE_M2 = 1e-6
+"""Tolerance of the goal's squared distance: 0.1 micrometres at the shortest lookahead."""
 
 
-Place = tuple[float, float, float]
-"""Where the rear axle is (x and y, m) and where the car points to (rad), in the frame the lane is given in."""
+PlanarPose = tuple[float, float, float]
+"""Position of the rear axle (x and y, m) and heading (rad), in the frame of the lane."""
 
-SEEN_FROM: Place = (0.0, 0.0, 0.0)
-"""Where the picture was taken."""
+ORIGIN: PlanarPose = (0.0, 0.0, 0.0)
+"""The pose at which the picture was taken."""
 
 
-def moved(place: Place, distance_m: float, curvature_per_m: float) -> Place:
-    """Go `distance_m` along a circle."""
-    x_m, y_m, heading_rad = place
+def move_along_arc(pose: PlanarPose, distance_m: float, curvature_per_m: float) -> PlanarPose:
+    """Return the pose after `distance_m` along a circle."""
+    x_m, y_m, heading_rad = pose
     turned_rad = distance_m * curvature_per_m
     # The chord of the arc: its length, and its direction half-way between the two headings.
     chord_m = distance_m if -1e-9 < turned_rad < 1e-9 else 2 * math.sin(turned_rad / 2) / curvature_per_m
@@ -35,31 +35,31 @@ def moved(place: Place, distance_m: float, curvature_per_m: float) -> Place:
 
 
 def lookahead_m(lookahead_s: float, speed_mps: float) -> float:
-    """Give the distance to aim at: `lookahead_s` of driving, within `LOOKAHEAD_WITHIN_M`."""
-    nearest_m, farthest_m = LOOKAHEAD_WITHIN_M
+    """Return the lookahead distance: `lookahead_s` of driving, within `LOOKAHEAD_RANGE_M`."""
+    nearest_m, farthest_m = LOOKAHEAD_RANGE_M
     return min(max(lookahead_s * speed_mps, nearest_m), farthest_m)
 
 
-def goal_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> tuple[float, float]:
-    """Find the point of the lane's centre, ahead of `place`, that is `distance_m` away from it.
+def goal_point_m(lane: Lane, distance_m: float, pose: PlanarPose = ORIGIN) -> tuple[float, float]:
+    """Return the point of the lane's centre that is ahead of `pose` and `distance_m` away from it.
 
-    From a place farther off the lane than that, it is the point abreast.
+    If the lane's centre is farther away than that, return the point abreast.
     """
     c0, c1, c2 = lane.centre
-    from_x_m, from_y_m, _ = place
+    from_x_m, from_y_m, _ = pose
     farthest_m2 = distance_m * distance_m
     aside_m = c0 + (c1 + c2 * from_x_m) * from_x_m - from_y_m
     if abs(aside_m) >= distance_m:
         return from_x_m, from_y_m + aside_m
-    # Newton's method on the squared distance, three or four steps; it starts where a straight lane would have the goal
-    # and is kept between what is known to be too near and too far.
+    # Newton's method on the squared distance, three or four steps; it starts at the goal of a straight lane
+    # and is bracketed by the nearest point known to be too far and the farthest known to be too near.
     low_m, high_m = from_x_m, from_x_m + distance_m
     x_m = from_x_m + math.sqrt(farthest_m2 - aside_m * aside_m)
     for _ in range(50):
         y_m = c0 + (c1 + c2 * x_m) * x_m
         ahead_m, left_m = x_m - from_x_m, y_m - from_y_m
         off_m2 = ahead_m * ahead_m + left_m * left_m - farthest_m2
-        if -CLOSE_M2 < off_m2 < CLOSE_M2:
+        if -TOLERANCE_M2 < off_m2 < TOLERANCE_M2:
             break
         if off_m2 < 0:
             low_m = x_m
@@ -72,40 +72,42 @@ def goal_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> tuple[flo
     return x_m, y_m
 
 
-def pursuit_curvature_per_m(lane: Lane, distance_m: float, place: Place = SEEN_FROM) -> float:
-    """Give the curvature, left positive, of the circle from `place` to the goal on the lane's centre."""
-    from_x_m, from_y_m, heading_rad = place
-    x_m, y_m = goal_m(lane, distance_m, place)
+def pursuit_curvature_per_m(lane: Lane, distance_m: float, pose: PlanarPose = ORIGIN) -> float:
+    """Return the curvature, left positive, of the circle from `pose` to the goal on the lane's centre."""
+    from_x_m, from_y_m, heading_rad = pose
+    x_m, y_m = goal_point_m(lane, distance_m, pose)
     return 2 * math.sin(math.atan2(y_m - from_y_m, x_m - from_x_m) - heading_rad) / distance_m
 
 
-def pursued_path(lane: Lane, distance_m: float, limit_per_m: float, place: Place = SEEN_FROM) -> tuple[float, ...]:
-    """Give the curvatures, within +-`limit_per_m`, of the path from `place` onto the lane's centre and along it.
+def pursuit_path_per_m(
+    lane: Lane, distance_m: float, limit_per_m: float, pose: PlanarPose = ORIGIN
+) -> tuple[float, ...]:
+    """Return the curvatures, within +-`limit_per_m`, of the path from `pose` onto the lane's centre and along it.
 
-    It is where pure pursuit would go: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead. The lane's
-    own curvature would not do: a car that is beside its lane, or turned, would stay so along a path of that curvature.
+    This is the path that pure pursuit would drive: `PATH_POINTS` values, `PATH_STEP_M` apart, the first one step ahead.
+    The curvature of the lane itself would not do: a car with an offset or heading error would keep it along that path.
     """
     curvatures = []
-    bend_per_m = limited(pursuit_curvature_per_m(lane, distance_m, place), limit_per_m)
+    next_per_m = clamp(pursuit_curvature_per_m(lane, distance_m, pose), limit_per_m)
     for _ in range(PATH_POINTS):
-        place = moved(place, PATH_STEP_M, bend_per_m)
-        bend_per_m = pursuit_curvature_per_m(lane, distance_m, place)
-        if not -limit_per_m <= bend_per_m <= limit_per_m:
-            bend_per_m = limited(bend_per_m, limit_per_m)
-        curvatures.append(bend_per_m)
+        pose = move_along_arc(pose, PATH_STEP_M, next_per_m)
+        next_per_m = pursuit_curvature_per_m(lane, distance_m, pose)
+        if not -limit_per_m <= next_per_m <= limit_per_m:
+            next_per_m = clamp(next_per_m, limit_per_m)
+        curvatures.append(next_per_m)
     return tuple(curvatures)
 
 
-def limited(value: float, limit: float) -> float:
-    """Keep `value` within +-`limit`."""
+def clamp(value: float, limit: float) -> float:
+    """Return `value` clamped to +-`limit`."""
     return min(max(value, -limit), limit)
 
 
 def steering_rad(curvature_per_m: float, wheelbase_m: float) -> float:
-    """Give the road wheel angle of the kinematic bicycle for a curvature of its rear axle's path."""
+    """Return the road wheel angle of the kinematic bicycle for a curvature of its rear axle's path."""
     return math.atan(wheelbase_m * curvature_per_m)
 
 
 def curvature_per_m(angle_rad: float, wheelbase_m: float) -> float:
-    """Give the curvature of the rear axle's path for a road wheel angle, the inverse of `steering_rad`."""
+    """Return the curvature of the rear axle's path for a road wheel angle, the inverse of `steering_rad`."""
     return math.tan(angle_rad) / wheelbase_m

@@ -1,1 +1,1 @@
-"""What `lavt doctor` checks on a machine, and how it finds out."""
+"""The checks of `lavt doctor`, and the probes that measure a machine for them."""

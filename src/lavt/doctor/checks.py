@@ -1,4 +1,4 @@
-"""What measurements of a machine, or of a pair of machines, mean for driving: the verdicts of `lavt doctor`."""
+"""The checks of `lavt doctor`: each function turns measurements of one or two machines into a verdict."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final, Literal
 
-from lavt.doctor.clock_checks import WHAT_TO_DO, ClockComparison, check_host
+from lavt.doctor.clock_checks import HINTS, ClockComparison, check_host
 from lavt.domain import NS_PER_MS, NS_PER_S, NS_PER_US, State
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.udp_link import RECEIVE_BUFFER_BYTES
@@ -20,33 +20,34 @@ Verdict = Literal["ok", "warning", "problem", "not checked"]
 PHYSICS_STEP_NS: Final = NS_PER_S // 240
 COMMAND_PERIOD_NS: Final = 20 * NS_PER_MS
 STATE_RATE_HZ: Final = 50.0
-UNREADABLE: Final = {
+UNREADABLE_REASONS: Final = {
     "states_of_another_time": "signed by the vehicle, which does not answer this operator's key",
     "states_forged": "not signed by the vehicle that security.vehicle names",
 }
-"""Why a door lets no state in, by what it counts."""
-SHOWN: Final = ("lavt", "eclipse-zenoh", "av", "opencv-python-headless", "numpy", "cryptography", "pylibsrtp")
+"""Why a gateway rejects states, by the name of its count."""
+KEY_PACKAGES: Final = ("lavt", "eclipse-zenoh", "av", "opencv-python-headless", "numpy", "cryptography", "pylibsrtp")
 """Packages whose versions matter between two machines."""
 CAMERA_SHARE: Final = 0.9
-"""Of the configured pictures have to come: fewer, and the camera exposes for longer than their period."""
+"""The required share of the configured picture rate; below it, the exposure is longer than the picture period."""
 CERTIFICATE_DAYS: Final = 14.0
-"""With fewer left it is time to make new ones."""
+"""The remaining validity below which a certificate should be renewed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that was looked at: what was found, and what to do about it (empty: nothing)."""
+    """The result of one check."""
 
     name: str
     verdict: Verdict
     found: str
     do: str = ""
+    """The suggested fix; empty if there is nothing to fix."""
     measured: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class CodecTimes:
-    """How long each synthetic picture took: stamped and encoded, decoded and its stamp read."""
+    """The processing times of synthetic pictures: to stamp and encode, and to decode and read the stamp."""
 
     encode_ns: Sequence[int]
     decode_ns: Sequence[int]
@@ -54,7 +55,7 @@ class CodecTimes:
 
 @dataclass(frozen=True, slots=True)
 class CameraSample:
-    """What a camera gave: when each picture came, and of how many was known when it was taken."""
+    """The arrival times of a camera's pictures, and how many of them have a capture time."""
 
     came_ns: Sequence[int]
     timed: int
@@ -62,289 +63,293 @@ class CameraSample:
 
 @dataclass(frozen=True, slots=True)
 class StateSample:
-    """What came on the state's key within `seconds` of the first: states, and how often what could not be read."""
+    """The vehicle states received within `seconds` of the first, and the counts of unreadable messages by reason."""
 
     states: Sequence[State] = ()
     unreadable: Mapping[str, int] = field(default_factory=dict)
     seconds: float = 1.0
 
 
-def check_versions(python: str, found: Mapping[str, str | None], requirements: Sequence[str]) -> Check:
-    """Compare installed packages (None: missing) with what LAVT asks for, `requirements` of a package's metadata."""
-    wrong = []
-    for each in requirements:
-        match = re.match(r"([\w.-]+)(?:.*?>=([\d.]+))?", each)
-        name, least = ("", None) if match is None else match.groups()
-        version = found.get(name)
-        if version is None and "extra ==" not in each:
-            wrong.append(f"{name} is missing")
-        elif version is not None and least is not None and _numbers(version) < _numbers(least):
-            wrong.append(f"{name} is {version}, at least {least} is needed")
-    measured = {"python": python, **found}
-    if wrong:
-        do = "in LAVT's directory, by the Python that runs it: pip install -e ."
-        return Check("versions", "problem", "; ".join(wrong), do, measured)
-    shown = [f"{name} {version}" for name in SHOWN if (version := found.get(name)) is not None]
-    return Check("versions", "ok", ", ".join([f"Python {python}", *shown]), measured=measured)
+def check_versions(python: str, installed: Mapping[str, str | None], requirements: Sequence[str]) -> Check:
+    """Check the installed versions (None: missing) against the `requirements` in LAVT's package metadata."""
+    errors = []
+    for requirement in requirements:
+        match = re.match(r"([\w.-]+)(?:.*?>=([\d.]+))?", requirement)
+        name, minimum = ("", None) if match is None else match.groups()
+        version = installed.get(name)
+        if version is None and "extra ==" not in requirement:
+            errors.append(f"{name} is missing")
+        elif version is not None and minimum is not None and _version_tuple(version) < _version_tuple(minimum):
+            errors.append(f"{name} is {version}, but at least {minimum} is required")
+    measured = {"python": python, **installed}
+    if errors:
+        do = "in LAVT's directory, with the Python that runs it: pip install -e ."
+        return Check("versions", "problem", "; ".join(errors), do, measured)
+    versions = [f"{name} {version}" for name in KEY_PACKAGES if (version := installed.get(name)) is not None]
+    return Check("versions", "ok", ", ".join([f"Python {python}", *versions]), measured=measured)
 
 
-def _numbers(version: str) -> tuple[int, ...]:
+def _version_tuple(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
 def check_codec(times: CodecTimes, *, size: str, rate_hz: float, side: str, cores: int) -> Check:
-    """Compare the time for each picture with the time between two; `side` "server" encodes, "client" decodes."""
+    """Check that the codec is fast enough for the picture rate; a "server" only encodes, a "client" only decodes."""
     period_ms = 1000.0 / rate_hz
-    parts = {"encode": times.encode_ns, "decode": times.decode_ns}
-    middle = {name: median(each) / NS_PER_MS for name, each in parts.items()}
-    high = {name: sorted(each)[int(len(each) * 0.95)] / NS_PER_MS for name, each in parts.items()}
-    words = f"{size} at {rate_hz:g} Hz: " + ", ".join(
-        f"to {name} takes {middle[name]:.1f} ms (95 %: {high[name]:.1f} ms), {middle[name] / period_ms:.0%} of a frame"
-        for name in parts
+    times_ns = {"encode": times.encode_ns, "decode": times.decode_ns}
+    median_ms = {name: median(each) / NS_PER_MS for name, each in times_ns.items()}
+    p95_ms = {name: sorted(each)[int(len(each) * 0.95)] / NS_PER_MS for name, each in times_ns.items()}
+    found = f"{size} at {rate_hz:g} Hz: " + ", ".join(
+        f"to {name} takes {median_ms[name]:.1f} ms (95 %: {p95_ms[name]:.1f} ms), "
+        f"{median_ms[name] / period_ms:.0%} of a frame"
+        for name in times_ns
     )
     measured = {
         "cores": cores,
         "period_ms": period_ms,
-        **{f"{name}_ms": value for name, value in middle.items()},
-        **{f"{name}_p95_ms": value for name, value in high.items()},
+        **{f"{name}_ms": value for name, value in median_ms.items()},
+        **{f"{name}_p95_ms": value for name, value in p95_ms.items()},
     }
-    counts = {"server": ["encode"], "client": ["decode"]}.get(side, list(parts))
-    words += f"; {cores} core{'s' * (cores != 1)}"
-    if max(middle[name] for name in counts) > period_ms:
-        do = "use a lower camera.rate_hz or smaller pictures, or a faster machine: this one cannot keep up"
-        return Check("processor", "problem", words, do, measured)
-    if max(high[name] for name in counts) > period_ms / 2:
+    relevant = {"server": ["encode"], "client": ["decode"]}.get(side, list(times_ns))
+    found += f"; {cores} core{'s' * (cores != 1)}"
+    if max(median_ms[name] for name in relevant) > period_ms:
+        do = "use a lower camera.rate_hz, smaller pictures or a faster machine: this one is too slow"
+        return Check("processor", "problem", found, do, measured)
+    if max(p95_ms[name] for name in relevant) > period_ms / 2:
         do = "close other programs, or use a lower camera.rate_hz or smaller pictures: the loop needs the other half"
-        return Check("processor", "warning", words, do, measured)
+        return Check("processor", "warning", found, do, measured)
     if cores < 2:
-        return Check("processor", "warning", words, "use at least two cores: video holds up commands on one", measured)
-    return Check("processor", "ok", words, measured=measured)
+        return Check("processor", "warning", found, "use at least two cores: on one, video delays commands", measured)
+    return Check("processor", "ok", found, measured=measured)
 
 
-def check_by_wire(heard: int, inhibit_reason: str, *, name: str) -> Check:
-    """Judge what a by-wire kit said on its bus while nothing was sent, and why it could not be driven."""
-    found = f"{heard} frames were heard on {name}"
+def check_by_wire(frames: int, inhibit_reason: str, *, name: str) -> Check:
+    """Check that a by-wire kit sends its reports on its bus, and that nothing inhibits driving."""
+    found = f"{frames} frames received on {name}"
     if inhibit_reason:
-        do = "put that right: until then the vehicle is not armed (docs/vehicles.md)"
-        return Check("by wire", "problem", f"{found}; {inhibit_reason}", do, {"frames": heard})
-    return Check("by wire", "ok", f"{found}, every report of the profile among them", measured={"frames": heard})
+        do = "fix this: until then the vehicle cannot be armed (docs/vehicles.md)"
+        return Check("by wire", "problem", f"{found}; {inhibit_reason}", do, {"frames": frames})
+    return Check("by wire", "ok", f"{found}, including every report of the profile", measured={"frames": frames})
 
 
-def check_camera(seen: CameraSample | str, *, name: str, size: str, rate_hz: float) -> Check:
-    """Compare the rate at which pictures came with what is configured; a text says why none can come."""
-    if isinstance(seen, str):
-        do = "put that right, or end what has the camera: `lavt server` does not start like this (docs/camera.md)"
-        return Check("camera", "problem", seen, do)
-    pictures, times = len(seen.came_ns), seen.came_ns
-    came_hz = (pictures - 1) * NS_PER_S / (times[-1] - times[0]) if pictures > 1 else 0.0
-    known = "known" if seen.timed else "not known"
-    found = f"{name} gives {size}, {came_hz:.1f} pictures a second; when each was taken is {known}"
-    measured = {"pictures": pictures, "rate_hz": came_hz, "timed": seen.timed}
-    if came_hz < rate_hz * CAMERA_SHARE:
-        do = f"{rate_hz:g} are configured: give it light (it exposes for longer in the dark), or lower camera.rate_hz"
+def check_camera(sample: CameraSample | str, *, name: str, size: str, rate_hz: float) -> Check:
+    """Check that a camera delivers pictures at the configured rate; a string is the reason why it delivers none."""
+    if isinstance(sample, str):
+        do = "fix this, or close the program that uses the camera: `lavt server` cannot start (docs/camera.md)"
+        return Check("camera", "problem", sample, do)
+    pictures, times = len(sample.came_ns), sample.came_ns
+    measured_hz = (pictures - 1) * NS_PER_S / (times[-1] - times[0]) if pictures > 1 else 0.0
+    has_times = "have a capture time" if sample.timed else "have no capture time"
+    found = f"{name} delivers {measured_hz:.1f} pictures of {size} a second, which {has_times}"
+    measured = {"pictures": pictures, "rate_hz": measured_hz, "timed": sample.timed}
+    if measured_hz < rate_hz * CAMERA_SHARE:
+        do = f"{rate_hz:g} Hz are configured: add light (darkness makes exposure longer), or lower camera.rate_hz"
         return Check("camera", "warning", found, do, measured)
     return Check("camera", "ok", found, measured=measured)
 
 
 def check_buffer(granted_bytes: int) -> Check:
-    """Compare the receive buffer that the system gives a socket with what LAVT asks for."""
-    words = f"a socket may keep {granted_bytes} bytes that wait to be read, {RECEIVE_BUFFER_BYTES} are asked for"
+    """Check that the system grants a socket the receive buffer that LAVT requests."""
+    found = f"a socket gets a receive buffer of {granted_bytes} bytes, LAVT requests {RECEIVE_BUFFER_BYTES}"
     measured = {"granted_bytes": granted_bytes, "requested_bytes": RECEIVE_BUFFER_BYTES}
     if granted_bytes >= RECEIVE_BUFFER_BYTES:
-        return Check("receive buffer", "ok", words, measured=measured)
-    do = f"as root: sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES} (and into /etc/sysctl.d/ to keep it)"
-    return Check("receive buffer", "warning", words, do, measured)
+        return Check("receive buffer", "ok", found, measured=measured)
+    do = f"as root: sysctl -w net.core.rmem_max={RECEIVE_BUFFER_BYTES} (and add it to /etc/sysctl.d/ to keep it)"
+    return Check("receive buffer", "warning", found, do, measured)
 
 
 def check_arrival(stamped: bool) -> Check:
-    """Judge whether the kernel says when a datagram arrived."""
+    """Check that the kernel records the arrival time of datagrams."""
     if stamped:
-        return Check("arrival times", "ok", "the kernel stamps datagrams as they arrive", measured={"stamped": True})
-    found = "the kernel does not stamp datagrams: waiting in the socket counts as network"
+        found = "the kernel records when datagrams arrive"
+        return Check("arrival times", "ok", found, measured={"stamped": True})
+    found = "the kernel does not record when datagrams arrive: time in the socket counts as network latency"
     return Check("arrival times", "warning", found, "use Linux 2.6.30 or newer, not in a sandbox", {"stamped": False})
 
 
 def check_timer(resolution_ns: int, late_ns: Sequence[int]) -> Check:
-    """Judge by how much a sleep of a millisecond is too long; the physics has 4.2 ms, a command 20 ms."""
+    """Check how late sleeps of 1 ms end, compared with the physics step of 4.2 ms and the command period of 20 ms."""
     late = sorted(late_ns)
-    middle_ns, high_ns = median(late), late[int(len(late) * 0.95)]
-    words = (
-        f"a sleep of 1 ms ends {middle_ns / NS_PER_MS:.2f} ms late (95 %: {high_ns / NS_PER_MS:.2f} ms); the monotonic "
-        f"clock tells {resolution_ns / NS_PER_US:.2f} µs apart"
+    median_ns, p95_ns = median(late), late[int(len(late) * 0.95)]
+    found = (
+        f"a sleep of 1 ms ends {median_ns / NS_PER_MS:.2f} ms late (95 %: {p95_ns / NS_PER_MS:.2f} ms); the monotonic "
+        f"clock has a resolution of {resolution_ns / NS_PER_US:.2f} µs"
     )
-    measured = {"resolution_ns": resolution_ns, "late_ms": middle_ns / NS_PER_MS, "late_p95_ms": high_ns / NS_PER_MS}
-    do = "close other programs, give a virtual machine processors of its own, run LAVT as root (it takes precedence)"
-    if middle_ns > COMMAND_PERIOD_NS:
-        return Check("timer", "problem", words, do, measured)
-    return (
-        Check("timer", "warning", words, do, measured)
-        if high_ns > PHYSICS_STEP_NS
-        else Check("timer", "ok", words, measured=measured)
-    )
+    measured = {"resolution_ns": resolution_ns, "late_ms": median_ns / NS_PER_MS, "late_p95_ms": p95_ns / NS_PER_MS}
+    do = "close other programs, give a virtual machine dedicated processors, or run LAVT as root (for priority)"
+    if median_ns > COMMAND_PERIOD_NS:
+        return Check("timer", "problem", found, do, measured)
+    if p95_ns > PHYSICS_STEP_NS:
+        return Check("timer", "warning", found, do, measured)
+    return Check("timer", "ok", found, measured=measured)
 
 
-def check_precedence(niceness: int) -> Check:
-    """Judge whether LAVT's processes go before ordinary ones."""
-    measured = {"niceness": niceness}
+def check_process_priority(niceness: int) -> Check:
+    """Check that LAVT's processes have a higher priority than ordinary ones."""
+    name, measured = "process priority", {"niceness": niceness}
     if niceness < 0:
-        found = f"LAVT's processes go before ordinary ones (nice {niceness})"
-        return Check("precedence", "ok", found, measured=measured)
-    found = "LAVT's processes wait like ordinary ones: what else runs shows as latency"
-    do = "run as root, or with LimitNICE=-10 as in deploy/systemd/ (`ulimit -e 30` of a login)"
-    return Check("precedence", "warning", found, do, measured)
+        found = f"LAVT's processes have priority over ordinary ones (nice {niceness})"
+        return Check(name, "ok", found, measured=measured)
+    found = "LAVT's processes have ordinary priority: other programs add latency"
+    do = "run as root, or with LimitNICE=-10 as in deploy/systemd/ (`ulimit -e 30` in a login shell)"
+    return Check(name, "warning", found, do, measured)
 
 
 def check_governor(governors: Sequence[str]) -> Check:
-    """Judge how the processors' frequency is set; none where the system does not tell."""
+    """Check that the processors run at full frequency; `governors` is empty if the system does not report them."""
     measured = {"governors": sorted(set(governors))}
     if not governors:
-        found = "this machine does not tell (usual for a virtual one)"
+        found = "this machine does not report its governor (usual for a virtual machine)"
         return Check("frequency", "not checked", found, measured=measured)
     found = f"the processors' governor is {', '.join(sorted(set(governors)))}"
     if set(governors) == {"performance"}:
         return Check("frequency", "ok", found, measured=measured)
-    do = "as root: cpupower frequency-set -g performance; a slow clock at little load shows as latency"
+    do = "as root: cpupower frequency-set -g performance; a low frequency at low load adds latency"
     return Check("frequency", "warning", found, do, measured)
 
 
 def check_clock(report: ClockReport | None) -> Check:
-    """Judge what this machine's source of time says; without one can be driven, but not measured as well."""
+    """Check this machine's time source; without one, driving is possible and latency measurements are less accurate."""
     if report is None:
-        found = "the source of time did not answer in time"
-        return Check("clock", "warning", found, "ask again when this machine is less busy")
-    finding = check_host(report)
+        return Check("clock", "warning", "the time source timed out", "try again when this machine is less busy")
+    comparison = check_host(report)
     measured = {"source": report.source, "correction_s": report.correction_s, "bound_s": report.bound_s}
-    found = "; ".join(finding.says)
-    if finding.good or report.source == "probe":
+    found = "; ".join(comparison.says)
+    if comparison.good or report.source == "probe":
         return Check("clock", "ok", found, measured=measured)
     if report.correction_s is None:
-        return Check("clock", "warning", report.status, WHAT_TO_DO.get(report.status, ""), measured)
-    do = "let one machine follow the other closely (deploy/chrony/), or both a reference on the same network"
+        return Check("clock", "warning", report.status, HINTS.get(report.status, ""), measured)
+    do = "synchronise one machine to the other (deploy/chrony/), or both to a reference on the same network"
     return Check("clock", "warning", found, do, measured)
 
 
 def check_netem(rejection: str, interface: str) -> Check:
-    """Judge whether the kernel can delay packets here; it must only where the config names an interface."""
+    """Check that the kernel can delay packets here, which is required only if the config names an interface."""
     if not rejection:
-        return Check("netem", "ok", "this kernel can delay packets, and this user may have it do so")
+        return Check("netem", "ok", "the kernel can delay packets, and this user may use it")
     if interface:
-        do = "put that right, or set injection.interface to nothing: the side does not start like this"
+        do = "fix this, or leave injection.interface empty: the side cannot start like this"
         return Check("netem", "problem", rejection, do, {"interface": interface})
-    found = f"not needed unless a delay is to be injected on this machine, where it would be refused: {rejection}"
+    found = f"not available, but needed only to inject latency on this machine: {rejection}"
     return Check("netem", "ok", found)
 
 
-def check_port(name: str, key: str, host: str, port: int, *, rejection: str, served: bool) -> Check:
-    """Judge whether a UDP port can be opened; `served`: a `lavt server` answers there already."""
-    where = f"UDP {host}:{port}"
+def check_port(name: str, key: str, host: str, port: int, *, rejection: str, is_served: bool) -> Check:
+    """Check that a UDP port is free, or in use by a `lavt server` (`is_served`)."""
+    address = f"UDP {host}:{port}"
     measured = {"host": host, "port": port}
     if not rejection:
-        return Check(name, "ok", f"{where} can be opened", measured=measured)
-    if served:
-        return Check(name, "ok", f"{where} is in use by a `lavt server` that runs here already", measured=measured)
-    do = f"end what has it (`ss -lunp 'sport = :{port}'` names it), or set {key} to another"
-    return Check(name, "problem", f"{where} cannot be opened: {rejection}", do, measured)
+        return Check(name, "ok", f"{address} is free", measured=measured)
+    if is_served:
+        return Check(name, "ok", f"{address} is in use by a `lavt server` on this machine", measured=measured)
+    do = f"end the program that uses it (`ss -lunp 'sport = :{port}'` shows it), or set {key} to another port"
+    return Check(name, "problem", f"{address} cannot be opened: {rejection}", do, measured)
 
 
 def check_router(endpoint: str, rejection: str) -> Check:
-    """Judge whether a router answers on this machine."""
+    """Check that a router answers on this machine."""
     measured = {"endpoint": endpoint}
     if not rejection:
         return Check("router", "ok", f"a router answers at {endpoint}", measured=measured)
-    return Check(
-        "router", "problem", rejection, "start `lavt router FILE.json5` here, or put zenoh.router right", measured
-    )
+    return Check("router", "problem", rejection, "start `lavt router FILE.json5` here, or fix zenoh.router", measured)
 
 
-def check_link(routers: Routers | None, *, heard: bool) -> Check:
-    """Judge whether this machine's router has a link to another one, and whether both are of one version."""
+def check_link(routers: Routers | None, *, has_vehicle: bool) -> Check:
+    """Check that this machine's router is linked to another one of the same version.
+
+    `has_vehicle`: the vehicle's state arrives, so that no link is needed.
+    """
     name = "link of routers"
     if routers is None:
-        return Check(name, "not checked", "the router does not tell: no adminspace, or no right to ask it")
+        found = "the router does not report its links: no adminspace, or no permission to query it"
+        return Check(name, "not checked", found)
     measured = {"linked": routers.linked, "versions": routers.versions}
-    if routers.linked == 0 and not heard:
+    if routers.linked == 0 and not has_vehicle:
         found = "this machine's router has no link to another one"
         do = (
-            "see that the other side's router runs, that the address in `connect` is its own, that both name the "
-            "protocol alike, and that UDP port 7448 is open at the side that listens"
+            "check that the other side's router runs, that `connect` has its address, that both use the same "
+            "protocol, and that UDP port 7448 is open on the listening side"
         )
         return Check(name, "warning", found, do, measured)
     found = f"linked to {routers.linked} other router{'s' * (routers.linked != 1)}; Zenoh {', '.join(routers.versions)}"
     if len(set(routers.versions)) > 1:
-        return Check(name, "warning", found, "install the same eclipse-zenoh everywhere", measured)
+        return Check(name, "warning", found, "install the same version of eclipse-zenoh everywhere", measured)
     return Check(name, "ok", found, measured=measured)
 
 
-def check_vehicle(heard: StateSample, vehicle: str, version: str) -> Check:
-    """Judge by the states that came whether the vehicle's server is there and understood; nobody takes the vehicle."""
-    states = len(heard.states)
-    rate_hz = states / heard.seconds
-    measured = {"states": states, "seconds": heard.seconds, "unreadable": dict(heard.unreadable)}
-    if heard.unreadable:
-        why = ", ".join(f"{UNREADABLE.get(reason, reason)} ({count})" for reason, count in heard.unreadable.items())
+def check_vehicle(sample: StateSample, vehicle: str, version: str) -> Check:
+    """Check that the vehicle's state arrives, can be read, and has the expected rate."""
+    states = len(sample.states)
+    rate_hz = states / sample.seconds
+    measured = {"states": states, "seconds": sample.seconds, "unreadable": dict(sample.unreadable)}
+    if sample.unreadable:
+        reasons = [f"{UNREADABLE_REASONS.get(name, name)} ({count})" for name, count in sample.unreadable.items()]
         do = (
-            f"install the same version of LAVT on both machines (here it is {version}), give both of them keys of one "
-            "`lavt keys`, or none, and name this operator in the vehicle's security.operators"
+            f"install the same version of LAVT on both machines (here it is {version}), use keys of one `lavt keys` "
+            "on both machines or none, and name this operator in the vehicle's security.operators"
         )
-        return Check("vehicle", "problem", f"states of {vehicle} come that cannot be read: {why}", do, measured)
+        found = f"states of {vehicle} cannot be read: {', '.join(reasons)}"
+        return Check("vehicle", "problem", found, do, measured)
     if not states:
-        do = "see that `lavt server` runs there, that vehicle_id is the same on both, and that the routers are linked"
-        return Check("vehicle", "problem", f"{vehicle} tells no state", do, measured)
-    latest = heard.states[-1]
-    active_operator = f"held by {latest.active_operator}" if latest.active_operator else "held by nobody"
-    found = f"{vehicle} tells its state {rate_hz:.0f} times a second: {latest.safety}, {active_operator}"
+        do = "check that `lavt server` runs there, that both sides have one vehicle_id, and that the routers are linked"
+        return Check("vehicle", "problem", f"no state of {vehicle} arrives", do, measured)
+    latest = sample.states[-1]
+    operator = f"{latest.active_operator} has control" if latest.active_operator else "no operator has control"
+    found = f"the state of {vehicle} arrives {rate_hz:.0f} times a second: {latest.safety}, {operator}"
     measured |= {"safety": latest.safety, "active_operator": latest.active_operator}
     if rate_hz < STATE_RATE_HZ / 2:
-        do = f"{STATE_RATE_HZ:.0f} are sent: look for loss on the way (`ping`), or a busy machine"
+        do = f"{STATE_RATE_HZ:.0f} a second are sent: look for packet loss (`ping`), or an overloaded machine"
         return Check("vehicle", "warning", found, do, measured)
     return Check("vehicle", "ok", found, measured=measured)
 
 
-def check_probe(finding: ClockComparison | None, host: str, port: int) -> Check:
-    """Judge the clocks of both machines by probes; None: nobody answered."""
+def check_probe(comparison: ClockComparison | None, host: str, port: int) -> Check:
+    """Check the clocks of both machines against each other by probes; None: no probe was answered."""
     measured: dict[str, Any] = {"host": host, "port": port}
-    if finding is None:
-        do = "see that `lavt server` runs there, that clock.probe_port is the same on both, and that the port is open"
-        return Check("clock probe", "problem", f"nobody answers at UDP {host}:{port}", do, measured)
-    measured |= {"round_trip_ms": finding.round_trip_ms}
-    measured |= {} if finding.probe is None else {"offset_ms": finding.probe.ms, "bound_ms": finding.probe.bound_ms}
-    found = "; ".join(finding.says[1:])  # the first is of this machine's clock
-    if finding.good:
+    if comparison is None:
+        do = "check that `lavt server` runs there, that clock.probe_port is equal on both sides, and that it is open"
+        return Check("clock probe", "problem", f"no answer from UDP {host}:{port}", do, measured)
+    measured |= {"round_trip_ms": comparison.round_trip_ms}
+    estimate = comparison.probe
+    measured |= {} if estimate is None else {"offset_ms": estimate.ms, "bound_ms": estimate.bound_ms}
+    found = "; ".join(comparison.says[1:])  # the first sentence is about this machine's clock
+    if comparison.good:
         return Check("clock probe", "ok", found, measured=measured)
-    do = "driving is possible, one-way latencies are not: docs/measuring_latency.md says what they need"
+    do = "driving is possible, but one-way latencies are not accurate (docs/measuring_latency.md)"
     return Check("clock probe", "warning", found, do, measured)
 
 
 def check_video(host: str, port: int) -> Check:
-    """Say why nobody knows beforehand whether the video comes through."""
-    where = f"UDP {host}:{port}" if port else f"{host}, UDP, at the server's video.port (5600 as shipped)"
-    do = "let that port through to the vehicle's machine; `lavt client` says whether pictures come"
-    found = f"{where}: the server answers only who has a session's token, so this shows in a drive alone"
+    """Return why the video's port cannot be checked before a drive."""
+    address = f"UDP {host}:{port}" if port else f"{host}, UDP, the server's video.port (5600 by default)"
+    do = "open that port to the vehicle's machine; `lavt client` reports whether pictures arrive"
+    found = f"{address}: the server answers only a client with a session token, so only a drive can check the port"
     return Check("video", "not checked", found, do, {"host": host, "port": port})
 
 
-def check_plain(secured: bool) -> Check:
-    """Judge whether messages are signed and the video is encrypted."""
-    if secured:
+def check_keys_configured(is_secured: bool) -> Check:
+    """Check that messages are signed and the video is encrypted."""
+    if is_secured:
         return Check("security", "ok", "messages are signed, and the video is encrypted")
-    do = "two machines: make keys with `lavt keys` and use the secure configs (docs/deployment.md)"
-    return Check("security", "warning", "plain: whoever reaches the vehicle's router can drive; for a lab or a VPN", do)
+    do = "on two machines: create keys with `lavt keys` and use the secure configs (docs/deployment.md)"
+    found = "no keys: anyone who can reach the vehicle's router can drive; use this in a lab or a VPN only"
+    return Check("security", "warning", found, do)
 
 
 def check_key_file(key: str, path: Path, *, rejection: str, mode: int, private: bool) -> Check:
-    """Judge a file with a key: readable, and a private one by its owner alone."""
+    """Check that a key file is readable and, if private, readable by its owner only."""
     if rejection:
-        return Check(key, "problem", f"{path} cannot be read: {rejection}", "copy it here, or put the config right")
+        return Check(key, "problem", f"{path} cannot be read: {rejection}", "copy it here, or fix the config")
     if private and mode & 0o077:
-        found = f"{path} is a private key that others may read (mode {mode & 0o777:o})"
-        return Check(key, "problem", found, f"chmod 600 {path}; make new keys if others had access")
-    return Check(key, "ok", f"{path} is there")
+        found = f"{path} is a private key that other users can read (mode {mode & 0o777:o})"
+        return Check(key, "problem", found, f"chmod 600 {path}; create new keys if others had access")
+    return Check(key, "ok", f"{path} is readable")
 
 
 def check_certificate(path: Path, days_left: float) -> Check:
-    """Judge for how long a certificate is valid."""
+    """Check that a certificate is valid for some time."""
     name, measured = path.name, {"days_left": round(days_left, 2)}
-    do = "make new ones with `lavt keys`, and put them onto all machines"
+    do = "create new ones with `lavt keys`, and copy them to all machines"
     if days_left < 0:
         return Check(name, "problem", f"the certificate {path} expired {-days_left:.0f} days ago", do, measured)
     found = f"the certificate {path} is valid for {days_left:.0f} days"

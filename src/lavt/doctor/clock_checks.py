@@ -1,4 +1,4 @@
-"""How good the clocks of two machines are at this moment, in words: what `lavt clock` says."""
+"""The checks of `lavt clock`: the accuracy of this machine's clock, and its offset to another machine's clock."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from lavt.transport.clock_sync import chrony, ptp
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.clock_sync.probe import ClockProbe, ProbeReply
 
-WHAT_TO_DO = {
-    chrony.ABSENT: "install chrony on both machines, or go by the probe alone",
-    chrony.NOT_RUNNING: "start chronyd, or go by the probe alone",
-    chrony.NOT_SYNCHRONISED: "wait for its first samples, or name a server in chrony.conf (chronyc sources tells more)",
+HINTS = {
+    chrony.ABSENT: "install chrony on both machines, or use the probe alone",
+    chrony.NOT_RUNNING: "start chronyd, or use the probe alone",
+    chrony.NOT_SYNCHRONISED: "wait for its first samples, or name a server in chrony.conf (see chronyc sources)",
     ptp.ABSENT: "install linuxptp on both machines, or set clock.source to another source",
     ptp.NOT_RUNNING: "start ptp4l, and run as a user who may write to its socket (root)",
-    ptp.NO_MASTER: "see that one machine is master and the other hears it (pmc 'GET PORT_DATA_SET' tells more)",
+    ptp.NO_MASTER: "check that one machine is master and the other receives it (see pmc 'GET PORT_DATA_SET')",
 }
+"""How to fix a time source, by its status."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockEstimate:
-    """What somebody says of Delta, and how wrong it can be."""
+    """An estimate of Delta (server minus client) with its largest error."""
 
     ms: float
     bound_ms: float
@@ -32,79 +33,88 @@ class ClockEstimate:
 
 @dataclass(frozen=True, slots=True)
 class ClockComparison:
-    """What was found, and whether it will do for a run between two machines."""
+    """The result of a clock check."""
 
     good: bool
+    """Whether the clocks are accurate enough for a run on two machines."""
     says: tuple[str, ...]
+    """The result in sentences."""
     sources: ClockEstimate | None = None
     probe: ClockEstimate | None = None
     round_trip_ms: float | None = None
 
 
 def check_host(report: ClockReport) -> ClockComparison:
-    """Tell how this host's clock is."""
+    """Check the accuracy of this machine's clock."""
     if report.correction_s is None or report.bound_s is None:
-        hint = WHAT_TO_DO.get(report.status)
+        hint = HINTS.get(report.status)
         return ClockComparison(False, (f"{report.status}: {hint}" if hint else report.status,))
     bound_ms = report.bound_s * 1e3
     reference = (
         f"follows {report.follows}" if report.follows else report.status or "follows a source without an address"
     )
-    words = (
-        f"by {report.source} this machine's clock {reference}: it must be corrected by "
-        f"{report.correction_s * 1e3:+.3f} ms, which is known to {bound_ms:.3f} ms"
+    sentence = (
+        f"{report.source}: this machine's clock {reference}; its correction is "
+        f"{report.correction_s * 1e3:+.3f} ms ± {bound_ms:.3f} ms"
     )
     good = bound_ms <= CLOCK_BOUND_LIMIT_MS
-    return ClockComparison(good, (words,) if good else (words, _too_wide(bound_ms)))
+    return ClockComparison(good, (sentence,) if good else (sentence, _bound_complaint(bound_ms)))
 
 
 def compare(
     before: ClockReport, report: ClockReport, probes: Sequence[ClockProbe], latest: ProbeReply, server: str
 ) -> ClockComparison:
-    """Tell how this host's clock is against that of a server at the address `server` that answered these probes.
+    """Compare this machine's clock with that of the server at the address `server`, which answered these probes.
 
-    `before` and `report` are what this host's source said before and after the probing: the second counts. The
-    server's word is of some moment between: what this clock was corrected by meanwhile is added to the bound.
+    `before` and `report` are the reports of this machine's time source before and after the probing. `report` is used.
+    The server's report is of some moment in between, so the change of this clock's correction is added to the bound.
     """
-    possible = [probe for probe in probes if probe.round_trip_ns >= 0]
-    if not possible:
-        return ClockComparison(
-            False, ("no answer can be used: a clock was set during each, so ask again when none is set",)
-        )
-    best = min(possible, key=lambda probe: probe.round_trip_ns)
+    usable = [probe for probe in probes if probe.round_trip_ns >= 0]
+    if not usable:
+        return ClockComparison(False, ("no answer is usable: a clock was set during each probe, so try again later",))
+    best = min(usable, key=lambda probe: probe.round_trip_ns)
     probe = ClockEstimate(best.offset_ns / NS_PER_MS, best.round_trip_ns / 2 / NS_PER_MS)
-    sources = _by_sources(before, report, latest, server)
+    sources = _estimate_from_sources(before, report, latest, server)
     round_trip_ms = best.round_trip_ns / NS_PER_MS
-    says = [check_host(report).says[0]]
+    sentences = [check_host(report).says[0]]
     complaints: list[str] = []
     if sources is None:
         if report.correction_s is not None and before.correction_s is None:
-            says.append("this machine's source of time could not tell before the probing: run `lavt clock` again")
+            sentences.append("this machine's time source had no estimate before the probing: run `lavt clock` again")
         elif report.correction_s is not None:
-            says.append("the server's source of time cannot tell how its clock is: run `lavt clock` there")
-        says.append(
-            f"Delta (server less client) is by the probe alone: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms. The "
-            "bound is half the round trip: if one way is slower than the other, that is hidden inside it"
+            sentences.append("the server's time source has no estimate: run `lavt clock` there")
+        sentences.append(
+            f"Delta (server minus client) from the probe alone: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms. The "
+            "bound is half the round trip and includes any asymmetry of the path"
         )
     else:
-        says.append(f"Delta (server less client) by {report.source}: {sources.ms:+.3f} ms ± {sources.bound_ms:.3f} ms")
-        says.append(f"Delta by the probe: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms")
+        sentences.append(
+            f"Delta (server minus client) from {report.source}: {sources.ms:+.3f} ms ± {sources.bound_ms:.3f} ms"
+        )
+        sentences.append(f"Delta from the probe: {probe.ms:+.3f} ms ± {probe.bound_ms:.3f} ms")
         complaints += _path_complaints(report, round_trip_ms, server)
-        apart_ms, allowed_ms = abs(sources.ms - probe.ms), sources.bound_ms + probe.bound_ms
+        difference_ms, allowed_ms = abs(sources.ms - probe.ms), sources.bound_ms + probe.bound_ms
         if complaints:
-            says.append(f"these two are {apart_ms:.3f} ms apart")
-        elif apart_ms > allowed_ms:
-            complaints.append(f"these two disagree: {apart_ms:.3f} ms, where {allowed_ms:.3f} ms are allowed")
+            sentences.append(f"the two estimates differ by {difference_ms:.3f} ms")
+        elif difference_ms > allowed_ms:
+            complaints.append(
+                f"the two estimates disagree: they differ by {difference_ms:.3f} ms, allowed are {allowed_ms:.3f} ms"
+            )
         else:
-            says.append(f"these two agree: they are {apart_ms:.3f} ms apart, {allowed_ms:.3f} ms are allowed")
-    says.append(f"the shortest of {len(possible)} round trips took {round_trip_ms:.3f} ms")
+            sentences.append(
+                f"the two estimates agree: they differ by {difference_ms:.3f} ms, allowed are {allowed_ms:.3f} ms"
+            )
+    sentences.append(f"the shortest of {len(usable)} round trips took {round_trip_ms:.3f} ms")
     used = sources or probe
     if not complaints and used.bound_ms > CLOCK_BOUND_LIMIT_MS:
-        complaints.append(_too_wide(used.bound_ms))
-    return ClockComparison(not complaints, (*says, *complaints), sources, probe, round_trip_ms)
+        complaints.append(_bound_complaint(used.bound_ms))
+    return ClockComparison(not complaints, (*sentences, *complaints), sources, probe, round_trip_ms)
 
 
-def _by_sources(before: ClockReport, report: ClockReport, latest: ProbeReply, server: str) -> ClockEstimate | None:
+def _estimate_from_sources(
+    before: ClockReport, report: ClockReport, latest: ProbeReply, server: str
+) -> ClockEstimate | None:
+    """Return Delta from the time sources of both machines; None if either has no estimate."""
     known = (report.correction_s, report.bound_s, latest.correction_s, latest.bound_s)
     if before.correction_s is None or known[0] is None or known[1] is None or known[2] is None or known[3] is None:
         return None
@@ -121,10 +131,10 @@ def _path_complaints(report: ClockReport, round_trip_ms: float, server: str) -> 
     if report.follows != server or delay_ms is None or delay_ms <= round_trip_ms + PATH_LIMIT_MS:
         return []
     return [
-        f"NTP seems to go through injected delay: its round trip is {delay_ms:.2f} ms, the probe's "
-        f"{round_trip_ms:.2f} ms; keep UDP port 123 out of what is delayed"
+        f"the injected delay seems to affect NTP: its round trip is {delay_ms:.2f} ms, the probe's is "
+        f"{round_trip_ms:.2f} ms; exempt UDP port 123 from the delay"
     ]
 
 
-def _too_wide(bound_ms: float) -> str:
-    return f"{bound_ms:.2f} ms are too wide: one-way latencies need {CLOCK_BOUND_LIMIT_MS} ms or better"
+def _bound_complaint(bound_ms: float) -> str:
+    return f"the bound of {bound_ms:.2f} ms is too wide: one-way latencies need {CLOCK_BOUND_LIMIT_MS} ms or better"

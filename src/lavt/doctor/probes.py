@@ -1,4 +1,4 @@
-"""How `lavt doctor` looks at a machine and at its peer: each function measures one thing and judges nothing."""
+"""The probes of `lavt doctor`: each function measures one property of this machine or its peer, without a verdict."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from lavt.assembly.fidelity import VIDEO
 from lavt.assembly.security import cipher_of, gateway_of
 from lavt.clock import MachineClock, pause
 from lavt.config import ClientCameraConfig, ClientConfig, ClockConfig, ServerConfig
-from lavt.doctor.checks import SHOWN, CameraSample, CodecTimes, StateSample
+from lavt.doctor.checks import KEY_PACKAGES, CameraSample, CodecTimes, StateSample
 from lavt.domain import NS_PER_MS, NS_PER_S, Now, Picture, State
 from lavt.errors import BadMessage, LavtError, UserError, WorkError
 from lavt.streams import stream
-from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, want_arrival_times
+from lavt.transport.arrival import ANCILLARY_BYTES, SO_TIMESTAMPNS, enable_arrival_times
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.messages import decode
 from lavt.transport.netem.netem import NetemInterface, run_tc
@@ -37,7 +37,7 @@ from lavt.transport.zenoh_link import ZenohLink
 
 PICTURES = 60
 STEP_PX = 4
-CODEC_LONGEST_NS = 3 * NS_PER_S
+CODEC_TIMEOUT_NS = 3 * NS_PER_S
 SLEEPS = 100
 FIRST_STATE_NS = 3 * NS_PER_S
 STATES_NS = NS_PER_S
@@ -46,13 +46,13 @@ GOVERNORS = Path("/sys/devices/system/cpu")
 
 
 def packages() -> tuple[dict[str, str | None], Sequence[str]]:
-    """Give the version of each package that matters, None where it is missing, and what LAVT's metadata asks for."""
+    """Return the installed versions of relevant packages (None: missing), and the requirements of LAVT's metadata."""
     try:
         requirements = requires("lavt") or []
-    except PackageNotFoundError:  # run from the source tree alone
+    except PackageNotFoundError:  # LAVT runs from the source tree and is not installed
         requirements = []
     needed = [match[0] for each in requirements if "extra ==" not in each and (match := re.match(r"[\w.-]+", each))]
-    return {name: _version(name) for name in dict.fromkeys((*SHOWN, *needed))}, requirements
+    return {name: _version(name) for name in dict.fromkeys((*KEY_PACKAGES, *needed))}, requirements
 
 
 def _version(name: str) -> str | None:
@@ -63,43 +63,44 @@ def _version(name: str) -> str | None:
 
 
 def codec_times(config: ServerConfig, clock: MachineClock) -> CodecTimes:
-    """Stamp, encode, decode and read synthetic pictures as server and client would; raises what the codec raises."""
+    """Time the codec with synthetic pictures, as server and client use it; errors of the codec are raised."""
     camera = config.camera
-    known = ClientCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=camera.rate_hz)
-    sender, receiver = VIDEO.sender(config), VIDEO.receiver(ClientConfig(camera=known))
+    client_camera = ClientCameraConfig(width_px=camera.width_px, height_px=camera.height_px, rate_hz=camera.rate_hz)
+    sender, receiver = VIDEO.sender(config), VIDEO.receiver(ClientConfig(camera=client_camera))
     encode_ns, decode_ns = [], []
-    end_ns = clock.now().mono_ns + CODEC_LONGEST_NS
+    end_ns = clock.now().mono_ns + CODEC_TIMEOUT_NS
     for picture in _pictures(camera.width_px, camera.height_px):
-        begun = clock.now()
+        start = clock.now()
         prepared, _ = sender.prepare(picture)
-        unit = sender.encode(sender.write_stamp(prepared, begun.wall_ns), keyframe=False)
+        unit = sender.encode(sender.write_stamp(prepared, start.wall_ns), keyframe=False)
         encoded_ns = clock.now().mono_ns
         received = receiver.decode(unit)
-        if received is None or receiver.read_stamp(received) != begun.wall_ns:
-            raise WorkError("a picture that was encoded does not come out again with its stamp")
+        if received is None or receiver.read_stamp(received) != start.wall_ns:
+            raise WorkError("the stamp of an encoded picture was lost")
         decode_ns.append(clock.now().mono_ns - encoded_ns)
-        encode_ns.append(encoded_ns - begun.mono_ns)
+        encode_ns.append(encoded_ns - start.mono_ns)
         if clock.now().mono_ns > end_ns:
             break
     return CodecTimes(encode_ns, decode_ns)
 
 
 def _pictures(width_px: int, height_px: int) -> Iterator[Picture]:
-    """Make soft structure that moves, with some noise.
+    """Yield pictures of a moving smooth texture with some noise.
 
-    A little harder than the simulator's road: 2.2 ms to encode and 0.8 ms to decode where that takes 2.0 and 0.7.
+    They are a little harder than the simulator's road: 2.2 ms to encode and 0.8 ms to decode, compared with 2.0 ms and
+    0.7 ms.
     """
     random = stream(1, "doctor")
     coarse = random.integers(0, 256, (height_px // 16 + 1, width_px // 16 + 1, 3), dtype=np.uint8)
     wide = cv2.resize(coarse, (width_px + PICTURES * STEP_PX, height_px), interpolation=cv2.INTER_CUBIC)
     noise = random.integers(0, 6, (height_px, width_px, 3), dtype=np.uint8)
     for number in range(PICTURES):
-        seen = wide[:, number * STEP_PX : number * STEP_PX + width_px]
-        yield cast("Picture", cv2.add(seen, np.roll(noise, 37 * number, axis=0)))
+        view = wide[:, number * STEP_PX : number * STEP_PX + width_px]
+        yield cast("Picture", cv2.add(view, np.roll(noise, 37 * number, axis=0)))
 
 
-def camera_seen(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
-    """Take what the camera that is plugged in gives in two seconds; a text says why it gives nothing."""
+def sample_camera(config: ServerConfig, clock: MachineClock) -> CameraSample | str:
+    """Take pictures from the configured camera for two seconds; return a string if it cannot be used."""
     try:
         camera = build_device(config)
     except UserError as error:
@@ -115,42 +116,42 @@ def camera_seen(config: ServerConfig, clock: MachineClock) -> CameraSample | str
 
 
 def receive_buffer_bytes() -> int:
-    """Ask for LAVT's receive buffer as `UdpLink` does, and tell what is granted (Linux counts double, for itself)."""
+    """Request LAVT's receive buffer as `UdpLink` does, and return the granted size (Linux reports it doubled)."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
 def arrivals_are_stamped() -> bool:
-    """Send one datagram to oneself, and tell whether the kernel says when it came."""
+    """Send a datagram to this process, and return whether the kernel records its arrival time."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.settimeout(1.0)
         opened.bind(("127.0.0.1", 0))
-        want_arrival_times(opened)
+        enable_arrival_times(opened)
         opened.sendto(b"doctor", opened.getsockname())
         _, ancillary, _, _ = opened.recvmsg(64, ANCILLARY_BYTES)
     return any((level, kind) == (socket.SOL_SOCKET, SO_TIMESTAMPNS) for level, kind, _ in ancillary)
 
 
 def timer(clock: MachineClock) -> tuple[int, list[int]]:
-    """Give the smallest step of the monotonic clock, and by how much each of many sleeps of 1 ms was too long."""
+    """Return the resolution of the monotonic clock, and by how much each of many sleeps of 1 ms was too long."""
     readings = [clock.now().mono_ns for _ in range(1000)]
     steps = [after - before for before, after in pairwise(readings) if after > before]
     late = []
     for _ in range(SLEEPS):
-        begun_ns = clock.now().mono_ns
+        start_ns = clock.now().mono_ns
         pause(NS_PER_MS)
-        late.append(clock.now().mono_ns - begun_ns - NS_PER_MS)
+        late.append(clock.now().mono_ns - start_ns - NS_PER_MS)
     return min(steps, default=0), late
 
 
 def niceness() -> int:
-    """Tell how far this process goes before (negative) or after ordinary ones."""
+    """Return the nice value of this process: negative means priority over ordinary processes."""
     return os.getpriority(os.PRIO_PROCESS, 0)
 
 
 def governors() -> list[str]:
-    """Read the governor of every processor's frequency; none where the system does not tell."""
+    """Return the frequency governor of every processor; empty if the system does not report them."""
     found = []
     for path in GOVERNORS.glob("cpu[0-9]*/cpufreq/scaling_governor"):
         with suppress(OSError):
@@ -159,20 +160,20 @@ def governors() -> list[str]:
 
 
 def clock_report(config: ClockConfig, clock: MachineClock) -> ClockReport | None:
-    """Ask this machine's source of time; None where it did not answer in time."""
-    with closing(interpreter(config)) as requested:
-        return clock_source(config, clock, requested.run)()
+    """Query this machine's time source; return None if it times out."""
+    with closing(interpreter(config)) as process:
+        return clock_source(config, clock, process.run)()
 
 
 def netem_rejection(interface: str) -> str:
-    """Tell why no delay could be injected here; empty where it could.
+    """Return why no delay can be injected on this machine; empty if it can.
 
-    The kernel is tried in a network of its own, which goes when the command ends: nothing that is there is touched.
+    The queues are created in a temporary network namespace, so that no existing interface is changed.
     """
-    apart = ("unshare", "--net", "--", "tc", "qdisc", "add", "dev", "lo", "root")
+    command = ("unshare", "--net", "--", "tc", "qdisc", "add", "dev", "lo", "root")
     try:
         for queue in (("handle", "1:", "prio"), ("netem", "delay", "1ms")):
-            run_tc([*apart, *queue])
+            run_tc([*command, *queue])
         if interface:
             NetemInterface(interface).check()
     except LavtError as error:
@@ -181,7 +182,7 @@ def netem_rejection(interface: str) -> str:
 
 
 def bind_rejection(host: str, port: int) -> str:
-    """Tell why a UDP port cannot be opened; empty where it can."""
+    """Return why a UDP port cannot be opened; empty if it can."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         try:
             opened.bind((host, port))
@@ -190,66 +191,67 @@ def bind_rejection(host: str, port: int) -> str:
     return ""
 
 
-class Listener:
-    """What a link delivers to the doctor: states, counted outside of the door, and kept behind it."""
+class StateListener:
+    """A receiver that counts the states of a link before the gateway, and keeps those that the gateway accepts."""
 
     def __init__(self, settings: ServerConfig | ClientConfig) -> None:
-        self._behind: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._outside = 0
-        self._carry: Carry = lambda *_: None
-        self._gateway = gateway_of(settings, self._keep, lambda *sends: self._carry(*sends))
+        self._accepted: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._received = 0
+        self._send: Carry = lambda *_: None
+        self._gateway = gateway_of(settings, self._keep, lambda *sends: self._send(*sends))
 
     def receive(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
-        """Take what the link delivers."""
-        self._outside += channel == "state"
+        """Count a message of the link if it is a state, and pass it to the gateway."""
+        self._received += channel == "state"
         self._gateway.receive(channel, payload, arrived, peer)
 
     def _keep(self, channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
         if channel == "state":
-            self._behind.put(payload)
+            self._accepted.put(payload)
 
-    def hear(self, link: ZenohLink, clock: MachineClock) -> StateSample:
-        """Listen for the vehicle's state: some seconds for the first, and one second from there."""
-        self._carry = link.send
+    def listen(self, link: ZenohLink, clock: MachineClock) -> StateSample:
+        """Wait some seconds for the vehicle's first state, then collect states for one second."""
+        self._send = link.send
         link.start()
         states: list[State] = []
         unreadable: Counter[str] = Counter()
-        begun, end_ns = False, clock.now().mono_ns + FIRST_STATE_NS
+        has_first, end_ns = False, clock.now().mono_ns + FIRST_STATE_NS
         while (left_ns := end_ns - clock.now().mono_ns) > 0:
             try:
-                payload = self._behind.get(timeout=left_ns / NS_PER_S)
+                payload = self._accepted.get(timeout=left_ns / NS_PER_S)
             except queue.Empty:
                 break
-            if not begun:
-                begun, end_ns = True, clock.now().mono_ns + STATES_NS
+            if not has_first:
+                has_first, end_ns = True, clock.now().mono_ns + STATES_NS
             try:
                 states.append(decode(State, payload))
             except BadMessage as error:
                 unreadable[str(error)] += 1
-        if self._outside and not states and not unreadable:
-            unreadable.update(self._gateway.counts or {"nothing of it gets through": self._outside})
+        if self._received and not states and not unreadable:
+            unreadable.update(self._gateway.counts or {"rejected by the gateway": self._received})
         return StateSample(states, dict(unreadable), STATES_NS / NS_PER_S)
 
 
 def key_files(section: Any) -> list[tuple[str, Path, bool]]:
-    """List what a config's `security` names: the key in the config, the file, and whether it is a private key."""
-    given: Mapping[str, Any] = {} if section is None else section.model_dump()
+    """Return the files of a config's `security`: the key in the config, the file, and whether it is private."""
+    values: Mapping[str, Any] = {} if section is None else section.model_dump()
     return [
         (f"security.{name}", Path(path), name == "key")
-        for name, value in given.items()
-        for name, path in (_named(name, value))
+        for name, value in values.items()
+        for name, path in (_flatten(name, value))
         if path
     ]
 
 
-def _named(name: str, value: Any) -> list[tuple[str, str]]:
+def _flatten(name: str, value: Any) -> list[tuple[str, str]]:
+    """Return the paths in a value by name: one for a string, and one per entry of a mapping."""
     if isinstance(value, Mapping):
         return [(f"{name}.{part}", str(path)) for part, path in value.items()]
     return [(name, str(value))] if value else []
 
 
 def file_state(path: Path) -> tuple[str, int]:
-    """Tell why a file cannot be read (empty: it can), and who may."""
+    """Return why a file cannot be read (empty: it can), and its permission bits."""
     try:
         with path.open("rb") as opened:
             opened.read(1)
@@ -259,20 +261,20 @@ def file_state(path: Path) -> tuple[str, int]:
 
 
 def certificates(folder: Path, now_wall_ns: int) -> list[tuple[Path, float]]:
-    """Give the certificates in a directory, and for how many days each is still valid; needs `cryptography`."""
+    """Return the certificates in a directory with their remaining days; empty without `cryptography`."""
     try:
         from lavt.transport.security.certificates import days_left  # noqa: PLC0415 (an extra)
     except ImportError:
         return []
     found = []
     for path in sorted(folder.glob("*.pem")):
-        with suppress(OSError, UserError):  # whoever uses the file says what is wrong with it
+        with suppress(OSError, UserError):  # loading the keys reports an invalid file
             found.append((path, days_left(path.read_bytes(), path.name, now_wall_ns)))
     return found
 
 
 def keys_rejection(settings: ServerConfig | ClientConfig) -> str:
-    """Tell why the keys that a config names cannot be used; empty where they can."""
+    """Return why the keys that a config names cannot be used; empty if they can."""
     try:
         cipher_of(settings)
         gateway_of(settings, lambda *_: None, lambda *_: None)

@@ -1,1 +1,1 @@
-"""The parts of the loop, each a table of hops without input, output or clock."""
+"""The nodes of the control loop: pipelines of stages without input, output or clock."""

@@ -1,4 +1,4 @@
-"""Steps 7 to 10 of the life of a frame: picture and stamp (`picture_reader`), lane, command."""
+"""Steps 7 to 10 of the life of a frame: picture and stamp (`picture_reader`), lane detection, command."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import ClassVar, Literal, Protocol
 from lavt.control.drive_controller import DriveController
 from lavt.control.driver_limits import ClientLimits
 from lavt.control.lane_watch import LaneState, LaneWatch
-from lavt.domain import Command, Decision, Lane, Mode, Now, SessionReply, Sight, State
+from lavt.domain import Command, Decision, FramePayload, Lane, Mode, Now, SessionReply, State
 from lavt.errors import BadMessage
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.client_session import ClientSession
 from lavt.nodes.payloads import DecodedFrame, LaneSeen, PathToken
 from lavt.nodes.picture_reader import PictureReader
@@ -19,25 +19,25 @@ from lavt.perception.lane_detector import FOLLOWS_FOR_NS
 from lavt.transport.messages import decode, encode
 from lavt.value import value
 
-OperatorAsks = Literal["emergency_stop", "release"]
-"""What a person beside the client can ask for, on the channel `operator`."""
+OperatorRequest = Literal["emergency_stop", "release"]
+"""A request of the person at the client, on the channel `operator`."""
 
 
 class LaneDetection(Protocol):
-    """Finds the lane in one picture after another."""
+    """A lane detector for a sequence of pictures."""
 
     def forget(self) -> None:
-        """Take the next picture as the first one."""
+        """Drop the memory of earlier pictures."""
         ...
 
-    def detect(self, picture: Sight, /) -> Lane:
-        """Give the lane in the next picture."""
+    def detect(self, picture: FramePayload, /) -> Lane:
+        """Return the lane in the next picture."""
         ...
 
 
 @value
 class PerceivedFrame:
-    """A view and the lane that perception found in it."""
+    """A decoded frame with the lane detected in it."""
 
     view: DecodedFrame
     stamp_ns: int
@@ -45,10 +45,10 @@ class PerceivedFrame:
 
 
 class DriverNode:
-    """Drives by the received pictures and the speed that the vehicle reports, and by nothing else.
+    """The node that drives by the received pictures and the reported speed only.
 
-    Every picture is decoded; when pictures wait, only the newest is looked at. A command leaves as soon as a picture
-    has been looked at, and never later than `limits.command_period_ns` after the one before.
+    Every picture is decoded, but the lane is detected only in the newest one that waits. A command is sent with each
+    detection, and at the latest `limits.command_period_ns` after the previous command.
     """
 
     name = "driver"
@@ -71,13 +71,13 @@ class DriverNode:
         self._sequence = 0
         self._view: DecodedFrame | None = None
         self._view_ns = 0
-        self._looked_at_ns = 0
+        self._detected_stamp_ns = 0
         self._decision: Decision | None = None
-        self._lane_says: LaneState = "ok"
+        self._lane_state: LaneState = "ok"
         self._speed_mps = 0.0
         self._state_ns = 0
         self._command_ns: int | None = None
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "access_unit": reader.stages,
             "view": (("perceive", self._perceive), ("decide", self._decide), ("command", self._command_now)),
             "state": (("note", self._note_state),),
@@ -89,30 +89,30 @@ class DriverNode:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted here and of the pictures."""
+        """Return the counts of the node and of its picture reader."""
         return {**self._reader.counts, **self._counts}
 
     def next_wake_ns(self) -> int | None:
-        """When the next command or session query is due."""
-        asks_ns = self.session.next_wake_ns()
-        if asks_ns is None or self._command_ns is None:
-            return asks_ns if self._command_ns is None else self._command_ns
-        return min(asks_ns, self._command_ns)
+        """Return when the next command or session request is due."""
+        request_ns = self.session.next_wake_ns()
+        if request_ns is None or self._command_ns is None:
+            return request_ns if self._command_ns is None else self._command_ns
+        return min(request_ns, self._command_ns)
 
-    # A picture is looked at.
+    # Pictures.
 
     def _perceive(self, message: Message, _now: Now) -> PerceivedFrame:
         view: DecodedFrame = message.payload
-        since_last_ns = view.stamp_ns - self._looked_at_ns
-        self._looked_at_ns = view.stamp_ns
-        # After a stop or a gap, what lies where the lane was may be another one. A gap is one between
-        # the times at which pictures were sent, as the car went on; of a clock put back nobody knows how long.
+        since_last_ns = view.stamp_ns - self._detected_stamp_ns
+        self._detected_stamp_ns = view.stamp_ns
+        # After a stop or a gap another lane may be where the lane was. The gap is measured between stamps, since the
+        # car moved on meanwhile; a negative gap, from a clock that was set back, has an unknown length.
         if self.session.phase != "driving" or not 0 <= since_last_ns <= FOLLOWS_FOR_NS:
             self._detector.forget()
         return PerceivedFrame(view, view.stamp_ns, self._detector.detect(view.received.picture))
 
     def _decide(self, seen: PerceivedFrame, now: Now) -> PerceivedFrame:
-        self._lane_says = self._watch.check(seen.lane.confidence, now.mono_ns)
+        self._lane_state = self._watch.check(seen.lane.confidence, now.mono_ns)
         self._decision = self._controller.decide(seen.lane, self._speed_mps, now.mono_ns)
         self._view, self._view_ns = seen.view, now.mono_ns
         return seen
@@ -120,7 +120,7 @@ class DriverNode:
     def _command_now(self, seen: PerceivedFrame, now: Now) -> list[Send]:
         return [*self._command(now), Send("lane", LaneSeen(seen.stamp_ns, seen.lane))]
 
-    # A command is due.
+    # Commands.
 
     def _wake(self, _message: Message, now: Now) -> list[Send]:
         sends: list[Send] = []
@@ -129,17 +129,17 @@ class DriverNode:
         return sends + self._wake_session(now)
 
     def _wake_session(self, now: Now) -> list[Send]:
-        request = self.session.request_due(now.mono_ns)
+        request = self.session.take_request(now.mono_ns)
         return [] if request is None else [Send("session", encode(request))]
 
     def _command(self, now: Now) -> list[Send]:
-        """Make the command of this moment from what is known; none without a session or a picture."""
+        """Return the present command; none without control or without a picture."""
         self._command_ns = None
-        if self._view is None or self._decision is None or not self.session.commanding:
+        if self._view is None or self._decision is None or not self.session.may_command:
             return []
         self._command_ns = now.mono_ns + self._limits.command_period_ns
         self._sequence += 1
-        mode, decision = self._intention(self._decision, now.mono_ns)
+        mode, decision = self._mode_and_decision(self._decision, now.mono_ns)
         command = Command(
             epoch=self.session.epoch,
             sequence=self._sequence,
@@ -155,7 +155,7 @@ class DriverNode:
         )
         return [Send("control", encode(command))]
 
-    def _intention(self, decision: Decision, now_ns: int) -> tuple[Mode, Decision]:
+    def _mode_and_decision(self, decision: Decision, now_ns: int) -> tuple[Mode, Decision]:
         if self.session.emergency_stop:
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
         if self.session.phase != "driving":
@@ -163,13 +163,13 @@ class DriverNode:
         frame_age_ns, state_age_ns = now_ns - self._view_ns, now_ns - self._state_ns
         limits = self._limits
         if (
-            self._lane_says == "stop"
+            self._lane_state == "stop"
             or frame_age_ns >= limits.no_picture_stop_ns
             or state_age_ns >= limits.no_state_stop_ns
         ):
             return "stop", Decision(decision.steering_rad, 0.0, 1.0, decision.path_curvature_per_m)
         if (
-            self._lane_says == "brake"
+            self._lane_state == "brake"
             or frame_age_ns >= limits.no_picture_brake_ns
             or state_age_ns >= limits.no_state_brake_ns
         ):
@@ -177,26 +177,26 @@ class DriverNode:
             return "drive", Decision(decision.steering_rad, 0.0, brake, decision.path_curvature_per_m)
         return "drive", decision
 
-    # The person beside it asks for something.
+    # Requests of the operator.
 
     def _accept_operator(self, message: Message, now: Now) -> list[Send]:
-        return self._FOR_THE_OPERATOR[message.payload](self, now)
+        return self._OPERATOR_REQUESTS[message.payload](self, now)
 
-    def _stop_now(self, now: Now) -> list[Send]:
-        """Raise an emergency stop: by a query at once, and by a flag in every command from now on."""
-        return [Send("session", encode(self.session.stop_now(now))), *self._command(now)]
+    def _raise_emergency_stop(self, now: Now) -> list[Send]:
+        """Send an emergency stop, at once as a request and from now on in every command."""
+        return [Send("session", encode(self.session.raise_emergency_stop(now))), *self._command(now)]
 
     def _release(self, now: Now) -> list[Send]:
-        """Give the vehicle up: it stops, and no more commands are made."""
+        """Release control: the vehicle stops, and no more commands are sent."""
         self.session.release(now.mono_ns)
         return self._wake_session(now)
 
-    _FOR_THE_OPERATOR: ClassVar[dict[OperatorAsks, Callable[..., list[Send]]]] = {
-        "emergency_stop": _stop_now,
+    _OPERATOR_REQUESTS: ClassVar[dict[OperatorRequest, Callable[..., list[Send]]]] = {
+        "emergency_stop": _raise_emergency_stop,
         "release": _release,
     }
 
-    # The vehicle tells.
+    # Messages from the vehicle.
 
     def _note_state(self, message: Message, now: Now) -> None:
         try:
@@ -205,10 +205,10 @@ class DriverNode:
             self._counts["states_unreadable"] += 1
             return
         self._speed_mps, self._state_ns = state.speed_mps, now.mono_ns
-        self.session.note_state(state, now.mono_ns)
+        self.session.handle_state(state, now.mono_ns)
 
     def _note_condition(self, message: Message, _now: Now) -> None:
-        self.session.note_condition(message.payload)
+        self.session.handle_condition(message.payload)
 
     def _note_reply(self, message: Message, now: Now) -> list[Send]:
         try:
@@ -216,5 +216,5 @@ class DriverNode:
         except BadMessage:
             self._counts["session_replies_unreadable"] += 1
             return []
-        self.session.note_reply(reply, now.mono_ns)
+        self.session.handle_reply(reply, now.mono_ns)
         return [Send("path_token", PathToken(reply.token, reply.video_port))] if reply.granted and reply.token else []

@@ -1,7 +1,7 @@
-"""The network's condition: the client asks for it, and each side sees that its own machine's queues follow.
+"""Network conditions: the client requests one, and each side applies its part to the queues of its own machine.
 
-A condition lasts as long as the client goes on asking for it: a lease that nobody renews ends, and everything is put
-back. Neither node touches a queue; the link that carries `inject` does, and tells what it measured.
+A condition is a lease: if the client does not renew it, it ends, and all queues are cleared. The nodes do not touch
+queues; the link that carries `inject` does, and reports what it measured.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Literal
 
 from lavt.domain import NS_PER_MS, NS_PER_S, NetemReply, NetemRequest, Now
 from lavt.errors import BadMessage, UserError
-from lavt.node import WAKE, Hop, Message, Peer, Send
+from lavt.node import WAKE, Message, Peer, Send, Stage
 from lavt.nodes.payloads import InjectionSample, StationaryStatus
 from lavt.transport.emulation.impairment import ImpairedFlow, Impairment, check_flows
 from lavt.transport.messages import decode, encode
@@ -21,54 +21,54 @@ from lavt.transport.netem.injector import InjectionOrder, InjectionResult
 from lavt.value import value
 
 MEASURE_PERIOD_NS = 5 * NS_PER_S
-"""A condition in force is measured as often."""
-ASK_PERIOD_NS = NS_PER_S
+"""Period of the measurement of a condition in force."""
+REQUEST_PERIOD_NS = NS_PER_S
 LEASE_MS = 5_000
-"""The client asks once a second: four may be lost."""
-LONGEST_REASON = 300
-QUESTIONS_KEPT = 64
-"""So many wait for the queues; as many as the link keeps."""
+"""The client renews once a second: four requests may be lost."""
+MAX_REASON_LENGTH = 300
+MAX_PENDING_REQUESTS = 64
+"""Requests that may wait for the queues; the link keeps as many."""
 
 
 class _Queues:
-    """What this machine's queues were told, and whether they do it."""
+    """The last order to this machine's queues, and whether it is in force."""
 
     def __init__(self) -> None:
         self.flows: tuple[ImpairedFlow, ...] = ()
         self.condition = ""
         self.in_force = False
-        self.again_ns: int | None = None
-        """When the order is given again: to measure what is in force, or because it failed."""
+        self.repeat_ns: int | None = None
+        """When the order is repeated: to measure the condition in force, or because it failed."""
         self._number = 0
 
-    def tell(self, condition: str, flows: tuple[ImpairedFlow, ...]) -> list[Send]:
-        self.condition, self.flows, self.in_force, self.again_ns = condition, flows, False, None
+    def order(self, condition: str, flows: tuple[ImpairedFlow, ...]) -> list[Send]:
+        self.condition, self.flows, self.in_force, self.repeat_ns = condition, flows, False, None
         self._number += 1
         return self._inject()
 
-    def tell_again_when_due(self, now_ns: int) -> list[Send]:
-        if self.again_ns is None or now_ns < self.again_ns:
+    def repeat_order(self, now_ns: int) -> list[Send]:
+        """Return the order again, if that is due."""
+        if self.repeat_ns is None or now_ns < self.repeat_ns:
             return []
-        self.again_ns = None  # set anew by the answer
-        return self._inject() if self.in_force else self.tell(self.condition, self.flows)
+        self.repeat_ns = None  # set by the result
+        return self._inject() if self.in_force else self.order(self.condition, self.flows)
 
-    def note(self, done: InjectionResult, now: Now) -> list[Send] | None:
-        """Take in what became of the newest order; None where it was an older one."""
-        if done.number != self._number:
+    def handle_result(self, result: InjectionResult, now: Now) -> list[Send] | None:
+        """Process the result of the newest order and return its samples; None: the result is of an older order."""
+        if result.number != self._number:
             return None
-        self.in_force = done.reason == ""
+        self.in_force = result.reason == ""
         if not self.in_force:
-            self.again_ns = now.mono_ns + ASK_PERIOD_NS
+            self.repeat_ns = now.mono_ns + REQUEST_PERIOD_NS
         elif self.condition:
-            self.again_ns = now.mono_ns + MEASURE_PERIOD_NS
-        requested_ms: dict[str, float] = {flow.name: flow.law.delay_ms for flow in self.flows} or {"": 0.0}
-        measured_ms = dict(done.measured_ms)
+            self.repeat_ns = now.mono_ns + MEASURE_PERIOD_NS
+        requested_ms: dict[str, float] = {flow.name: flow.impairment.delay_ms for flow in self.flows} or {"": 0.0}
+        measured_ms = dict(result.measured_ms)
+        reason = result.reason or result.problems
         return [
             Send(
                 "injection",
-                InjectionSample(
-                    now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), done.reason or done.doubts
-                ),
+                InjectionSample(now.mono_ns, self.condition, name, each_ms, measured_ms.get(name), reason),
             )
             for name, each_ms in requested_ms.items()
         ]
@@ -79,16 +79,16 @@ class _Queues:
 
 @value
 class Lease:
-    """Who has the network's condition in hand, and until when."""
+    """The client that controls the network condition, and until when."""
 
-    active_operator: tuple[str, int]
+    client: tuple[str, int]
     until_ns: int
 
 
 class InjectionNode:
-    """The server's: lets one client at a time say what happens to what this machine sends.
+    """The server's node: applies the condition that one client at a time requests to what this machine sends.
 
-    A vehicle that is not `simulated` must stand disarmed for a change; that a lease ends is never in its way.
+    A vehicle that is not `simulated` must be stationary and disarmed for a change; a lease may end at any time.
     """
 
     name = "injection"
@@ -108,19 +108,19 @@ class InjectionNode:
         self._control = control
         self._queues = _Queues()
         self._lease: Lease | None = None
-        self._rest = StationaryStatus(False, None)
-        self._waiting: deque[Peer] = deque(maxlen=QUESTIONS_KEPT)
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        self._status = StationaryStatus(False, None)
+        self._waiting: deque[Peer] = deque(maxlen=MAX_PENDING_REQUESTS)
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "netem": (("answer", self._answer),),
-            "injected": (("note", self._note_injected),),
-            "rest": (("note", self._note_rest),),
-            WAKE: (("look", self._look),),
+            "injected": (("note", self._handle_result),),
+            "rest": (("note", self._handle_status),),
+            WAKE: (("look", self._wake),),
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the lease ends, the condition is measured again, or what failed is tried again."""
-        ends_ns = None if self._lease is None else self._lease.until_ns
-        return _first(ends_ns, self._queues.again_ns)
+        """Return when the lease ends or an order is repeated."""
+        lease_end_ns = None if self._lease is None else self._lease.until_ns
+        return _earliest(lease_end_ns, self._queues.repeat_ns)
 
     def _answer(self, message: Message, now: Now) -> list[Send]:
         try:
@@ -129,27 +129,27 @@ class InjectionNode:
             self.counts["netem_requests_unreadable"] += 1
             return []
         flows = self._flows(request)
-        changes = flows != self._queues.flows or request.condition != self._queues.condition
-        rejection = self._rejection(request, changes=changes)
-        self.counts[f"netem {'refused' if rejection else 'granted'}"] += 1
+        is_change = flows != self._queues.flows or request.condition != self._queues.condition
+        rejection = self._rejection(request, is_change=is_change)
+        self.counts[f"netem {'rejected' if rejection else 'granted'}"] += 1
         if rejection:
             return [_reply(rejection, message.peer)]
         self._lease = Lease((request.who, request.instance), now.mono_ns + request.lease_ms * NS_PER_MS)
-        if not changes and self._queues.in_force:
+        if not is_change and self._queues.in_force:
             return [_reply("", message.peer)]
         self._waiting.append(message.peer)
-        return self._queues.tell(request.condition, flows) if changes else []
+        return self._queues.order(request.condition, flows) if is_change else []
 
-    def _rejection(self, request: NetemRequest, *, changes: bool) -> str:
+    def _rejection(self, request: NetemRequest, *, is_change: bool) -> str:
         if not self._allowed:
-            return "this server lets nobody inject delay: set injection.remote: true in its config"
-        asking = (request.who, request.instance)
-        if self._lease is not None and self._lease.active_operator != asking:
-            return f"{self._lease.active_operator[0]} has the condition in hand until its lease ends"
-        if self._rest.active_operator is not None and self._rest.active_operator != asking:
-            return f"{self._rest.active_operator[0]} holds the vehicle"
-        if changes and not (self._simulated or self._rest.at_rest):
-            return "a vehicle that is not simulated must stand disarmed for this"
+            return "this server does not allow clients to inject delay: set injection.remote: true in its config"
+        client = (request.who, request.instance)
+        if self._lease is not None and self._lease.client != client:
+            return f"{self._lease.client[0]} controls the network condition until its lease ends"
+        if self._status.active_operator is not None and self._status.active_operator != client:
+            return f"{self._status.active_operator[0]} has control of the vehicle"
+        if is_change and not (self._simulated or self._status.at_rest):
+            return "a vehicle that is not simulated must be stationary and disarmed for this"
         try:
             check_flows(self._flows(request))
         except UserError as error:
@@ -172,42 +172,42 @@ class InjectionNode:
             ImpairedFlow("state", *self._control, "source", Impairment(request.state_delay_ms)),
         )
 
-    def _note_rest(self, message: Message, _now: Now) -> list[Send]:
-        """Whoever holds the vehicle drives without what another had asked for."""
-        self._rest = message.payload
-        if self._lease is None or self._rest.active_operator in (None, self._lease.active_operator):
+    def _handle_status(self, message: Message, _now: Now) -> list[Send]:
+        """End the lease if another client has control of the vehicle."""
+        self._status = message.payload
+        if self._lease is None or self._status.active_operator in (None, self._lease.client):
             return []
         return self._end_lease()
 
-    def _note_injected(self, message: Message, now: Now) -> list[Send]:
-        done: InjectionResult = message.payload
-        sends = self._queues.note(done, now)
+    def _handle_result(self, message: Message, now: Now) -> list[Send]:
+        result: InjectionResult = message.payload
+        sends = self._queues.handle_result(result, now)
         if sends is None:
             return []
-        sends += [_reply(done.reason, peer) for peer in self._waiting]
+        sends += [_reply(result.reason, peer) for peer in self._waiting]
         self._waiting.clear()
-        if not done.reason:
+        if not result.reason:
             return sends
         self.counts["netem_failed"] += 1
         self._lease = None
-        # What failed half-way must not stay; what cannot be put back is tried again every second.
-        return [*sends, *self._queues.tell("", ())] if self._queues.condition else sends
+        # A condition may have failed half-way, so clear the queues; a failed clearing is repeated every second.
+        return [*sends, *self._queues.order("", ())] if self._queues.condition else sends
 
-    def _look(self, _message: Message, now: Now) -> list[Send]:
+    def _wake(self, _message: Message, now: Now) -> list[Send]:
         if self._lease is not None and now.mono_ns >= self._lease.until_ns:
             return self._end_lease()
-        return self._queues.tell_again_when_due(now.mono_ns)
+        return self._queues.repeat_order(now.mono_ns)
 
     def _end_lease(self) -> list[Send]:
         self._lease = None
         self.counts["netem_leases_ended"] += 1
-        return self._queues.tell("", ())
+        return self._queues.order("", ())
 
 
 class InjectionClient:
-    """The client's: has the control delayed by its own machine, and asks the server for the rest, again and again.
+    """The client's node: delays the control on its own machine and periodically requests the rest from the server.
 
-    The driver arms when both are in force; without a condition it need not wait.
+    The driver arms when both are in force; without a condition it does not wait.
     """
 
     name = "injection"
@@ -227,40 +227,42 @@ class InjectionClient:
         self._condition = condition
         self._control = control
         self._queues = _Queues()
-        law = asdict(video)
-        self.request = encode(NetemRequest(who, instance, condition, LEASE_MS, **law, state_delay_ms=state_delay_ms))
-        self._ask_ns: int | None = start_ns if condition else None
-        self._told = False
-        self.chains: Mapping[str, Sequence[Hop]] = {
-            "netem_reply": (("note", self._note_reply),),
-            "injected": (("note", self._note_injected),),
-            WAKE: (("ask", self._ask),),
+        impairment = asdict(video)
+        self.request = encode(
+            NetemRequest(who, instance, condition, LEASE_MS, **impairment, state_delay_ms=state_delay_ms)
+        )
+        self._request_ns: int | None = start_ns if condition else None
+        self._has_ordered = False
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
+            "netem_reply": (("note", self._handle_reply),),
+            "injected": (("note", self._handle_result),),
+            WAKE: (("ask", self._wake),),
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the lease is renewed, what this machine does is measured again, or what failed is tried again."""
-        return _first(self._ask_ns, self._queues.again_ns)
+        """Return when the lease is renewed or an order is repeated."""
+        return _earliest(self._request_ns, self._queues.repeat_ns)
 
-    def _ask(self, _message: Message, now: Now) -> list[Send]:
-        sends = self._queues.tell_again_when_due(now.mono_ns)
-        if self._ask_ns is None or now.mono_ns < self._ask_ns:
+    def _wake(self, _message: Message, now: Now) -> list[Send]:
+        sends = self._queues.repeat_order(now.mono_ns)
+        if self._request_ns is None or now.mono_ns < self._request_ns:
             return sends
-        self._ask_ns = now.mono_ns + ASK_PERIOD_NS
-        if not self._told:
-            self._told = True
-            return self._queues.tell(self._condition, (self._control,))
+        self._request_ns = now.mono_ns + REQUEST_PERIOD_NS
+        if not self._has_ordered:
+            self._has_ordered = True
+            return self._queues.order(self._condition, (self._control,))
         return [*sends, Send("netem", self.request)] if self._queues.in_force else sends
 
-    def _note_injected(self, message: Message, now: Now) -> list[Send]:
-        done: InjectionResult = message.payload
-        sends = self._queues.note(done, now) or []
-        if done.reason:
+    def _handle_result(self, message: Message, now: Now) -> list[Send]:
+        result: InjectionResult = message.payload
+        sends = self._queues.handle_result(result, now) or []
+        if result.reason:
             self.counts["netem_failed"] += 1
-            return [*sends, Send("condition_in_force", f"this machine does not delay the control: {done.reason}")]
-        self._ask_ns = now.mono_ns if self._ask_ns is None else min(self._ask_ns, now.mono_ns)
+            return [*sends, Send("condition_in_force", f"this machine does not delay the control: {result.reason}")]
+        self._request_ns = now.mono_ns if self._request_ns is None else min(self._request_ns, now.mono_ns)
         return sends
 
-    def _note_reply(self, message: Message, _now: Now) -> list[Send]:
+    def _handle_reply(self, message: Message, _now: Now) -> list[Send]:
         try:
             reply = decode(NetemReply, message.payload)
         except BadMessage:
@@ -271,9 +273,9 @@ class InjectionClient:
         return [Send("condition_in_force", reason)]
 
 
-def _first(*times_ns: int | None) -> int | None:
+def _earliest(*times_ns: int | None) -> int | None:
     return min((each for each in times_ns if each is not None), default=None)
 
 
 def _reply(reason: str, peer: Peer) -> Send:
-    return Send("netem_reply", encode(NetemReply(reason == "", reason[:LONGEST_REASON])), peer)
+    return Send("netem_reply", encode(NetemReply(reason == "", reason[:MAX_REASON_LENGTH])), peer)

@@ -1,4 +1,4 @@
-"""What nodes tell each other on one side, and what they write down."""
+"""Messages between the nodes of one side, and records."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class FrameWritten:
     stamped_mono_ns: int
     capture_ns: int | None
     pixel_crc: int
-    """Tells the picture, without its stamp, from the one before."""
+    """Checksum of the picture without its stamp, which differs from that of a different picture."""
     size_bytes: int
 
 
 @value
 class VideoUnit:
-    """One H.264 access unit as it was sent or received."""
+    """One H.264 access unit, sent or received."""
 
     stamp_ns: int
     data: bytes
@@ -30,19 +30,19 @@ class VideoUnit:
 
 @value
 class ReceivedUnit:
-    """An access unit out of the network; the times are the client's monotonic clock."""
+    """A received access unit; times are on the client's monotonic clock."""
 
     data: bytes
     rtp_timestamp: int
     complete: bool
     keyframe: bool
     packet_mono_ns: int
-    """Arrival of its last packet."""
+    """Arrival of the last packet."""
 
 
 @value
 class DecodedFrame:
-    """A decoded picture with a stamp that could be read."""
+    """A decoded picture with a valid stamp."""
 
     stamp_ns: int
     read_wall_ns: int
@@ -51,16 +51,16 @@ class DecodedFrame:
 
 @value
 class PictureRead:
-    """What became of a received access unit."""
+    """The outcome of decoding an access unit and reading its stamp."""
 
     stamp_ns: int | None
-    """None where it could not be read."""
+    """None: it could not be read."""
     readable: bool
     reason: str
     in_doubt: bool
-    """Something of it, or of a picture it refers to, was lost since the last clean keyframe."""
+    """Parts of it, or of a picture it refers to, were lost since the last intact keyframe."""
     decoded: bool
-    """The decoder gave a picture for it."""
+    """The decoder returned a picture."""
     rtp_timestamp: int
     packet_mono_ns: int
     decoded_mono_ns: int
@@ -70,7 +70,7 @@ class PictureRead:
 
 @value
 class LaneSeen:
-    """What perception made of a picture."""
+    """The lane detected in a picture."""
 
     stamp_ns: int
     lane: Lane
@@ -78,7 +78,7 @@ class LaneSeen:
 
 @value
 class Admission:
-    """What became of a command on the server."""
+    """The verdict on a command on the server, with its times."""
 
     epoch: int
     sequence: int
@@ -91,7 +91,7 @@ class Admission:
     verdict: str
     reason: str
     limited: str
-    """Names of the limits that changed it, with commas."""
+    """Names of the limits that changed it, separated by commas."""
     mode: str
     steering_rad: float
     throttle: float
@@ -100,19 +100,19 @@ class Admission:
 
 @value
 class AtWheel:
-    """A command was seen to have reached the wheels; the times are the server's monotonic clock."""
+    """A command that reached the wheels; times are on the server's monotonic clock."""
 
     sequence: int
     stamp_ns: int
     applied_mono_ns: int
     """As in its `Admission`."""
     wheel_mono_ns: int
-    """When the vehicle's own report came, that it steers by it."""
+    """Arrival of the vehicle's report that it steers by this command."""
 
 
 @value
 class Event:
-    """Something worth a line in the record of the server."""
+    """An event in the server's record."""
 
     mono_ns: int
     kind: str
@@ -121,7 +121,7 @@ class Event:
 
 @value
 class Route:
-    """The road that is driven: the middle of its lane, once at the start of a record."""
+    """The centre line of the driven lane, once at the start of a record."""
 
     name: str
     length_m: float
@@ -130,7 +130,7 @@ class Route:
 
 @value
 class PathToken:
-    """The client may open the path of the video with this."""
+    """The token with which the client validates its video path."""
 
     token: bytes
     port: int
@@ -138,7 +138,7 @@ class PathToken:
 
 @value
 class StationaryStatus:
-    """Whether the vehicle stands and nobody drives it, and who holds it."""
+    """Whether the vehicle is stationary and not active, and the active operator."""
 
     at_rest: bool
     active_operator: tuple[str, int] | None
@@ -146,13 +146,13 @@ class StationaryStatus:
 
 @value
 class InjectionSample:
-    """What this machine does to a flow that it sends, as asked and as measured; written at each change, and again."""
+    """The requested and measured impairment of a flow that this machine sends, at each change and periodically."""
 
     mono_ns: int
     condition: str
-    """Empty: none is in force any more."""
+    """Empty: no condition is in force any more."""
     flow: str
     requested_ms: float
     measured_ms: float | None
     reason: str
-    """Why it is not in force, or what was measured to be otherwise than asked; empty: all is well."""
+    """Why it is not in force, or which measurement deviates from the request; empty: neither."""

@@ -1,4 +1,4 @@
-"""Steps 7 and 8 of the life of a frame: an access unit becomes a picture whose send time is known."""
+"""Steps 7 and 8 of the life of a frame: an access unit is decoded to a picture, and its stamp is read and checked."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from lavt.domain import Now
 from lavt.errors import BadPacket
-from lavt.node import Hop, Message, Send
+from lavt.node import Message, Send, Stage
 from lavt.nodes.payloads import DecodedFrame, PictureRead, ReceivedUnit, VideoUnit
 from lavt.transport.video.frame_codec import PictureReceiver, ReceivedPicture
 from lavt.transport.video.stamp import stamp_agrees
@@ -16,7 +16,7 @@ from lavt.value import value
 
 @value
 class DecodedUnit:
-    """A received access unit and the picture that came of it."""
+    """A received access unit with its decoded picture."""
 
     unit: ReceivedUnit
     picture: ReceivedPicture | None
@@ -25,7 +25,7 @@ class DecodedUnit:
 
 @value
 class StampRead:
-    """A decoded picture with its stamp; 0 where it could not be read."""
+    """A decoded picture with its stamp; 0: it could not be read."""
 
     decoded: DecodedUnit
     stamp_ns: int
@@ -33,12 +33,12 @@ class StampRead:
 
 
 class PictureReader:
-    """Decodes every access unit, reads its stamp, and shows it where that can be believed.
+    """A reader that decodes every access unit and forwards pictures with a valid stamp.
 
-    `agrees(stamp, RTP timestamp)` says whether it can. Where that check is weak, stamps of pictures in doubt are better
-    not shown to it (`reads_doubtful` false): made up ones can agree with each other. `stages` are a node's chain for
-    "access_unit"; what comes out is a "view" for whoever looks at pictures, and "picture_lost" where the decoder has
-    none or had to make parts of it up.
+    A stamp is valid if `agrees(stamp, RTP timestamp)`. If that check is weak, `reads_doubtful` should be false, which
+    excludes pictures in doubt: their damaged stamps can agree with each other. `stages` is a node's pipeline for
+    "access_unit". It sends a "view" for each valid picture, and "picture_lost" if the decoder has no picture or had to
+    conceal errors in it.
     """
 
     def __init__(
@@ -49,7 +49,11 @@ class PictureReader:
         reads_doubtful: bool = True,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self.stages: Sequence[Hop] = (("decode", self._decode), ("read_stamp", self._read_stamp), ("show", self._show))
+        self.stages: Sequence[Stage] = (
+            ("decode", self._decode),
+            ("read_stamp", self._read_stamp),
+            ("show", self._show),
+        )
         self._pictures = pictures
         self._agrees = agrees
         self._reads_doubtful = reads_doubtful
@@ -58,8 +62,8 @@ class PictureReader:
     def _decode(self, message: Message, now: Now) -> DecodedUnit:
         unit: ReceivedUnit = message.payload
         picture = self._pictures.decode(unit.data)
-        whole = unit.complete and picture is not None and not picture.corrupt
-        self._in_doubt = not whole or (self._in_doubt and not unit.keyframe)
+        is_intact = unit.complete and picture is not None and not picture.corrupt
+        self._in_doubt = not is_intact or (self._in_doubt and not unit.keyframe)
         return DecodedUnit(unit, picture, now.mono_ns)
 
     def _read_stamp(self, decoded: DecodedUnit, now: Now) -> StampRead:

@@ -1,4 +1,4 @@
-"""Step 6 of the life of a frame: packets arrive, are put in order, and become access units again."""
+"""Step 6 of the life of a frame: packets are put in order and become access units."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.errors import BadPacket
-from lavt.node import WAKE, Hop, Message, Send
+from lavt.node import WAKE, Message, Send, Stage
 from lavt.nodes.payloads import PathToken, ReceivedUnit
 from lavt.transport.rtp.fec import REPAIR_PAYLOAD_TYPE, RepairReceiver
 from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
@@ -18,39 +18,39 @@ from lavt.transport.video.cipher import NewCipher, plain_cipher
 from lavt.transport.video.path_validation import PathClient, is_path_datagram
 
 REPORT_PERIOD_NS = 500 * NS_PER_MS
-"""Four reports within the 2 s after which the server closes a silent path."""
+"""Four reports within the 2 s after which the server closes a path without reports."""
 SAMPLE_PERIOD_NS = NS_PER_S
-"""The record has a line of statistics for each second."""
+"""Period of the recorded statistics."""
 KEYFRAME_TAKES_NS = 50 * NS_PER_MS
-"""From the request to its sender to the packets of the keyframe: the wait for the next picture, and its encoding."""
+"""Time that a keyframe takes at the sender: the wait for the next picture, and its encoding."""
 UNKNOWN_ROUND_TRIP_NS = 50 * NS_PER_MS
-"""Until a sender report has told it."""
+"""Assumed until a sender report gives the round trip."""
 SSRC = 0x4C415654
-"""Of the receiver in its reports: "LAVT"."""
+"""SSRC of the receiver in its reports: "LAVT"."""
 
 
 class ReceiverNode:
-    """Opens the path of the video, keeps it open with receiver reports, and asks for a keyframe after a loss.
+    """The node that validates the video path, keeps it open with receiver reports, and receives the video.
 
-    What is lost comes back from repair packets where there are enough of them. Otherwise pictures are in doubt up to
-    the next whole keyframe, and one is asked for: at once, and again after each round trip without one.
-    `max_bit_rate_bps` is asked of the sender with each report.
+    Lost packets are recovered from repair packets, if there are enough of them. Otherwise pictures are in doubt up to
+    the next complete keyframe, which is requested at once and again after each round trip without one. Each report
+    requests `max_bit_rate_bps` from the sender.
     """
 
     name = "receiver"
 
     def __init__(
         self,
-        reorder: JitterBuffer,
+        jitter_buffer: JitterBuffer,
         depacketizer: Depacketizer,
         max_bit_rate_bps: int | None = None,
         new_cipher: NewCipher = plain_cipher,
     ) -> None:
         self._counts: Counter[str] = Counter()
-        self._reorder = reorder
+        self._jitter_buffer = jitter_buffer
         self._repair = RepairReceiver()
         self._depacketizer = depacketizer
-        self._reception = Reception(reorder)
+        self._reception = Reception(jitter_buffer)
         self._max_bit_rate_bps = max_bit_rate_bps
         self._new_cipher = new_cipher
         self._path: PathClient | None = None
@@ -60,8 +60,8 @@ class ReceiverNode:
         self._report_ns = self._sample_ns = 0
         self._in_doubt = False
         self._requested_ns: int | None = None
-        """When a keyframe was asked for last."""
-        self.chains: Mapping[str, Sequence[Hop]] = {
+        """Time of the last keyframe request."""
+        self.pipelines: Mapping[str, Sequence[Stage]] = {
             "rtp": (("reorder", self._receive), ("depacketize", self._depacketize)),
             "path_token": (("note", self._note_token),),
             "picture_lost": (("ask", self._note_picture_lost),),
@@ -70,25 +70,25 @@ class ReceiverNode:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted here, in the reorder buffer, the repair and the depacketizer."""
+        """Return the counts of the node, the jitter buffer, repair and the depacketizer."""
         names = ("late", "duplicate", "lost", "reordered", "stray", "recovered")
         return {
             **self._counts,
-            **{f"packets_{name}": getattr(self._reorder, name) for name in names},
+            **{f"packets_{name}": getattr(self._jitter_buffer, name) for name in names},
             "repair_malformed": self._repair.malformed,
             "repair_blocks_given_up": self._repair.unrepaired,
             "payloads_malformed": self._depacketizer.malformed,
         }
 
     def next_wake_ns(self) -> int | None:
-        """When the reorder buffer gives up waiting, a hello, a report, a sample or a request is due."""
-        times = [self._reorder.next_wake_ns()]
+        """Return when the jitter buffer, a hello, a report, a sample or a keyframe request is due."""
+        times = [self._jitter_buffer.next_wake_ns()]
         if self._path is not None:
             times.append(self._path.next_hello_ns())
         if self._media_ssrc is not None:
             times.append(self._sample_ns)
             if self._path is not None:
-                times += [self._report_ns, self._ask_ns() if self._asks_again() else None]
+                times += [self._report_ns, self._request_due_ns() if self._repeats_requests() else None]
         return min((time for time in times if time is not None), default=None)
 
     def _note_token(self, message: Message, _now: Now) -> None:
@@ -99,7 +99,7 @@ class ReceiverNode:
             self._port = token.port
 
     def _receive(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]] | None:
-        """Sort out what came; what is not understood is counted and dropped."""
+        """Process a datagram of any kind; count and drop an unreadable one."""
         datagram: bytes | None = message.payload
         if is_path_datagram(message.payload):
             answer = None if self._path is None else self._path.answer(message.payload)
@@ -107,14 +107,14 @@ class ReceiverNode:
             return None if answer is None else ([], message.arrived, [self._feedback(answer)])
         control = is_rtcp(message.payload)
         if self._path is not None:
-            datagram = (self._path.open_control if control else self._path.open)(message.payload)
+            datagram = (self._path.unprotect_rtcp if control else self._path.unprotect)(message.payload)
         if datagram is None:
             self._counts["packets_forged"] += 1
             return None
         try:
             if control:
                 announcement = parse_announcement(datagram)
-                # Without a path nothing was reported: what a sender answers is another receiver's.
+                # Without a path this node has sent no reports: answers in sender reports belong to another receiver.
                 own_ssrc = None if self._path is None else SSRC
                 self._reception.note_announcement(announcement, own_ssrc, message.arrived.mono_ns)
                 return None
@@ -124,7 +124,7 @@ class ReceiverNode:
             return None
 
     def _order(self, datagram: bytes, arrived: Now, now: Now) -> Ordered:
-        """Put a packet in its place, and those that could be made again because of it; raises `BadPacket`."""
+        """Return the packets in order after this one, with recovered packets; raise `BadPacket`."""
         packet = parse_packet(datagram)
         ordered: Ordered = []
         if packet.payload_type == REPAIR_PAYLOAD_TYPE:
@@ -134,10 +134,10 @@ class ReceiverNode:
             self._media_ssrc = packet.ssrc
             if self._path is not None:
                 self._path.video_arrived(now.mono_ns)
-            ordered = self._reorder.push(packet, now.mono_ns)
+            ordered = self._jitter_buffer.push(packet, now.mono_ns)
             self._reception.received(packet, arrived.mono_ns)
-        for made in self._repair.push(packet, now.mono_ns):
-            ordered += self._reorder.push_recovered(made, now.mono_ns)
+        for recovered in self._repair.push(packet, now.mono_ns):
+            ordered += self._jitter_buffer.push_recovered(recovered, now.mono_ns)
         return ordered
 
     def _wake(self, message: Message, now: Now) -> tuple[Ordered, Now, list[Send]]:
@@ -152,9 +152,9 @@ class ReceiverNode:
             if now_ns >= self._sample_ns:
                 self._sample_ns = now_ns + SAMPLE_PERIOD_NS
                 sends.append(Send("reception", self._reception.sample(now_ns)))
-            if self._asks_again():
-                sends += self._ask_for_keyframe(now_ns)
-        return self._reorder.expire(now_ns), message.arrived, sends
+            if self._repeats_requests():
+                sends += self._request_keyframe(now_ns)
+        return self._jitter_buffer.expire(now_ns), message.arrived, sends
 
     def _depacketize(self, ordered: tuple[Ordered, Now, list[Send]], now: Now) -> list[Send]:
         packets, arrived, sends = ordered
@@ -169,19 +169,19 @@ class ReceiverNode:
                 received = ReceivedUnit(unit.data, unit.timestamp, unit.complete, unit.keyframe, arrived.mono_ns)
                 sends.append(Send("access_unit", received))
         self._in_doubt |= damaged
-        return [*sends, *self._ask_for_keyframe(now.mono_ns)] if damaged else sends
+        return [*sends, *self._request_keyframe(now.mono_ns)] if damaged else sends
 
     def _note_picture_lost(self, _message: Message, now: Now) -> list[Send]:
-        """The decoder has no picture, or not the one that was sent."""
+        """Request a keyframe, because the decoder has no picture or a damaged one."""
         self._in_doubt = True
-        return self._ask_for_keyframe(now.mono_ns)
+        return self._request_keyframe(now.mono_ns)
 
-    def _asks_again(self) -> bool:
-        """Whether a keyframe should have come by `_ask_ns`; before a round trip is known only the next loss tells."""
+    def _repeats_requests(self) -> bool:
+        """Return whether a keyframe is missing and its request can be repeated, which needs a known round trip."""
         return self._in_doubt and self._reception.round_trip_ns is not None
 
-    def _ask_ns(self) -> int:
-        """Tell when a keyframe may be asked for next: one that was asked for can be on its way for a round trip."""
+    def _request_due_ns(self) -> int:
+        """Return when the next keyframe request is allowed: when the keyframe of the last one should have arrived."""
         if self._requested_ns is None:
             return 0
         round_trip_ns = self._reception.round_trip_ns
@@ -189,9 +189,9 @@ class ReceiverNode:
             self._requested_ns + KEYFRAME_TAKES_NS + (UNKNOWN_ROUND_TRIP_NS if round_trip_ns is None else round_trip_ns)
         )
 
-    def _ask_for_keyframe(self, now_ns: int) -> list[Send]:
-        """Ask for a keyframe, unless one that was asked for can be on its way."""
-        if self._media_ssrc is None or self._path is None or now_ns < self._ask_ns():
+    def _request_keyframe(self, now_ns: int) -> list[Send]:
+        """Return a keyframe request, unless a requested keyframe may still arrive."""
+        if self._media_ssrc is None or self._path is None or now_ns < self._request_due_ns():
             return []
         self._requested_ns = now_ns
         self._counts["picture_loss_requests"] += 1
@@ -205,7 +205,7 @@ class ReceiverNode:
         return sends
 
     def _control(self, packet: bytes) -> Send:
-        return self._feedback(packet if self._path is None else self._path.protect_control(packet))
+        return self._feedback(packet if self._path is None else self._path.protect_rtcp(packet))
 
     def _feedback(self, datagram: bytes) -> Send:
         return Send("feedback", datagram, self._port)

@@ -1,27 +1,27 @@
-"""Who looks at a stream and does not drive."""
+"""A node that decodes a video stream and does not drive."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 from lavt.domain import Now
-from lavt.node import Hop, Message
+from lavt.node import Message, Stage
 from lavt.nodes.picture_reader import PictureReader
 
 
 class WatcherNode:
-    """Reads pictures in the driver's place, and makes nothing of them: what became of each is in "picture"."""
+    """A node in the driver's place that reads and drops pictures; "picture" records the outcome of each."""
 
     name = "driver"
-    """Under which the channels know who gets pictures."""
+    """The receiver of pictures in the channel table."""
 
     def __init__(self, reader: PictureReader) -> None:
         self.counts: Mapping[str, int] = reader.counts
-        self.chains: Mapping[str, Sequence[Hop]] = {"access_unit": reader.stages, "view": (("forget", _forget),)}
+        self.pipelines: Mapping[str, Sequence[Stage]] = {"access_unit": reader.stages, "view": (("forget", _forget),)}
 
     def next_wake_ns(self) -> None:
-        """It sleeps until a picture comes."""
+        """Return None: only messages wake the node."""
 
 
 def _forget(_message: Message, _now: Now) -> None:
-    """Drop a picture that nobody looks at."""
+    """Drop a picture."""

@@ -1,1 +1,1 @@
-"""From a picture to a lane: step 9 of the life of a frame."""
+"""Lane detection in pictures: step 9 of the life of a frame."""

@@ -1,4 +1,4 @@
-"""A camera as its calibration knows it: where a point of the ground is in its picture, through any lens OpenCV knows.
+"""Calibrated cameras: the projection of ground points into the picture, through any lens model of OpenCV.
 
 Ground coordinates are the vehicle's frame: x ahead of the rear axle, y left, in metres. Pixel coordinates are those of
 OpenCV: the middle of the top left pixel is (0, 0). The lens models are OpenCV's, with its order of coefficients:
@@ -17,30 +17,29 @@ from numpy.typing import NDArray
 from lavt.domain import CameraModel, FloatArray
 
 REFERENCE_FOCAL_PX = 320.0
-"""Of the camera for which sizes in pixels are given here: 640 columns over 90 degrees."""
+"""The focal length of the reference camera for sizes in pixels: 640 columns over 90 degrees."""
 
-ALONG_RAY = 8
-"""Steps from the lens's axis to a ray in which the picture must go outwards all the way.
+RAY_STEPS = 8
+"""Steps from the lens's axis to a ray at which the image radius is checked to increase.
 
-A polynomial of distortion turns back at some angle and puts what lies beyond, which the lens does not see, into the
-picture once more.
+A distortion polynomial folds back at some angle: it maps points beyond, which the lens does not see, into the picture.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CalibratedCamera:
-    """A camera with its lens and its place on the vehicle.
+    """A camera with its lens and its pose on the vehicle.
 
-    `yaw_rad` is left positive, `pitch_rad` down positive, `roll_rad` positive with the right side down; the
-    vehicle's axes are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without any.
+    `yaw_rad` is positive to the left, `pitch_rad` downwards, `roll_rad` with the right side down. The vehicle's axes
+    are turned by yaw, then pitch, then roll. `distortion` is empty for a lens without distortion.
     """
 
     width_px: int
     height_px: int
     focal_px: tuple[float, float]
-    """Along the columns' direction (fx) and along the rows' (fy)."""
+    """The focal lengths (fx, fy), horizontal and vertical."""
     middle_px: tuple[float, float]
-    """Where the lens's axis meets the picture (cx, cy)."""
+    """The principal point (cx, cy)."""
     x_m: float
     y_m: float
     z_m: float
@@ -51,19 +50,19 @@ class CalibratedCamera:
     fisheye: bool = False
 
     @property
-    def lens(self) -> FloatArray:
+    def camera_matrix(self) -> FloatArray:
         """The 3 x 3 camera matrix."""
         (fx, fy), (cx, cy) = self.focal_px, self.middle_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @property
     def scale(self) -> float:
-        """How much larger things are in this camera's picture than in that of the reference."""
+        """The size of objects in this camera's picture relative to the reference camera's."""
         return self.focal_px[0] / REFERENCE_FOCAL_PX
 
 
 def calibrated(model: CameraModel) -> CalibratedCamera:
-    """Give the pinhole camera of a config as a calibrated one: square pixels, axis in the middle, no distortion."""
+    """Return a config's pinhole camera as a calibrated one: square pixels, central axis, no distortion."""
     return CalibratedCamera(
         width_px=model.width_px,
         height_px=model.height_px,
@@ -79,66 +78,67 @@ def calibrated(model: CameraModel) -> CalibratedCamera:
 
 
 def axes(camera: CalibratedCamera) -> FloatArray:
-    """Give the camera's axes in the vehicle's frame, (3, 3): rows to the right, down, and deep."""
+    """Return the camera's axes in the vehicle's frame, (3, 3): rows right, down and forward."""
     yaw, pitch, roll = camera.yaw_rad, camera.pitch_rad, camera.roll_rad
     ahead = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     down = np.array([0.0, 0.0, -1.0])
-    deep, down = (
+    forward, down = (
         math.cos(pitch) * ahead + math.sin(pitch) * down,
         math.cos(pitch) * down - math.sin(pitch) * ahead,
     )
     right, down = math.cos(roll) * right + math.sin(roll) * down, math.cos(roll) * down - math.sin(roll) * right
-    return np.stack([right, down, deep])
+    return np.stack([right, down, forward])
 
 
 def ground_to_camera(camera: CalibratedCamera) -> FloatArray:
-    """Give the 3 x 3 map from ground (x, y, 1) to the camera's frame (right, down, deep), in metres."""
+    """Return the 3 x 3 matrix from ground (x, y, 1) to the camera's frame (right, down, forward), in metres."""
     turn = axes(camera)
     return np.column_stack([turn[:, 0], turn[:, 1], -turn @ np.array([camera.x_m, camera.y_m, camera.z_m])])
 
 
 def ground_to_picture(camera: CalibratedCamera) -> FloatArray:
-    """Give the 3 x 3 homography from ground (x, y, 1) to the picture (u, v, 1) without distortion, up to scale.
+    """Return the 3 x 3 homography from ground (x, y, 1) to the undistorted picture (u, v, 1), up to scale.
 
-    The third component is the depth along the camera's axis; a point with none is not in the picture.
+    The third component is the depth along the camera's axis; only points with a positive depth are in the picture.
     """
-    return np.asarray(camera.lens @ ground_to_camera(camera), dtype=np.float64)
+    return np.asarray(camera.camera_matrix @ ground_to_camera(camera), dtype=np.float64)
 
 
 def picture_points(camera: CalibratedCamera, ground_m: FloatArray) -> FloatArray:
-    """Tell where in the distorted picture the ground points (n, 2) are seen: (n, 2) in pixels.
+    """Project ground points (n, 2) into the distorted picture: (n, 2) in pixels.
 
-    NaN for what is behind the camera or so far aside that the lens model does not speak of it; other points may lie
-    outside the picture.
+    Points behind the camera or outside the lens model's valid field are NaN; others may lie outside the picture.
     """
     seen = np.column_stack([ground_m, np.ones(len(ground_m))]) @ ground_to_camera(camera).T
     ahead = seen[:, 2] > 1e-6
     rays = seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    pixels = _bent(camera, rays)
-    pixels[~(ahead & _seen_once(camera, rays))] = np.nan
+    pixels = _distort(camera, rays)
+    pixels[~(ahead & _in_lens_field(camera, rays))] = np.nan
     return pixels
 
 
-def _bent(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
-    """Send rays, as points of the plane one deep (n, 2), through the lens: pixels (n, 2)."""
+def _distort(camera: CalibratedCamera, rays: FloatArray) -> FloatArray:
+    """Project rays, given as points (n, 2) of the plane at depth 1, through the lens to pixels (n, 2)."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.middle_px
     if not camera.distortion:
         return rays * (fx, fy) + (cx, cy)
     factors = np.array(camera.distortion)
     if camera.fisheye:
-        return np.asarray(cv2.fisheye.distortPoints(rays[:, None], camera.lens, factors), dtype=np.float64)[:, 0]
-    deep = np.column_stack([rays, np.ones(len(rays))])
-    pixels = cv2.projectPoints(deep[:, None], np.zeros(3), np.zeros(3), camera.lens, factors)[0]
+        return np.asarray(cv2.fisheye.distortPoints(rays[:, None], camera.camera_matrix, factors), dtype=np.float64)[
+            :, 0
+        ]
+    forward = np.column_stack([rays, np.ones(len(rays))])
+    pixels = cv2.projectPoints(forward[:, None], np.zeros(3), np.zeros(3), camera.camera_matrix, factors)[0]
     return np.asarray(pixels, dtype=np.float64)[:, 0]
 
 
-def _seen_once(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
-    """Tell which rays lie within the field in which the lens model holds, (n,)."""
+def _in_lens_field(camera: CalibratedCamera, rays: FloatArray) -> NDArray[np.bool_]:
+    """Return which rays lie within the lens model's valid field, (n,)."""
     if not camera.distortion:
         return np.ones(len(rays), dtype=np.bool_)
     radii = [
-        np.hypot(*((_bent(camera, rays * step / ALONG_RAY) - camera.middle_px) / camera.focal_px).T)
-        for step in range(ALONG_RAY + 1)
+        np.hypot(*((_distort(camera, rays * step / RAY_STEPS) - camera.middle_px) / camera.focal_px).T)
+        for step in range(RAY_STEPS + 1)
     ]
     return np.asarray(np.all(np.diff(radii, axis=0) > 0, axis=0))

@@ -1,4 +1,4 @@
-"""From one picture after another to the lane the car is in: step 9 of the life of a frame."""
+"""The lane detector: finds the car's lane in a sequence of pictures, step 9 of the life of a frame."""
 
 from __future__ import annotations
 
@@ -25,51 +25,51 @@ from lavt.perception.lane_fit import (
 from lavt.perception.lane_pixels import Mask, lane_pixels
 
 SMOOTHING = 0.6
-"""Weight of the newest picture in the moving average; `lavt.experiment.boundary.delay_margin` reckons with it."""
+"""Weight of the newest picture in the moving average; `lavt.experiment.boundary.delay_margin` depends on it."""
 GRID = GroundGrid()
-"""The piece of ground that is looked at."""
+"""The ground searched for the lane."""
 LANE_WIDTH_M = 3.5
-"""Width of the lane where it cannot be measured yet."""
+"""The lane's width until it has been measured."""
 TRACK_CONFIDENCE = 0.2
-"""A fit with less (one line over 40 % of the length) is not followed."""
-REFINED = 2
-"""Times that a lane found is followed once more, as from picture to picture: a curve seen near leads far."""
+"""A fit with less confidence (one line over 40 % of the length) is not followed."""
+REFINEMENTS = 2
+"""The number of times a found lane is refitted: a curve visible nearby extends to points farther away."""
 FORGET_AFTER = 3
-"""Pictures without a lane after which the search begins anew: a tenth of a second."""
+"""Pictures without a lane after which the search restarts: a tenth of a second."""
 FOLLOWS_FOR_NS = 350 * NS_PER_MS
-"""A lane is not followed over a longer gap between pictures: whoever feeds the detector calls `forget`.
+"""A lane is not followed over a longer gap between pictures: the caller of `detect` then calls `forget`.
 
-In that time a lane that bends at a radius of 42 m moves sideways by `CORRIDOR_M`, 10 m ahead of a car that goes
-straight on at 30 km/h: then what lies where a line was may be another one.
+In that time a lane with a radius of 42 m moves sideways by `CORRIDOR_M`, 10 m ahead of a car that drives straight at
+30 km/h, so a line at the old position may be another one.
 """
 LEFT_AT_WIDTHS = 1.0
-"""A lane is kept until the car is as many of its widths beside it: then it is in the middle of the next one."""
+"""A lane is dropped when the car is this many lane widths off its centre: it is then in the middle of the next lane."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionTrace:
-    """What one picture gave, step by step: for whoever wants to look at it."""
+    """The lane detection trace: the results of all steps for one picture, for inspection."""
 
     mask: Mask
-    """The marks from above, (grid.rows, grid.columns)."""
+    """The marks in the bird's-eye view, (grid.rows, grid.columns)."""
     points: Points
     sides: Sides
     expected: tuple[float, float, float] | None
-    """The centre near which the lines were looked for; None where there was nothing to begin at."""
+    """The centre near which the lines were searched; None without a start line."""
     expected_width_m: float
     windows: tuple[tuple[float, float], ...]
-    """The sliding windows of a search, as `sides_by_windows` gives them; none where the lane was followed."""
+    """The sliding windows of a search, as `sides_by_windows` returns them; empty if the lane was followed."""
     fit: LaneFit | None
-    """The lane in this picture alone; None when there is none."""
+    """The lane in this picture alone; None if there is none."""
 
 
 class LaneDetector:
-    """Finds the lane by sliding windows at first, then near where it was, and averages over pictures.
+    """A lane detector that searches with sliding windows at first, then follows the lane, and averages over pictures.
 
-    Confidence is (share of the left line seen + share of the right line seen) / 2 x (share of the paint in and beside
-    the lane that lies on its lines, put so that speckle gets 0 and clean lines 1); seen paint vouches for 3 m each way.
-    It speaks of the newest picture alone: with nothing in it the confidence is 0, and the lane is the one seen last.
-    docs/perception.md says what values are to be expected.
+    Confidence is (visible share of the left line + visible share of the right line) / 2 x (share of the paint in and
+    beside the lane that is on its lines, scaled to 0 for speckle and 1 for clean lines). Visible paint counts for 3 m
+    in both directions. Confidence refers to the newest picture alone: without a lane in it the confidence is 0 and the
+    lane is the last one detected. docs/perception.md lists the values to expect.
     """
 
     def __init__(
@@ -80,87 +80,87 @@ class LaneDetector:
         *,
         stamped: bool = True,
     ) -> None:
-        known = calibrated(camera) if isinstance(camera, CameraModel) else camera
-        self._shape = (known.height_px, known.width_px, 3)
-        self._scale = known.scale
-        self.view = bird_eye(known, grid, stamped=stamped)
-        self.sight: DetectionTrace | None = None
+        calibration = calibrated(camera) if isinstance(camera, CameraModel) else camera
+        self._shape = (calibration.height_px, calibration.width_px, 3)
+        self._scale = calibration.scale
+        self.bird_eye = bird_eye(calibration, grid, stamped=stamped)
+        self.trace: DetectionTrace | None = None
         self._lane_width_m = lane_width_m
         self._lane = Lane((0.0, 0.0, 0.0), lane_width_m, grid.near_m, grid.far_m, 0.0)
         self._misses = FORGET_AFTER
 
     def forget(self) -> None:
-        """Take the next picture as the first one: the lane is where it is nearest, not where it was last seen."""
+        """Search the nearest lane in the next picture, instead of following the last one."""
         self._misses = FORGET_AFTER
 
     def detect(self, picture_bgr: Picture) -> Lane:
-        """Give the lane in the next picture, (height, width, 3) as the camera's model says; else ValueError."""
+        """Return the lane in the next picture; raise `ValueError` unless it is (height, width, 3) as the camera's."""
         if picture_bgr.shape != self._shape:
             raise ValueError(f"a picture of shape {picture_bgr.shape}, not {self._shape}")
-        mask = self.view.from_above(lane_pixels(self.view.region(picture_bgr), self._scale))
-        points = mark_points(mask, self.view.grid)
+        mask = self.bird_eye.from_above(lane_pixels(self.bird_eye.region(picture_bgr), self._scale))
+        points = mark_points(mask, self.bird_eye.grid)
         tracked = self._misses < FORGET_AFTER
-        self.sight = self._near_last(mask, points) if tracked else self._anywhere(mask, points)
-        fit = self.sight.fit
+        self.trace = self._follow(mask, points) if tracked else self._search(mask, points)
+        fit = self.trace.fit
         if fit is None or fit.confidence < TRACK_CONFIDENCE:
             self._misses += 1
             self._lane = replace(self._lane, confidence=0.0 if fit is None else fit.confidence)
         else:
             self._misses = 0
-            self._lane = averaged(self._lane, fit) if tracked else averaged(None, fit)
-            if has_been_left(self._lane):
+            self._lane = average_lane(self._lane, fit) if tracked else average_lane(None, fit)
+            if car_has_left(self._lane):
                 self.forget()
         return self._lane
 
-    def _near_last(self, mask: Mask, points: Points) -> DetectionTrace:
+    def _follow(self, mask: Mask, points: Points) -> DetectionTrace:
         sides = sides_near(points, self._lane.centre, self._lane.width_m)
-        fit = fit_lane(points, sides, self.view.grid, self._lane.width_m, self._lane.centre)
+        fit = fit_lane(points, sides, self.bird_eye.grid, self._lane.width_m, self._lane.centre)
         return DetectionTrace(mask, points, sides, self._lane.centre, self._lane.width_m, (), fit)
 
-    def _anywhere(self, mask: Mask, points: Points) -> DetectionTrace:
-        grid = self.view.grid
+    def _search(self, mask: Mask, points: Points) -> DetectionTrace:
+        grid = self.bird_eye.grid
         start = start_line(points, grid, self._lane_width_m)
         if start is None:
             return DetectionTrace(
                 mask, points, np.zeros(len(points.x_m), dtype=np.int8), None, self._lane_width_m, (), None
             )
         sides, windows = sides_by_windows(points, grid, start, self._lane_width_m)
-        # The windows follow any curve, also that of a line which leads aside; the start is rough, but of all the paint.
+        # Windows follow any curve, also a line that leads away; the start line is rough, but is based on all paint.
         fits = (
-            self._refined(points, fit_lane(points, sides, grid, self._lane_width_m)),
-            self._refined(points, self._followed(points, start, self._lane_width_m)),
+            self._refine(points, fit_lane(points, sides, grid, self._lane_width_m)),
+            self._refine(points, self._fit_near(points, start, self._lane_width_m)),
         )
-        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and stands_in(fit)]
+        lanes = [fit for fit in fits if fit is not None and has_parallel(points, fit, grid) and contains_car(fit)]
         found = max(lanes, key=lambda fit: fit.confidence, default=None)
         return DetectionTrace(mask, points, sides, start, self._lane_width_m, windows, found)
 
-    def _followed(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
-        return fit_lane(points, sides_near(points, centre, width_m), self.view.grid, width_m, centre)
+    def _fit_near(self, points: Points, centre: tuple[float, float, float], width_m: float) -> LaneFit | None:
+        return fit_lane(points, sides_near(points, centre, width_m), self.bird_eye.grid, width_m, centre)
 
-    def _refined(self, points: Points, fit: LaneFit | None) -> LaneFit | None:
-        for _ in range(REFINED):
+    def _refine(self, points: Points, fit: LaneFit | None) -> LaneFit | None:
+        for _ in range(REFINEMENTS):
             if fit is not None:
-                fit = self._followed(points, fit.centre, fit.width_m)
+                fit = self._fit_near(points, fit.centre, fit.width_m)
         return fit
 
 
-def stands_in(lane: LaneFit) -> bool:
-    """Tell whether the car stands in a lane, as far as a fit can tell; on a line it stands in both."""
-    return _aside_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
+def contains_car(lane: LaneFit) -> bool:
+    """Return whether the car is in a lane, within a fit's accuracy; on a line it is in both lanes."""
+    return _lateral_distance_m(lane.centre) <= lane.width_m / 2 + OUTLIER_M
 
 
-def has_been_left(lane: Lane) -> bool:
-    """Tell whether the car is so far beside a lane that it is in the middle of the next one, or beyond."""
-    return _aside_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
+def car_has_left(lane: Lane) -> bool:
+    """Return whether the car is so far off a lane that it is in the middle of the next one, or beyond."""
+    return _lateral_distance_m(lane.centre) > LEFT_AT_WIDTHS * lane.width_m
 
 
-def _aside_m(centre: tuple[float, float, float]) -> float:
+def _lateral_distance_m(centre: tuple[float, float, float]) -> float:
     c0, c1, _ = centre
     return abs(c0) / math.hypot(1.0, c1)
 
 
-def averaged(before: Lane | None, fit: LaneFit | Lane) -> Lane:
-    """Move the lane seen before towards the newest one; the first fit after a loss stands alone."""
+def average_lane(before: Lane | None, fit: LaneFit | Lane) -> Lane:
+    """Return the previous lane moved towards the newest one; without a previous lane, the newest one."""
     if before is None:
         return Lane(fit.centre, fit.width_m, fit.near_m, fit.far_m, fit.confidence)
     c0, c1, c2 = (old + SMOOTHING * (new - old) for old, new in zip(before.centre, fit.centre, strict=True))

@@ -1,9 +1,9 @@
-"""From paint seen from above to the lane's centre: which points are whose, and the curve through them.
+"""The lane fit: assigns bird's-eye paint to the left and right line, and fits the lane's centre.
 
-Both lines of a lane are fitted at once, as two parallels of one centre y = c0 + c1 x + c2 x^2: broken marks (3 m of
-paint, 6 m of gap) leave either line alone too little to fit a curve to, but they fill each other's gaps. A parallel at
-distance d of a curve with slope m lies d sqrt(1 + m^2) from it along y, so the fit stays linear when the slope of a
-fit before is used.
+Both lines of a lane are fitted together, as two parallels of one centre y = c0 + c1 x + c2 x^2: a broken mark (3 m of
+paint, 6 m of gap) alone has too little paint to fit a curve, but two lines fill each other's gaps. A parallel at
+distance d from a curve with slope m is d sqrt(1 + m^2) from it along y, so the fit is linear with the slope of an
+earlier fit.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from lavt.perception.bird_eye import GroundGrid
 from lavt.perception.lane_pixels import Mask
 
 Sides = NDArray[np.int8]
-"""For each point +1: of the left line, -1: of the right line, 0: of neither."""
+"""For each point +1: left line, -1: right line, 0: neither."""
 
 PAINT_AT_LEAST = 128  # a cell of the bird's-eye mask is paint when half of it is
-CORRIDOR_M = 0.7  # beside the line expected: far more than a car moves in one frame, far less than half a lane
-OUTLIER_M = 0.25  # off the last fit but one: two widths of a mark
-DOUBTED_FROM_M = (0.3, 0.15)  # off the first two fits: paint this far off counts half, so that the greater part wins
+CORRIDOR_M = 0.7  # around the expected line: far more than a car moves in one frame, far less than half a lane
+OUTLIER_M = 0.25  # off the second to last fit: two widths of a mark
+HALF_WEIGHT_M = (0.3, 0.15)  # off the first two fits: paint this far off has half weight, so that the majority wins
 POINTS_AT_LEAST = 25  # of a line: a quarter of a metre of paint at full width
-LINEAR_BELOW_M = 6.0  # of length seen: the curvature of less is noise
+LINEAR_BELOW_M = 6.0  # of visible length: the curvature of a shorter line is noise
 WIDTH_WITHIN_M = (2.6, 4.4)  # a lane's width
-SLOPE_AT_MOST = 0.5  # of the lane to the car: a line farther turned crosses the lane
-CURVATURE_AT_MOST_PER_M = 1 / 15  # what a car at walking pace could just follow
+SLOPE_AT_MOST = 0.5  # of the lane relative to the car: a line with more crosses the lane
+CURVATURE_AT_MOST_PER_M = 1 / 15  # a car at walking pace could just follow it
 COLUMN_BIN_M = 0.1
-START_LENGTH_M = 12.0  # the first paint is looked for within more than one period of broken marks
-START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)  # straight first: it wins a tie
+START_LENGTH_M = 12.0  # length of the start line's search: more than one period of broken marks
+START_SLOPES = (0.0, 0.05, -0.05, 0.1, -0.1, 0.15, -0.15, 0.2, -0.2, 0.25, -0.25)  # straight first, to win ties
 START_BENDS_PER_M = (0.0, 0.006, -0.006, 0.012, -0.012)  # half the curvature, down to a radius of 42 m
 WINDOW_M = (1.0, 0.6)  # a sliding window's length along x, and half its width
 WINDOW_POINTS_AT_LEAST = 6
 COVER_BIN_M = 0.5
-COVER_POINTS_AT_LEAST = 4  # a third of what a whole mark gives in a bin
-COVER_LINE_M = 0.15  # a mark's half width, and as much for how well a curve fits
-COVER_CLEAN = 0.6  # share of the paint beside the line (`CORRIDOR_M`) that lies on it: by chance it is 0.2
-COVER_BINS_TOGETHER = 2  # paint of less than a metre is a spot
-COVER_REACH_M = 3.0  # half the gap of broken marks: seen paint vouches for as much road before and behind it
-PARALLEL_SEEN_AT_LEAST = 0.2  # of the length, to be the line of a neighbour lane
+COVER_POINTS_AT_LEAST = 4  # a third of the points of a full mark in a bin
+COVER_LINE_M = 0.15  # a mark's half width, and as much for the error of the curve
+COVER_CLEAN = 0.6  # minimum share of the paint around the line (`CORRIDOR_M`) that is on it: by chance it is 0.2
+COVER_BINS_TOGETHER = 2  # adjacent bins: paint shorter than a metre is a spot
+COVER_REACH_M = 3.0  # half the gap of broken marks: paint counts for this much of the line before and behind it
+PARALLEL_VISIBLE_AT_LEAST = 0.2  # of the length, to be the line of a neighbouring lane
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """Middles of the cells that are paint, in the vehicle's frame."""
+    """The centres of paint cells, in the vehicle's frame."""
 
     x_m: FloatArray
     y_m: FloatArray
@@ -63,29 +63,29 @@ class LaneFit:
     width_m: float
     near_m: float
     far_m: float
-    left_seen: float
-    """Share of the length looked at in which the left line is seen, 0 to 1."""
-    right_seen: float
-    fitting: float
-    """Share of the paint in and beside the lane that lies on its lines, 0 to 1."""
+    left_visible: float
+    """Share of the grid's length over which the left line is visible, 0 to 1."""
+    right_visible: float
+    on_line_share: float
+    """Share of the paint in and beside the lane that is on its lines, 0 to 1."""
 
     @property
     def confidence(self) -> float:
-        """Mean share of the two lines seen, times how much better than by chance the lines explain the paint."""
+        """The mean visible share of the two lines, times the share of paint on the lines in excess of chance."""
         by_chance = 4 * OUTLIER_M / (self.width_m + 2 * CORRIDOR_M)
-        return (self.left_seen + self.right_seen) / 2 * max(self.fitting - by_chance, 0.0) / (1 - by_chance)
+        return (self.left_visible + self.right_visible) / 2 * max(self.on_line_share - by_chance, 0.0) / (1 - by_chance)
 
 
 def mark_points(mask: Mask, grid: GroundGrid) -> Points:
-    """Give the cells of a bird's-eye mask that are paint as points on the ground."""
+    """Return the paint cells of a bird's-eye mask as points on the ground."""
     found: Any = cv2.findNonZero(cv2.threshold(mask, PAINT_AT_LEAST - 1, 255, cv2.THRESH_BINARY)[1])
     cells = np.empty((0, 2), dtype=np.int32) if found is None else np.reshape(found, (-1, 2))
     return Points(grid.row_x_m()[cells[:, 1]], grid.column_y_m()[cells[:, 0]])
 
 
 def sides_near(points: Points, centre: tuple[float, float, float], width_m: float) -> Sides:
-    """Tell which points lie near the lines of a lane that is known from before."""
-    middle, slope_factor = _along(points.x_m, centre)
+    """Assign points to the lines of a known lane if they are near them."""
+    middle, slope_factor = _evaluate_centre(points.x_m, centre)
     offset = points.y_m - middle
     line = width_m / 2 * slope_factor
     sides = np.where(offset > 0, 1, -1)
@@ -93,18 +93,18 @@ def sides_near(points: Points, centre: tuple[float, float, float], width_m: floa
 
 
 def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float, float, float] | None:
-    """Guess the centre of the lane the car stands in as c0, c1, c2; None without paint.
+    """Estimate the centre c0, c1, c2 of the lane the car is in; None without paint.
 
-    For a few slopes and bends the paint is straightened and counted along y modulo the lane's width, which brings both
-    lines of the lane, and those of its neighbours, to the same place; the sharpest peak wins. Lanes repeat every
-    `width_m`, so that just one of them has its centre within half of it.
+    For several slopes and bends the paint is straightened and counted along y modulo the lane's width. Both lines of
+    the lane, and those of its neighbours, then coincide; the highest peak wins. Lanes repeat every `width_m`, so
+    exactly one of them has its centre within half a width of the car.
     """
     near = points.x_m < grid.near_m + START_LENGTH_M
     bins = round(width_m / COLUMN_BIN_M)
     x, y = points.x_m[near], points.y_m[near]
     far_m = grid.near_m + START_LENGTH_M
     spread_m = float(np.abs(y).max(initial=0.0)) + (max(START_SLOPES) + max(START_BENDS_PER_M) * far_m) * far_m
-    lanes = 2 * math.ceil(spread_m / width_m)  # as many as straightened paint may lie in, half of them on the right
+    lanes = 2 * math.ceil(spread_m / width_m)  # enough for all straightened paint, half of them on the right
     y_bins, bins_per_m = y / width_m * bins + lanes // 2 * bins, bins / width_m
     best_score, best = WINDOW_POINTS_AT_LEAST, None
     for bend in START_BENDS_PER_M:
@@ -113,7 +113,7 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
             counts = np.bincount(straight, minlength=lanes * bins).reshape(-1, bins).sum(axis=0)
             scores = counts + np.roll(counts, 1) + np.roll(counts, -1)
             if scores.max() > best_score:
-                line_m = (float(np.argmax(scores)) + 0.5) / bins * width_m  # between 0 and the width: one of the lines
+                line_m = (float(np.argmax(scores)) + 0.5) / bins * width_m  # one of the lines, between 0 and the width
                 best_score, best = int(scores.max()), (line_m - width_m / 2, slope, bend)
     return best
 
@@ -121,93 +121,96 @@ def start_line(points: Points, grid: GroundGrid, width_m: float) -> tuple[float,
 def sides_by_windows(
     points: Points, grid: GroundGrid, start: tuple[float, float, float], width_m: float
 ) -> tuple[Sides, tuple[tuple[float, float], ...]]:
-    """Follow both lines from the near end with a pair of sliding windows that move as one.
+    """Follow both lines from the near end with a pair of sliding windows that move together.
 
-    They follow the centre `start`, moved by how far off it they were seen to be last. Gives the sides and, for each
-    pair, its near end (x) and how far left of `start` its middle is, in metres.
+    The windows follow the centre `start`, shifted by the last measured offset. Returns the sides and, for each pair,
+    its near end (x) and the offset of its middle to the left of `start`, in metres.
     """
     length_m, half_width_m = WINDOW_M
-    offset_m = points.y_m - _along(points.x_m, start)[0]
-    off_m = 0.0
+    offset_m = points.y_m - _evaluate_centre(points.x_m, start)[0]
+    distance_m = 0.0
     sides = np.zeros(len(points.x_m), dtype=np.int8)
-    places = []
+    windows = []
     for low_m in np.arange(grid.near_m, grid.far_m, length_m):
         inside = (points.x_m >= low_m) & (points.x_m < low_m + length_m)
-        seen_m = []
-        places.append((float(low_m), off_m))
+        measured_offsets_m = []
+        windows.append((float(low_m), distance_m))
         for side in (1, -1):
-            line_m = off_m + side * width_m / 2
-            caught = inside & (np.abs(offset_m - line_m) < half_width_m)
-            sides[caught] = side
-            if np.count_nonzero(caught) >= WINDOW_POINTS_AT_LEAST:
-                seen_m.append(float(np.mean(offset_m[caught])) - line_m)
-        if seen_m:
-            off_m += sum(seen_m) / len(seen_m)
-    return sides, tuple(places)
+            line_m = distance_m + side * width_m / 2
+            in_window = inside & (np.abs(offset_m - line_m) < half_width_m)
+            sides[in_window] = side
+            if np.count_nonzero(in_window) >= WINDOW_POINTS_AT_LEAST:
+                measured_offsets_m.append(float(np.mean(offset_m[in_window])) - line_m)
+        if measured_offsets_m:
+            distance_m += sum(measured_offsets_m) / len(measured_offsets_m)
+    return sides, tuple(windows)
 
 
 def fit_lane(
     points: Points, sides: Sides, grid: GroundGrid, width_m: float, expected: tuple[float, float, float] | None = None
 ) -> LaneFit | None:
-    """Fit a lane to the points of its lines, trusting less what lies off it, and fit again; None when there is none.
+    """Fit a lane to the points of its lines, iteratively reweighted by their residuals; None when there is none.
 
-    `width_m` is the width expected; it is used where only one line is seen, or where what is seen is not a lane's.
-    `expected` is the centre expected, where one is.
+    `width_m` is the expected width, used where only one line is visible or the measured width is not a lane's.
+    `expected` is the expected centre, if there is one.
     """
-    of_lane = np.flatnonzero(sides)
-    chosen, side = Points(points.x_m[of_lane], points.y_m[of_lane]), sides[of_lane]
-    fit = _fit_once(chosen, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
-    for doubted_m in DOUBTED_FROM_M:
+    lane_indices = np.flatnonzero(sides)
+    line_points, side = Points(points.x_m[lane_indices], points.y_m[lane_indices]), sides[lane_indices]
+    fit = _fit_once(line_points, side, width_m, slopes_of=(0.0, 0.0, 0.0)) if expected is None else (expected, width_m)
+    for half_weight_m in HALF_WEIGHT_M:
         if fit is None:
             return None
-        trust = 1 / (1 + (_residual_m(chosen, side, *fit) / doubted_m) ** 2)
-        fit = _fit_once(chosen, side, width_m, slopes_of=fit[0], trust=trust)
+        weights = 1 / (1 + (_residual_m(line_points, side, *fit) / half_weight_m) ** 2)
+        fit = _fit_once(line_points, side, width_m, slopes_of=fit[0], weights=weights)
     if fit is None:
         return None
-    fits = np.abs(_residual_m(chosen, side, *fit)) < OUTLIER_M
-    kept, kept_side = Points(chosen.x_m[fits], chosen.y_m[fits]), side[fits]
+    is_on_line = np.abs(_residual_m(line_points, side, *fit)) < OUTLIER_M
+    kept, kept_side = Points(line_points.x_m[is_on_line], line_points.y_m[is_on_line]), side[is_on_line]
     fit = _fit_once(kept, kept_side, width_m, slopes_of=fit[0])
     if fit is None or abs(fit[0][1]) > SLOPE_AT_MOST or 2 * abs(fit[0][2]) > CURVATURE_AT_MOST_PER_M:
         return None
     centre, measured_m = fit
-    across = _across_m(points, centre)
-    beyond = np.abs(across) - measured_m / 2
-    near_line = np.abs(beyond)
+    across = _lateral_offset_m(points, centre)
+    outside_m = np.abs(across) - measured_m / 2
+    near_line = np.abs(outside_m)
     return LaneFit(
         centre=centre,
         width_m=measured_m,
         near_m=float(kept.x_m.min()),
         far_m=float(kept.x_m.max()),
-        left_seen=_share_seen(points.x_m[across > 0], near_line[across > 0], grid),
-        right_seen=_share_seen(points.x_m[across < 0], near_line[across < 0], grid),
-        fitting=float(np.count_nonzero(near_line < OUTLIER_M)) / max(int(np.count_nonzero(beyond < CORRIDOR_M)), 1),
+        left_visible=_visible_share(points.x_m[across > 0], near_line[across > 0], grid),
+        right_visible=_visible_share(points.x_m[across < 0], near_line[across < 0], grid),
+        on_line_share=float(np.count_nonzero(near_line < OUTLIER_M))
+        / max(int(np.count_nonzero(outside_m < CORRIDOR_M)), 1),
     )
 
 
 def has_parallel(points: Points, fit: LaneFit, grid: GroundGrid) -> bool:
-    """Tell whether there are two lines a lane's width apart: both of the lane's, or one and one of a neighbour's."""
-    seen = [side for side, share in ((1, fit.left_seen), (-1, fit.right_seen)) if share >= PARALLEL_SEEN_AT_LEAST]
-    if len(seen) != 1:
-        return len(seen) == 2
-    off = np.abs(_across_m(points, fit.centre) - seen[0] * 1.5 * fit.width_m)
-    return _share_seen(points.x_m, off, grid) >= PARALLEL_SEEN_AT_LEAST
+    """Return whether there are two lines a lane's width apart: both of the lane's, or one and a neighbour's."""
+    visible_sides = [
+        side for side, share in ((1, fit.left_visible), (-1, fit.right_visible)) if share >= PARALLEL_VISIBLE_AT_LEAST
+    ]
+    if len(visible_sides) != 1:
+        return len(visible_sides) == 2
+    distance_m = np.abs(_lateral_offset_m(points, fit.centre) - visible_sides[0] * 1.5 * fit.width_m)
+    return _visible_share(points.x_m, distance_m, grid) >= PARALLEL_VISIBLE_AT_LEAST
 
 
-def _along(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
-    """Give y of a centre line at x, and how much farther its parallels lie along y than across."""
+def _evaluate_centre(x_m: FloatArray, centre: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
+    """Return y of a centre at x, and the ratio of its parallels' distance along y to that across."""
     c0, c1, c2 = centre
     slope = c1 + 2 * c2 * x_m
     return c0 + (c1 + c2 * x_m) * x_m, np.sqrt(1 + slope * slope)
 
 
-def _across_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
-    """Give how far left of a centre line points lie."""
-    middle, slope_factor = _along(points.x_m, centre)
+def _lateral_offset_m(points: Points, centre: tuple[float, float, float]) -> FloatArray:
+    """Return the offsets of points to the left of a centre."""
+    middle, slope_factor = _evaluate_centre(points.x_m, centre)
     return (points.y_m - middle) / slope_factor
 
 
 def _residual_m(points: Points, side: Sides, centre: tuple[float, float, float], width_m: float) -> FloatArray:
-    return _across_m(points, centre) - side * width_m / 2
+    return _lateral_offset_m(points, centre) - side * width_m / 2
 
 
 def _fit_once(
@@ -215,33 +218,33 @@ def _fit_once(
     side: Sides,
     width_m: float,
     slopes_of: tuple[float, float, float],
-    trust: FloatArray | None = None,
+    weights: FloatArray | None = None,
 ) -> tuple[tuple[float, float, float], float] | None:
-    """Least squares for centre and width; the parallels' slopes are those of an earlier centre."""
+    """Fit centre and width by least squares; the parallels' slopes are those of an earlier centre."""
     left = int(np.count_nonzero(side > 0))
     right = len(side) - left
     if max(left, right) < POINTS_AT_LEAST:
         return None
     x, y = points.x_m, points.y_m
-    half_lane = side * _along(x, slopes_of)[1] / 2
+    half_lane = side * _evaluate_centre(x, slopes_of)[1] / 2
     curve = [np.ones_like(x), x]
     if float(np.ptp(x)) >= LINEAR_BELOW_M:
         curve.append(x * x)
-    weight = curve[0] if trust is None else trust
+    weight = curve[0] if weights is None else weights
     if min(left, right) >= POINTS_AT_LEAST:
         solved = _solve([*curve, half_lane], y, weight)
         if solved is None:
             return None
         if WIDTH_WITHIN_M[0] <= solved[-1] <= WIDTH_WITHIN_M[1]:
             return _centre(solved[:-1]), float(solved[-1])
-    # One line, or two that are not a lane apart: believe the one of which more is seen.
-    better = side == (1 if left >= right else -1)
-    solved = _solve([column[better] for column in curve], (y - width_m * half_lane)[better], weight[better])
+    # One line, or two that are not a lane's width apart: use the one with more points.
+    majority = side == (1 if left >= right else -1)
+    solved = _solve([column[majority] for column in curve], (y - width_m * half_lane)[majority], weight[majority])
     return None if solved is None else (_centre(solved), width_m)
 
 
 def _solve(columns: list[FloatArray], y: FloatArray, weight: FloatArray) -> FloatArray | None:
-    """Solve the normal equations: hundreds of points, four unknowns; None when the points do not determine them."""
+    """Solve the normal equations for up to four unknowns; None when the points do not determine them."""
     design = np.stack(columns)
     weighted = design * weight
     try:
@@ -254,18 +257,18 @@ def _centre(solved: FloatArray) -> tuple[float, float, float]:
     return float(solved[0]), float(solved[1]), float(solved[2]) if len(solved) > 2 else 0.0
 
 
-def _share_seen(x_m: FloatArray, off_m: FloatArray, grid: GroundGrid) -> float:
-    """Give the share of the grid's length within reach of a line's clean paint, so that broken counts as solid.
+def _visible_share(x_m: FloatArray, distance_m: FloatArray, grid: GroundGrid) -> float:
+    """Return the share of the grid's length within reach of a line's clean paint; broken marks count as solid.
 
-    `off_m` is how far each point lies off the line; clean is where most of what lies near it lies on it.
+    `distance_m` are the points' distances from the line. Paint is clean where most points near the line are on it.
     """
     bins = round((grid.far_m - grid.near_m) / COVER_BIN_M)
     each = np.minimum(((x_m - grid.near_m) / COVER_BIN_M).astype(np.int64), bins - 1)
-    on_line = np.bincount(each[off_m < COVER_LINE_M], minlength=bins)
-    beside = np.bincount(each[off_m < CORRIDOR_M], minlength=bins)
+    on_line = np.bincount(each[distance_m < COVER_LINE_M], minlength=bins)
+    beside = np.bincount(each[distance_m < CORRIDOR_M], minlength=bins)
     clean = (on_line >= COVER_POINTS_AT_LEAST) & (on_line >= COVER_CLEAN * beside)
     runs = np.convolve(clean, np.ones(COVER_BINS_TOGETHER), mode="full") == COVER_BINS_TOGETHER
-    # A run ends where it was found: what reaches back over it, and COVER_REACH_M from both its ends, is seen.
+    # `ends` are the last bins of runs: the line is visible over each run and COVER_REACH_M beyond both its ends.
     reach = round(COVER_REACH_M / COVER_BIN_M)
     ends = np.flatnonzero(runs)
     near = np.zeros(bins + 1)

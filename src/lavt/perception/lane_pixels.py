@@ -1,7 +1,7 @@
-"""Which pixels may be paint: white or yellow, brighter than the road around, and between edges that stand upright.
+"""Lane-mark pixels: white or yellow, brighter than the surrounding road, and near vertical edges.
 
-All thresholds are on 8-bit values, none on brightness itself, which light and exposure decide. They were chosen on
-rendered daylight pictures before any drive under delay.
+All thresholds are on 8-bit values. None is on absolute brightness, which depends on light and exposure. They were
+chosen on rendered daylight pictures before any drive under delay.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from numpy.typing import NDArray
 from lavt.domain import Picture
 
 Mask = NDArray[np.uint8]
-"""0 or 255 for each pixel of a picture or cut-out."""
+"""0 or 255 for each pixel of a picture or crop."""
 
 WHITE_ABOVE_ROAD = 28
-"""White paint is this much brighter than the mean around it, which shadows and exposure move as well."""
+"""White paint is this much brighter than the mean around it, which changes with shadows and exposure as paint does."""
 WHITE_OVER_ROAD = 1.3
-"""And so many times as bright: in bright light the grain of asphalt alone exceeds any fixed difference."""
+"""White paint is also this many times as bright: in bright light the grain of asphalt exceeds any fixed difference."""
 YELLOW_RED_OVER_BLUE = 55
 """Yellow paint has this much less blue than red."""
 EDGE_AT_LEAST = 48
-"""Of the 3 x 3 Sobel gradient along a row: 12 grey levels from one pixel to the one after the next."""
+"""Minimum 3 x 3 Sobel gradient along a row: 12 grey levels between pixels two columns apart."""
 AROUND_PX = (65, 5)
-"""Width and height of "around" at a focal length of 320 px: three times as wide as the nearest mark (20 px at 2 m)."""
+"""Width and height of the surroundings at a focal length of 320 px: three times the nearest mark (20 px at 2 m)."""
 MARK_PX = 21
-"""Width for a focal length of 320 px within which an edge speaks for the inside of a mark."""
+"""The width around an edge that may be the inside of a mark, at a focal length of 320 px."""
 
 
 def lane_pixels(region: Picture, scale: float = 1.0) -> Mask:
-    """Find the pixels of `region`, (height, width, 3), that may belong to a lane's marks.
+    """Return a mask of the pixels of `region`, (height, width, 3), that may belong to a lane's marks.
 
-    `scale` is the camera's focal length over 320 px: by that much a mark is wider.
+    `scale` is the camera's focal length over 320 px, by which marks are wider.
     """
     grey = grey_of(region)
     paint = cv2.bitwise_or(white_pixels(grey, scale), yellow_pixels(region))
@@ -40,12 +40,12 @@ def lane_pixels(region: Picture, scale: float = 1.0) -> Mask:
 
 
 def grey_of(region: Picture) -> NDArray[np.uint8]:
-    """Give the brightness of a picture, (height, width)."""
+    """Return the brightness of a picture, (height, width)."""
     return np.asarray(cv2.cvtColor(region, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def white_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
-    """Find what is brighter than its surroundings, by difference and by ratio; how bright it is does not matter."""
+    """Return a mask of pixels brighter than their surroundings, both by difference and by ratio."""
     width, height = AROUND_PX
     around = cv2.blur(grey, (_odd(width * scale), height))
     above = cv2.threshold(cv2.subtract(grey, around), WHITE_ABOVE_ROAD, 255, cv2.THRESH_BINARY)[1]
@@ -54,13 +54,13 @@ def white_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
 
 
 def yellow_pixels(region: Picture) -> Mask:
-    """Find what is more red than blue by far, as yellow is and grey is not."""
+    """Return a mask of pixels with much more red than blue, which yellow has and grey has not."""
     difference = cv2.subtract(cv2.extractChannel(region, 2), cv2.extractChannel(region, 0))
     return np.asarray(cv2.threshold(difference, YELLOW_RED_OVER_BLUE, 255, cv2.THRESH_BINARY)[1], dtype=np.uint8)
 
 
 def edge_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
-    """Find what is near a change of brightness along the row; patches of light and grass have none so sharp."""
+    """Return a mask of pixels near a sharp edge along the row; patches of light and grass have softer edges."""
     gradient = cv2.convertScaleAbs(cv2.Sobel(grey, cv2.CV_16S, 1, 0, ksize=3))  # saturates at 255
     sharp = cv2.threshold(gradient, EDGE_AT_LEAST, 255, cv2.THRESH_BINARY)[1]
     near = np.ones((1, _odd(MARK_PX * scale)), dtype=np.uint8)
@@ -68,5 +68,5 @@ def edge_pixels(grey: NDArray[np.uint8], scale: float = 1.0) -> Mask:
 
 
 def _odd(width_px: float) -> int:
-    """Round a width to an odd number, which has a middle."""
+    """Return an odd integer width, which has a middle pixel."""
     return int(width_px) | 1

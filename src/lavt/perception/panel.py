@@ -1,4 +1,4 @@
-"""All steps from a picture to its lane, drawn side by side: what the detector did, for people to look at."""
+"""The panel: all steps of lane detection in a picture, drawn side by side for inspection."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from lavt.perception.lane_fit import CORRIDOR_M, WINDOW_M
 from lavt.perception.lane_pixels import edge_pixels, grey_of, lane_pixels, white_pixels, yellow_pixels
 
 TILE_PX = (400, 300)
-"""Width and height of a step's picture; a row of text stands above each."""
+"""Width and height of a step's tile, below a line of text."""
 LABEL_PX = 24
 COLUMNS = 4
-LEFT, RIGHT, NOBODYS, CENTRE, EXPECTED = (80, 200, 80), (230, 150, 60), (120, 120, 120), (60, 60, 255), (60, 220, 255)
-"""Colours (blue, green, red) of the left and the right line's points, of others', of the centre, and of a guess."""
+LEFT, RIGHT, OTHER, CENTRE, EXPECTED = (80, 200, 80), (230, 150, 60), (120, 120, 120), (60, 60, 255), (60, 220, 255)
+"""Colours (blue, green, red) of the left and right line's points, other points, the centre, and the expected lines."""
 
 
 def panel(camera: CalibratedCamera, detector: LaneDetector, picture: Picture) -> Picture:
-    """Let the detector look at the next picture and draw its steps: (3 rows of tiles, 4 columns of tiles, 3)."""
+    """Detect the lane in the next picture and return a drawing of the steps: 3 rows and 4 columns of tiles."""
     lane = detector.detect(picture)
-    sight, view = detector.sight, detector.view
-    if sight is None:
-        raise ValueError("a detector that has looked has a sight")
-    region = view.region(picture)
+    trace, bird_eye = detector.trace, detector.bird_eye
+    if trace is None:
+        raise ValueError("a detector has a trace after detecting")
+    region = bird_eye.region(picture)
     grey, scale = grey_of(region), camera.scale
-    rows = {
-        "3 white: brighter than around": white_pixels(grey, scale),
+    masks = {
+        "3 white: brighter than surroundings": white_pixels(grey, scale),
         "4 yellow: much more red than blue": yellow_pixels(region),
-        "5 near upright edges": edge_pixels(grey, scale),
+        "5 near vertical edges": edge_pixels(grey, scale),
         "6 marks: (3 or 4) and 5": lane_pixels(region, scale),
     }
     tiles = {
         "1 picture": picture,
-        "2 without distortion; ground looked at": _with_region(camera, picture, view.grid),
-        **{label: _in_place(mask, picture, view) for label, mask in rows.items()},
-        "7 bird's eye, far end at the top": view.from_above(region),
-        "8 marks from above": _grey_to_colour(sight.mask),
-        "9 points: left, right, nobody's": _points(sight, view.grid),
-        "10 lane fitted": _fitted(sight, lane, view),
-        "11 lane in the picture": _lane_in(camera, picture, lane),
+        "2 undistorted, with the searched ground": _draw_ground_outline(camera, picture, bird_eye.grid),
+        **{label: _mask_in_picture(mask, picture, bird_eye) for label, mask in masks.items()},
+        "7 bird's-eye view, far end at the top": bird_eye.from_above(region),
+        "8 marks in the bird's-eye view": _grey_to_colour(trace.mask),
+        "9 points: left, right, other": _draw_points(trace, bird_eye.grid),
+        "10 fitted lane": _draw_fit(trace, lane, bird_eye),
+        "11 lane in the picture": _draw_lane(camera, picture, lane),
     }
-    drawn = [_tile(label, tile) for label, tile in tiles.items()]
-    drawn.append(_tile("12 confidence", _words(sight, lane)))
+    drawn = [_make_tile(label, tile) for label, tile in tiles.items()]
+    drawn.append(_make_tile("12 confidence", _confidence_text(trace, lane)))
     return np.vstack([np.hstack(drawn[start : start + COLUMNS]) for start in range(0, len(drawn), COLUMNS)])
 
 
-def _tile(label: str, tile: Picture) -> Picture:
-    """Fit a picture into a tile and write its label above."""
+def _make_tile(label: str, tile: Picture) -> Picture:
+    """Return a tile with a picture scaled to fit and its label above."""
     width, height = TILE_PX
     factor = min(width / tile.shape[1], height / tile.shape[0])
     size = (max(round(tile.shape[1] * factor), 1), max(round(tile.shape[0] * factor), 1))
@@ -69,124 +69,133 @@ def _grey_to_colour(grey: Picture) -> Picture:
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
 
 
-def _in_place(mask: Picture, picture: Picture, view: BirdEye) -> Picture:
-    """Put a mask of the rows cut out where they are in the picture."""
+def _mask_in_picture(mask: Picture, picture: Picture, bird_eye: BirdEye) -> Picture:
+    """Return a mask of the cropped rows at their place in the picture."""
     whole = np.full_like(picture, 30)
-    view.region(whole)[:] = mask[..., None]
+    bird_eye.region(whole)[:] = mask[..., None]
     return whole
 
 
-def _with_region(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
-    """Straighten the picture and outline the ground that is looked at."""
+def _draw_ground_outline(camera: CalibratedCamera, picture: Picture, grid: GroundGrid) -> Picture:
+    """Return the undistorted picture with an outline of the grid."""
     straight, factors = picture.copy(), np.array(camera.distortion)
     if camera.distortion:
-        size, undistorted = (camera.width_px, camera.height_px), camera.lens
+        size, undistorted = (camera.width_px, camera.height_px), camera.camera_matrix
         make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-        maps = make(camera.lens, factors, np.eye(3), undistorted, size, cv2.CV_16SC2)
+        maps = make(camera.camera_matrix, factors, np.eye(3), undistorted, size, cv2.CV_16SC2)
         straight = np.asarray(cv2.remap(picture, *maps, cv2.INTER_LINEAR), dtype=np.uint8)
     near, far, side = grid.near_m, grid.far_m, grid.half_width_m
     corners = np.array([[near, side], [far, side], [far, -side], [near, -side], [near, side]])
     rim = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(corners)])
     seen = np.column_stack([rim, np.ones(len(rim))]) @ ground_to_picture(camera).T
     seen = seen[seen[:, 2] > 0.1]
-    _curve(straight, seen[:, :2] / seen[:, 2:], EXPECTED)
+    _draw_curve(straight, seen[:, :2] / seen[:, 2:], EXPECTED)
     return straight
 
 
-def _curve(picture: Picture, pixels: FloatArray, colour: tuple[int, int, int], thickness: int = 2) -> None:
-    """Draw a line through those of the points (n, 2) that are anywhere near the picture."""
+def _draw_curve(picture: Picture, pixels: FloatArray, colour: tuple[int, int, int], thickness: int = 2) -> None:
+    """Draw a line through the points (n, 2) that are near the picture."""
     limit = 4 * max(picture.shape)
     near = np.isfinite(pixels).all(axis=1) & (np.abs(np.nan_to_num(pixels)) < limit).all(axis=1)
     cv2.polylines(picture, [np.round(pixels[near]).astype(np.int32)], False, colour, thickness, cv2.LINE_AA)
 
 
 def _cells(points: FloatArray, grid: GroundGrid) -> FloatArray:
-    """Turn ground points (n, 2) into (column, row) of the grid."""
+    """Return ground points (n, 2) as (column, row) of the grid."""
     columns = (grid.half_width_m - points[:, 1]) / grid.step_y_m - 0.5
     return np.column_stack([columns, (grid.far_m - points[:, 0]) / grid.step_x_m - 0.5])
 
 
-def _parallel(centre: tuple[float, float, float], offset_m: float, near_m: float, far_m: float) -> FloatArray:
-    """Give ground points (n, 2) along the parallel of a centre line, left of it by `offset_m`."""
+def _parallel_line(centre: tuple[float, float, float], offset_m: float, near_m: float, far_m: float) -> FloatArray:
+    """Return ground points (n, 2) along the parallel of a centre, `offset_m` to its left."""
     x = np.linspace(near_m, far_m, 60)
     slope = centre[1] + 2 * centre[2] * x
     across = np.column_stack([-slope, np.ones_like(slope)]) / np.hypot(slope, 1.0)[:, None]
     return np.column_stack([x, centre[0] + (centre[1] + centre[2] * x) * x]) + offset_m * across
 
 
-def _points(sight: DetectionTrace, grid: GroundGrid) -> Picture:
-    """Draw whose point is whose, and the windows or corridors in which they were looked for."""
-    drawn = np.zeros((*sight.mask.shape, 3), dtype=np.uint8)
-    cells = np.round(_cells(np.column_stack([sight.points.x_m, sight.points.y_m]), grid)).astype(int)
-    palette = np.array([NOBODYS, LEFT, RIGHT], dtype=np.uint8)  # by side: 0, 1, -1
-    drawn[cells[:, 1], cells[:, 0]] = palette[sight.sides]
-    if sight.expected is None:
+def _draw_points(trace: DetectionTrace, grid: GroundGrid) -> Picture:
+    """Return a drawing of the points by side, with the windows or corridors of the search."""
+    drawn = np.zeros((*trace.mask.shape, 3), dtype=np.uint8)
+    cells = np.round(_cells(np.column_stack([trace.points.x_m, trace.points.y_m]), grid)).astype(int)
+    palette = np.array([OTHER, LEFT, RIGHT], dtype=np.uint8)  # by side: 0, 1, -1
+    drawn[cells[:, 1], cells[:, 0]] = palette[trace.sides]
+    if trace.expected is None:
         return drawn
-    if not sight.windows:
+    if not trace.windows:
         for side in (1, -1):
             for rim_m in (-CORRIDOR_M, CORRIDOR_M):
-                line = _parallel(sight.expected, side * sight.expected_width_m / 2 + rim_m, grid.near_m, grid.far_m)
-                _curve(drawn, _cells(line, grid), EXPECTED, 1)
+                line = _parallel_line(
+                    trace.expected, side * trace.expected_width_m / 2 + rim_m, grid.near_m, grid.far_m
+                )
+                _draw_curve(drawn, _cells(line, grid), EXPECTED, 1)
     length_m, half_width_m = WINDOW_M
-    c0, c1, c2 = sight.expected
-    for low_m, off_m in sight.windows:
+    c0, c1, c2 = trace.expected
+    for low_m, off_m in trace.windows:
         middle_m = low_m + length_m / 2
         for side in (1, -1):
-            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * sight.expected_width_m / 2
+            y_m = c0 + (c1 + c2 * middle_m) * middle_m + off_m + side * trace.expected_width_m / 2
             box = np.array([[low_m, y_m + half_width_m], [low_m + length_m, y_m - half_width_m]])
             first, second = np.round(_cells(box, grid)).astype(int).tolist()
             cv2.rectangle(drawn, first, second, EXPECTED, 1)
     return drawn
 
 
-def _fitted(sight: DetectionTrace, lane: Lane, view: BirdEye) -> Picture:
-    """Draw the lane of this picture alone over its marks, and the average's centre."""
-    drawn = _grey_to_colour(sight.mask // 2)
-    if sight.fit is not None:
-        for offset_m, colour in ((sight.fit.width_m / 2, LEFT), (-sight.fit.width_m / 2, RIGHT)):
-            line = _parallel(sight.fit.centre, offset_m, sight.fit.near_m, sight.fit.far_m)
-            _curve(drawn, _cells(line, view.grid), colour, 1)
+def _draw_fit(trace: DetectionTrace, lane: Lane, bird_eye: BirdEye) -> Picture:
+    """Return a drawing of this picture's own lane over its marks, with the centre of the average."""
+    drawn = _grey_to_colour(trace.mask // 2)
+    if trace.fit is not None:
+        for offset_m, colour in ((trace.fit.width_m / 2, LEFT), (-trace.fit.width_m / 2, RIGHT)):
+            line = _parallel_line(trace.fit.centre, offset_m, trace.fit.near_m, trace.fit.far_m)
+            _draw_curve(drawn, _cells(line, bird_eye.grid), colour, 1)
     if lane.confidence >= TRACK_CONFIDENCE:
-        centre = _parallel(lane.centre, 0.0, view.grid.near_m, view.grid.far_m)
-        _curve(drawn, _cells(centre, view.grid), CENTRE, 1)
+        centre = _parallel_line(lane.centre, 0.0, bird_eye.grid.near_m, bird_eye.grid.far_m)
+        _draw_curve(drawn, _cells(centre, bird_eye.grid), CENTRE, 1)
     return drawn
 
 
-def _lane_in(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
-    """Draw the lane into the picture, through the lens; nothing where there is none to drive by."""
+def _draw_lane(camera: CalibratedCamera, picture: Picture, lane: Lane) -> Picture:
+    """Return the picture with the lane drawn through the lens, unless its confidence is too low."""
     drawn = picture.copy()
     if lane.confidence < TRACK_CONFIDENCE:
         return drawn
-    left, right = (_parallel(lane.centre, side * lane.width_m / 2, lane.near_m, lane.far_m) for side in (1, -1))
+    left, right = (_parallel_line(lane.centre, side * lane.width_m / 2, lane.near_m, lane.far_m) for side in (1, -1))
     rim = picture_points(camera, np.concatenate([left, right[::-1]]))
     rim = rim[np.isfinite(rim).all(axis=1)]
     filled = drawn.copy()
     cv2.fillPoly(filled, [np.round(rim).astype(np.int32)], LEFT)
     cv2.addWeighted(filled, 0.35, drawn, 0.65, 0, drawn)
     for line, colour in ((left, LEFT), (right, RIGHT)):
-        _curve(drawn, picture_points(camera, line), colour)
-    _curve(drawn, picture_points(camera, _parallel(lane.centre, 0.0, lane.near_m, lane.far_m)), CENTRE)
+        _draw_curve(drawn, picture_points(camera, line), colour)
+    _draw_curve(drawn, picture_points(camera, _parallel_line(lane.centre, 0.0, lane.near_m, lane.far_m)), CENTRE)
     return drawn
 
 
-def _words(sight: DetectionTrace, lane: Lane) -> Picture:
-    """Write the confidence and what it is made of."""
+def _confidence_text(trace: DetectionTrace, lane: Lane) -> Picture:
+    """Return a tile with the confidence and its components as text."""
     drawn = np.full((TILE_PX[1], TILE_PX[0], 3), 30, dtype=np.uint8)
     enough = lane.confidence >= TRACK_CONFIDENCE
     lines = [f"confidence {lane.confidence:.2f}: " + ("a lane" if enough else f"no lane (below {TRACK_CONFIDENCE})")]
-    searched = sight.windows or sight.expected is None
-    lines.append("searched by windows" if searched else "followed from the picture before")
-    if sight.fit is None:
-        lines.append("no two parallel lines, or nothing a lane can be")
+    searched = trace.windows or trace.expected is None
+    lines.append("searched with windows" if searched else "followed from the last picture")
+    if trace.fit is None:
+        lines.append("no two parallel lines, or an impossible lane")
     else:
-        fit = sight.fit
-        lines += [f"left line seen {fit.left_seen:.2f}", f"right line seen {fit.right_seen:.2f}",
-                  f"paint in the lane that is on its lines {fit.fitting:.2f}"]  # fmt: skip
+        fit = trace.fit
+        lines += [
+            f"left line visible {fit.left_visible:.2f}",
+            f"right line visible {fit.right_visible:.2f}",
+            f"share of paint on the lines {fit.on_line_share:.2f}",
+        ]
     if enough:
         c0, c1, c2 = lane.centre
-        lines += [f"width {lane.width_m:.2f} m", f"centre {abs(c0):.2f} m to the {'left' if c0 > 0 else 'right'}",
-                  f"turned {math.degrees(math.atan(c1)):+.1f} deg (left +)", f"curvature {2 * c2:+.4f} / m",
-                  f"seen from {lane.near_m:.1f} to {lane.far_m:.1f} m"]  # fmt: skip
+        lines += [
+            f"width {lane.width_m:.2f} m",
+            f"centre {abs(c0):.2f} m to the {'left' if c0 > 0 else 'right'}",
+            f"turned {math.degrees(math.atan(c1)):+.1f} deg (left +)",
+            f"curvature {2 * c2:+.4f} / m",
+            f"visible from {lane.near_m:.1f} to {lane.far_m:.1f} m",
+        ]
     for number, line in enumerate(lines):
         colour = (255, 255, 255) if number else ((120, 230, 120) if enough else (90, 90, 255))
         cv2.putText(drawn, line, (10, 28 + 25 * number), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

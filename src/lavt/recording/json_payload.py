@@ -1,6 +1,6 @@
-"""Payloads of a record as JSON, and the JSON Schema of their types.
+"""Conversion of a record's payloads to JSON, and the JSON Schema of their types.
 
-Bytes become base64 text, None and NaN become null, times stay whole numbers, floats keep every digit.
+Bytes become base64 text. None and NaN become null. Times remain integers, and floats keep every digit.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 from pydantic.errors import PydanticUserError
 
 Json = Any
-"""What `json` reads and writes: dict, list, str, int, float, bool, None."""
+"""A value that `json` reads and writes: dict, list, str, int, float, bool, None."""
 
 
 @functools.cache
@@ -27,8 +27,8 @@ def _field_names(payload_type: type) -> tuple[str, ...]:
     return tuple(field.name for field in fields(payload_type))
 
 
-def _plain(value: Any) -> Json:
-    """Say in simpler types what `json` cannot write; what is inside of it is asked for again."""
+def _to_simpler_type(value: Any) -> Json:
+    """Convert a value that `json` cannot write by one level; the encoder calls this again for nested values."""
     if is_dataclass(value) and not isinstance(value, type):
         return {name: getattr(value, name) for name in _field_names(type(value))}
     if isinstance(value, bytes | bytearray | memoryview):
@@ -39,12 +39,15 @@ def _plain(value: Any) -> Json:
         return value.item()
     if isinstance(value, Enum):
         return value.value
-    raise TypeError(f"a record cannot hold a {type(value).__name__}")
+    raise TypeError(f"a record cannot contain a {type(value).__name__}")
 
 
 @functools.cache
 def _serializer(payload_type: type) -> Callable[[Any], bytes] | None:
-    """Pydantic's compiled serializer of a dataclass; None for others, and where it would write bytes in its own way."""
+    """Return pydantic's compiled serializer of a dataclass; None for other types and for a dataclass with bytes.
+
+    Pydantic does not encode bytes as base64.
+    """
     if not is_dataclass(payload_type) or b"base64" in json_schema(payload_type):
         return None
     try:
@@ -54,11 +57,11 @@ def _serializer(payload_type: type) -> Callable[[Any], bytes] | None:
     return functools.partial(adapter.serializer.to_json, warnings=False)
 
 
-_ENCODER = json.JSONEncoder(default=_plain, separators=(",", ":"), allow_nan=False)
+_ENCODER = json.JSONEncoder(default=_to_simpler_type, separators=(",", ":"), allow_nan=False)
 
 
 def without_nan(value: Any) -> Json:
-    """Say the same value in plain JSON types, with null for every number that is not finite."""
+    """Return the value in plain JSON types, with null for every number that is not finite."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, float):
@@ -69,32 +72,32 @@ def without_nan(value: Any) -> Json:
         return {str(key): without_nan(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [without_nan(entry) for entry in value]
-    return without_nan(_plain(value))
+    return without_nan(_to_simpler_type(value))
 
 
 def to_json(payload: Any) -> bytes:
-    """One line of JSON for a dataclass or a dict.
+    """Return a dataclass or a dict as one line of JSON.
 
-    Raises `TypeError` for values that JSON has no words for.
+    Raises `TypeError` for values that JSON cannot represent.
     """
-    return writer_of(type(payload))(payload)
+    return serializer_of(type(payload))(payload)
 
 
-def writer_of(payload_type: type) -> Callable[[Any], bytes]:
-    """Give the function that makes JSON of payloads of a type."""
-    which: Any = payload_type
-    return _serializer(which) or _by_hand
+def serializer_of(payload_type: type) -> Callable[[Any], bytes]:
+    """Return the function that serializes payloads of a type to JSON."""
+    hashable: Any = payload_type
+    return _serializer(hashable) or _encode
 
 
-def _by_hand(payload: Any) -> bytes:
+def _encode(payload: Any) -> bytes:
     try:
         return _ENCODER.encode(payload).encode()
-    except ValueError:  # a float that is not finite: rare, and worth a second walk only then
+    except ValueError:  # a float that is not finite: too rare to check every payload in advance
         return _ENCODER.encode(without_nan(payload)).encode()
 
 
 def _with_base64(schema: Json) -> Json:
-    """Say of bytes what `to_json` does with them; pydantic calls them only binary."""
+    """Return the schema with bytes described as base64, as `to_json` writes them; pydantic only says "binary"."""
     if isinstance(schema, dict):
         if schema.get("format") == "binary":
             return {"type": "string", "contentEncoding": "base64"}
@@ -106,7 +109,7 @@ def _with_base64(schema: Json) -> Json:
 
 @functools.cache
 def json_schema(payload_type: type) -> bytes:
-    """JSON Schema of a payload's type; of a dict, or of a type pydantic cannot describe, only that it is an object."""
+    """Return the JSON Schema of a payload's type: only `object` for a dict or a type that pydantic cannot describe."""
     schema: Json = {"type": "object"}
     if is_dataclass(payload_type):
         try:

@@ -1,7 +1,7 @@
-"""Reading MCAP files (mcap.dev/spec) as `mcap_file.py` writes them, fast: a sweep reads millions of messages.
+"""A fast reader of the MCAP files (mcap.dev/spec) that `mcap_writer.py` writes: a sweep reads millions of messages.
 
-The reader of the package `mcap` takes 10 us for a message, this one takes 1: messages are taken apart in place, and the
-indexes, of which it reads every entry, are passed over. Rare records are read with the package's classes.
+The reader of the package `mcap` takes 10 us for a message, this one takes 1: it parses messages in place and skips
+the indexes, whose every entry the package reads. The package's classes read the rare records.
 """
 
 from __future__ import annotations
@@ -26,15 +26,22 @@ from mcap.stream_reader import CRCValidationError
 from lavt.recording.mcap_writer import MAGIC
 
 _HEAD: Final = struct.Struct("<BQ")
-"""Opcode, length of what follows."""
+"""Opcode and length of the content that follows."""
 _MESSAGE: Final = struct.Struct("<HIQQ")
-"""Channel, sequence, log time, publish time; then the data."""
+"""Channel, sequence, log time and publish time; the data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _CHANNEL_OPCODE: Final = int(Opcode.CHANNEL)
 _DAMAGE: Final = (
-    McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, KeyError, RuntimeError, MemoryError
-)  # fmt: skip
-"""What reading damage can raise; memory, where a length is damaged."""
+    McapError,
+    CRCValidationError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    RuntimeError,
+    MemoryError,
+)
+"""The errors that a damaged file can raise; a damaged length can raise `MemoryError`."""
 
 
 @dataclass(slots=True)
@@ -48,7 +55,7 @@ class Messages:
 
 @dataclass(slots=True)
 class McapContent:
-    """What a file holds: where it was never finished, or is damaged, what came before; then it is not `complete`."""
+    """The content of a file; `complete` is False for an unfinished or damaged file, read up to the damage."""
 
     topics: dict[str, Messages] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -59,11 +66,11 @@ def read_mcap(path: Path, wanted: Callable[[str], bool]) -> McapContent:
     """Read the messages of `wanted` topics, and all metadata, up to the end or to the first damage."""
     content = McapContent()
     messages_of: dict[int, Messages | None] = {}
-    # A cut or damaged end raises: what came before is whole, each chunk has its own checksum.
+    # A cut or damaged end raises. The chunks before it are intact: each has its own checksum.
     with path.open("rb") as stream, contextlib.suppress(*_DAMAGE), mmap(stream.fileno(), 0, access=ACCESS_READ) as file:
         for opcode, begin, end in _records(file):
             if opcode == Opcode.CHUNK:
-                _take_apart(_checked(Chunk.read(_stream(file[begin:end]))), messages_of, content, wanted)
+                _parse_chunk(_decompress(Chunk.read(_stream(file[begin:end]))), messages_of, content, wanted)
             elif opcode == Opcode.METADATA:
                 metadata = Metadata.read(_stream(file[begin:end]))
                 content.metadata[metadata.name] = dict(metadata.metadata)
@@ -74,9 +81,9 @@ def read_mcap(path: Path, wanted: Callable[[str], bool]) -> McapContent:
 
 
 def _records(file: mmap) -> Iterator[tuple[int, int, int]]:
-    """Give opcode, begin and end of each record of the file; raises `ValueError` where it is cut."""
+    """Yield opcode, begin and end of each record of the file; raise `ValueError` where the file is cut."""
     if file[: len(MAGIC)] != MAGIC:
-        raise ValueError("no MCAP file")
+        raise ValueError("not an MCAP file")
     end = len(MAGIC)
     while True:
         opcode, length = _HEAD.unpack_from(file, end)
@@ -91,8 +98,8 @@ def _stream(record: bytes) -> ReadDataStream:
     return ReadDataStream(BytesIO(record))
 
 
-def _checked(chunk: Chunk) -> bytes:
-    """Give what is in a chunk; raises `CRCValidationError` where it is not what was written."""
+def _decompress(chunk: Chunk) -> bytes:
+    """Return a chunk's decompressed content; raise `CRCValidationError` where its checksum is wrong."""
     data = chunk.data
     if chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().decompress(data, max_output_size=chunk.uncompressed_size)
@@ -102,32 +109,31 @@ def _checked(chunk: Chunk) -> bytes:
     return data
 
 
-def _take_apart(
+def _parse_chunk(
     chunk: bytes,
     messages_of: dict[int, Messages | None],
     content: McapContent,
     wanted: Callable[[str], bool],
 ) -> None:
     head, message, head_size, message_size = _HEAD.unpack_from, _MESSAGE.unpack_from, _HEAD.size, _MESSAGE.size
-    place, end = 0, len(chunk)
-    while place < end:
-        opcode, length = head(chunk, place)
-        begin = place + head_size
-        place = begin + length
+    offset, end = 0, len(chunk)
+    while offset < end:
+        opcode, length = head(chunk, offset)
+        begin = offset + head_size
+        offset = begin + length
         if opcode == _MESSAGE_OPCODE:
             channel, _sequence, log_ns, publish_ns = message(chunk, begin)
             messages = messages_of[channel]
             if messages is not None:
-                messages.data.append(chunk[begin + message_size : place])
+                messages.data.append(chunk[begin + message_size : offset])
                 messages.publish_ns.append(publish_ns)
                 messages.log_ns.append(log_ns)
         elif opcode == _CHANNEL_OPCODE:
-            _note_channel(chunk[begin:place], messages_of, content, wanted)
+            _register_channel(chunk[begin:offset], messages_of, content, wanted)
 
 
-def _note_channel(
+def _register_channel(
     record: bytes, messages_of: dict[int, Messages | None], content: McapContent, wanted: Callable[[str], bool]
 ) -> None:
     channel = Channel.read(_stream(record))
-    chosen = wanted(channel.topic)
-    messages_of[channel.id] = content.topics.setdefault(channel.topic, Messages()) if chosen else None
+    messages_of[channel.id] = content.topics.setdefault(channel.topic, Messages()) if wanted(channel.topic) else None

@@ -1,7 +1,7 @@
-"""Writing MCAP files (mcap.dev/spec), fast: a record has hundreds of messages for each second of a drive.
+"""A fast writer of MCAP files (mcap.dev/spec): a record has hundreds of messages for each second of a drive.
 
-The package `mcap` reads the files, in `record.py` and in tests; its writer takes 10 us for a message, this one takes 2.
-Rare records (header, schemas, channels, indexes) are written with its classes all the same.
+The writer of the package `mcap` takes 10 us for a message, this one takes 2. The package's classes write the rare
+records (header, schemas, channels, indexes), and its reader reads the files in tests.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from mcap.records import (
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of what follows, channel, sequence, log time, publish time; then the data."""
+"""Opcode, length of the content that follows, channel, sequence, log time and publish time; the data follow."""
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
-_HEAD: Final = 9
-_MESSAGE_REST: Final = _MESSAGE.size - _HEAD
+_HEAD_BYTES: Final = 9
+_MESSAGE_FIELDS_BYTES: Final = _MESSAGE.size - _HEAD_BYTES
 _MESSAGE_INDEX: Final = struct.Struct("<BQHI")
 _COMPRESSION_LEVEL: Final = 1
-"""zstd's fastest ordinary level: a drive's JSON shrinks to a ninth, as it does at level 3 in a third more time."""
+"""zstd's fastest ordinary level: a drive's JSON shrinks to a ninth. Level 3 takes a third longer for the same size."""
 
 
 class McapFile:
-    """An MCAP file that is being written, in chunks of about `chunk_bytes` that can each be read without the others."""
+    """An MCAP file that is being written, in independently readable chunks of about `chunk_bytes`."""
 
     def __init__(self, path: Path, *, library: str, chunk_bytes: int) -> None:
         self._file = path.open("wb")
@@ -64,30 +64,30 @@ class McapFile:
         return self._file.closed
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a schema; returns its number."""
+        """Add a schema and return its number."""
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
         self._schemas.append(schema)
-        self._put(_bytes(schema))
+        self._append(_bytes(schema))
         return schema.id
 
     def add_channel(self, topic: str, encoding: str, schema_id: int) -> int:
-        """Add a channel; returns its number."""
+        """Add a channel and return its number."""
         number = len(self._channels) + 1
         channel = Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema_id)
         self._channels.append(channel)
-        self._put(_bytes(channel))
+        self._append(_bytes(channel))
         return number
 
     def add_messages(self, entries: Iterable[tuple[int, int, int, bytes]]) -> bytes:
-        """Add messages, each (channel, log time, publish time, data); returns what the file has of them."""
+        """Add messages, each (channel, log time, publish time, data), and return their uncompressed MCAP records."""
         added: list[bytes] = []
         size, sequence, pack, messages = self._size, self._sequence, _MESSAGE.pack, self._messages
         for channel_id, log_ns, publish_ns, data in entries:
             sequence += 1
-            length = _MESSAGE_REST + len(data)
+            length = _MESSAGE_FIELDS_BYTES + len(data)
             added += (pack(_MESSAGE_OPCODE, length, channel_id, sequence & 0xFFFFFFFF, log_ns, publish_ns), data)
             messages[channel_id] += (log_ns, size)
-            size += _HEAD + length
+            size += _HEAD_BYTES + length
         self._size, self._sequence = size, sequence
         written = b"".join(added)
         self._parts.append(written)
@@ -96,13 +96,13 @@ class McapFile:
         return written
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """Add what belongs to no time."""
+        """Add named entries that belong to no time."""
         record = _bytes(Metadata(name=name, metadata=dict(entries)))
         self._metadata_indexes.append(MetadataIndex(offset=self._file.tell(), length=len(record), name=name))
         self._file.write(record)
 
     def close(self) -> None:
-        """Write the chunk that is begun, and the indexes."""
+        """Write the last chunk and the indexes, and close the file."""
         self._finish_chunk()
         self._file.write(_bytes(DataEnd(data_section_crc=0)))
         begin = self._file.tell()
@@ -113,7 +113,7 @@ class McapFile:
         self._file.write(summary + _bytes(footer) + MAGIC)
         self._file.close()
 
-    def _put(self, record: bytes) -> None:
+    def _append(self, record: bytes) -> None:
         self._parts.append(record)
         self._size += len(record)
 
@@ -121,7 +121,7 @@ class McapFile:
         self._parts: list[bytes] = []
         self._size = 0
         self._messages: defaultdict[int, list[int]] = defaultdict(list)
-        """For each channel log time and place of each message, one after the other."""
+        """For each channel, the log time and the offset of each message, alternating."""
 
     def _finish_chunk(self) -> None:
         if not self._messages:
@@ -179,8 +179,8 @@ class McapFile:
 
 
 def _message_index(channel_id: int, entries: list[int]) -> bytes:
-    places = struct.pack(f"<{len(entries)}Q", *entries)
-    return _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(places), channel_id, len(places)) + places
+    packed = struct.pack(f"<{len(entries)}Q", *entries)
+    return _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(packed), channel_id, len(packed)) + packed
 
 
 def _bytes(record: McapRecord) -> bytes:

@@ -1,4 +1,4 @@
-"""Where a record comes from: versions and machine. They are annotations of the record and stay out of its digest."""
+"""The provenance of a record: versions and machine, as annotations that its digest does not cover."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import lavt
 LIBRARIES = ("numpy", "opencv-python-headless", "av", "eclipse-zenoh")
 
 
-@functools.cache  # every run asks, and nothing of it changes
+@functools.cache  # constant, and needed for every run
 def provenance() -> Mapping[str, Mapping[str, str]]:
-    """Give the versions of what computes and the machine that it computes on."""
+    """Return the versions of LAVT and its libraries, and a description of the machine."""
     return {
         "versions": {"lavt": lavt.__version__, **{each: version(each) for each in LIBRARIES}},
         "machine": {

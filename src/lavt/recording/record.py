@@ -1,8 +1,8 @@
-"""Records of a run: one MCAP file a side, everything that went in and out, in the order it happened.
+"""Records of runs: one MCAP file per side with all its inputs and outputs, in the order in which they occurred.
 
-A message's log time is the host's wall clock, its publish time the host's monotonic clock. A step of the wall clock
-must not put messages in another order, so readers go by their order in the file. Formats: MCAP (mcap.dev/spec), JSON
-with JSON Schema; the video is `foxglove.CompressedVideo`, which Foxglove and others play.
+A message's log time is the host's wall clock, its publish time the host's monotonic clock. Readers keep the order of
+the file, so that a step of the wall clock does not reorder messages. Formats: MCAP (mcap.dev/spec), JSON with JSON
+Schema; the video is `foxglove.CompressedVideo`, which Foxglove and others play.
 """
 
 from __future__ import annotations
@@ -18,20 +18,25 @@ from typing import Any, Literal, Protocol
 from pydantic_core import from_json
 
 from lavt.domain import NS_PER_S, Now
-from lavt.errors import WorkError
-from lavt.recording.json_payload import json_schema, writer_of
-from lavt.recording.mcap_reader import Messages, read_mcap
+from lavt.errors import UserError, WorkError
+from lavt.recording.json_payload import json_schema, serializer_of
+from lavt.recording.mcap_reader import McapContent, Messages, read_mcap
 from lavt.recording.mcap_writer import McapFile
 from lavt.recording.table import EMPTY, Table, table_of
 
-CHUNK_BYTES = 64 * 1024
-"""What a crash can cost at most: only whole chunks can be read again."""
+FORMAT_VERSION = 2
+"""The version of the channels and their fields, in the metadata `format`. Records of version 1 do not name theirs."""
 
-KEPT_MESSAGES = 64
-"""And so many before them, a tenth of a second of a drive."""
+CHUNK_BYTES = 64 * 1024
+"""A crash loses at most one unfinished chunk: only whole chunks can be read again."""
+
+BUFFERED_MESSAGES = 64
+"""A crash also loses at most these messages, which are not in a chunk yet: a tenth of a second of a drive."""
 
 VIDEO = "video"
 """The channel of access units; its payload has `stamp_ns` and `data`."""
+
+_FORMAT = "format"
 
 _VIDEO_SCHEMA_NAME = "foxglove.CompressedVideo"
 _VIDEO_SCHEMA = {
@@ -56,7 +61,7 @@ Side = Literal["server", "client"]
 
 
 class Digest(Protocol):
-    """What the writers need of a digest, as in `hashlib`."""
+    """A digest as in `hashlib`, reduced to the method that the writers call."""
 
     def update(self, data: bytes, /) -> None:
         """Add bytes."""
@@ -64,11 +69,11 @@ class Digest(Protocol):
 
 
 class RecordWriter:
-    """Writes the record of one side.
+    """A writer of one side's record.
 
-    `digest`, where there is one, gets every message: side, channel, both times, length and JSON. Both sides of a
-    run in virtual time share one, so it also holds the order between them. What `annotate` writes stays out of it, and
-    so do the channels `left_out`, which are not recorded.
+    `digest`, if given, is updated with every message: side, channel, both times, length and JSON. Both sides of a run
+    in virtual time share one digest, which therefore also covers the order between them. It covers neither annotations
+    nor the channels in `left_out`, which are not recorded.
     """
 
     def __init__(
@@ -78,24 +83,25 @@ class RecordWriter:
         self._left_out = left_out
         self._digest = digest
         self._mcap = McapFile(path, library=f"lavt {side}", chunk_bytes=CHUNK_BYTES)
+        self._mcap.add_metadata(_FORMAT, {"version": str(FORMAT_VERSION)})
         self._channels: dict[str, dict[type, tuple[int, Callable[[Any], bytes]]]] = defaultdict(dict)
-        """For each channel and type of payload its number, and what makes JSON of it."""
+        """For each channel and payload type, its number and its serializer."""
         self._schemas: dict[type, int] = {}
-        self._kept: list[tuple[str, Any, Now]] = []
+        self._buffer: list[tuple[str, Any, Now]] = []
 
     def write(self, channel: str, payload: Any, now: Now) -> None:
-        """Write one message, soon: a dataclass or a dict that nobody changes, on the topic "/" + `channel`.
+        """Buffer one message for the topic "/" + `channel`: a dataclass or a dict that must not change afterwards.
 
-        Raises `TypeError` for values that JSON has no words for, when it comes to them.
+        Raises `TypeError` for values that JSON cannot represent, at the latest in `close`.
         """
-        self._kept.append((channel, payload, now))
-        if len(self._kept) >= KEPT_MESSAGES:
-            self._write_kept()
+        self._buffer.append((channel, payload, now))
+        if len(self._buffer) >= BUFFERED_MESSAGES:
+            self._flush()
 
-    def _write_kept(self) -> None:
-        kept, self._kept = self._kept, []
+    def _flush(self) -> None:
+        buffered, self._buffer = self._buffer, []
         entries = []
-        for channel, payload, now in kept:
+        for channel, payload, now in buffered:
             if channel in self._left_out:
                 continue
             kind = type(payload)
@@ -106,17 +112,17 @@ class RecordWriter:
             self._digest.update(self._side.encode() + written)
 
     def annotate(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write what belongs to this machine and not to the run's result: versions, the machine itself."""
+        """Write metadata that do not belong to the run's result: versions, the machine."""
         self._mcap.add_metadata(name, entries)
 
     def close(self) -> None:
-        """Finish the file; a file without this can still be read, but says that it is not complete."""
+        """Finish the file. Without this call it can still be read, but is not `complete`."""
         if not self._mcap.closed:
-            self._write_kept()
+            self._flush()
             self._mcap.close()
 
     def _register(self, channel: str, payload_type: type) -> tuple[int, Callable[[Any], bytes]]:
-        """Add the channel of a payload type; the second type of a channel becomes a second channel of its topic."""
+        """Add an MCAP channel for a payload type; a second type on one topic gets a second MCAP channel."""
         if channel == VIDEO:
             schema_id = self._mcap.add_schema(_VIDEO_SCHEMA_NAME, "jsonschema", json.dumps(_VIDEO_SCHEMA).encode())
         else:
@@ -126,7 +132,8 @@ class RecordWriter:
                 self._schemas[payload_type] = self._mcap.add_schema(name, "jsonschema", schema)
             schema_id = self._schemas[payload_type]
         channel_id = self._mcap.add_channel("/" + channel, "json", schema_id)
-        self._channels[channel][payload_type] = channel_id, _video_json if channel == VIDEO else writer_of(payload_type)
+        serialize = _video_json if channel == VIDEO else serializer_of(payload_type)
+        self._channels[channel][payload_type] = channel_id, serialize
         if self._digest is not None:
             self._digest.update(f"{self._side} {channel} is {channel_id}\n".encode())
         return self._channels[channel][payload_type]
@@ -138,25 +145,25 @@ def _video_json(payload: Any) -> bytes:
     )
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     text = base64.b64encode(unit).decode("ascii")
-    # Written by hand: base64 needs no escaping, and this is by far the largest message.
+    # Formatted without `json`, as base64 needs no escaping and this is by far the largest message.
     return (
         f'{{"timestamp":{{"sec":{seconds},"nsec":{nanoseconds}}},"frame_id":"camera","data":"{text}","format":"h264"}}'
     ).encode()
 
 
 class _Tables(Mapping[str, Table]):
-    """Tables of a record's channels, each made when it is first asked for: half of them nobody looks at."""
+    """The tables of a record's channels, each parsed on first access: half of them are never read."""
 
     def __init__(self, messages: Mapping[str, Messages]) -> None:
         self._messages = messages
-        self._made: dict[str, Table] = {}
+        self._parsed: dict[str, Table] = {}
 
     def __getitem__(self, channel: str) -> Table:
-        if channel not in self._made:
+        if channel not in self._parsed:
             messages = self._messages[channel]
             rows = from_json(b"[" + b",".join(messages.data) + b"]")
-            self._made[channel] = table_of(rows, messages.publish_ns, messages.log_ns)
-        return self._made[channel]
+            self._parsed[channel] = table_of(rows, messages.publish_ns, messages.log_ns)
+        return self._parsed[channel]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._messages)
@@ -167,10 +174,10 @@ class _Tables(Mapping[str, Table]):
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One side's record, read back.
+    """One side's record, read from its file.
 
-    `complete` is False for a file that was never finished, or is damaged: then it holds what came before. `last_ns` is
-    when the last message was recorded, on the host's monotonic clock; 0 of nothing.
+    `complete` is False for an unfinished or damaged file, of which only the intact beginning is read. `last_ns` is the
+    time of the last message on the host's monotonic clock, or 0 without messages.
     """
 
     path: Path
@@ -180,11 +187,11 @@ class Record:
     last_ns: int
 
     def table(self, channel: str) -> Table:
-        """Give the messages of a channel; no rows where nothing was recorded."""
+        """Return the messages of a channel; the table is empty where none were recorded."""
         return self.tables.get(channel, EMPTY)
 
     def video(self) -> list[tuple[int, bytes]]:
-        """Read the access units and the stamp (ns) of each from the file; they are too large to be kept."""
+        """Read the stamp (ns) and the data of each access unit from the file; they are too large to keep in memory."""
         units = []
         for data in read_mcap(self.path, lambda topic: topic == "/" + VIDEO).topics.get("/" + VIDEO, Messages()).data:
             fields = from_json(data)
@@ -194,9 +201,10 @@ class Record:
 
 
 def read_record(path: Path, channels: Container[str] | None = None) -> Record:
-    """Read the record at `path` into tables, without the video; `channels` names the only ones wanted.
+    """Read the record at `path` into tables, without the video; `channels`, if given, limits the channels.
 
-    An unfinished file (a crash, a full disk) gives all its whole chunks. Raises `WorkError` where there is no file.
+    All whole chunks of an unfinished file (a crash, a full disk) are read. Raises `WorkError` where there is no file,
+    and `UserError` for a record in another format version.
     """
     if not path.is_file():
         raise WorkError(f"there is no record at {path}")
@@ -206,6 +214,22 @@ def read_record(path: Path, channels: Container[str] | None = None) -> Record:
         return channel != VIDEO and (channels is None or channel in channels)
 
     content = read_mcap(path, wanted)
+    _check_version(path, content)
     messages = {topic.removeprefix("/"): each for topic, each in content.topics.items() if each.data}
     last_ns = max((max(each.publish_ns) for each in messages.values()), default=0)
     return Record(path, content.complete, _Tables(messages), content.metadata, last_ns)
+
+
+def _check_version(path: Path, content: McapContent) -> None:
+    """Raise `UserError` for a record in another format version than `FORMAT_VERSION`.
+
+    The version is the file's first entry: only a file that was cut before any message lacks it, and is read as empty.
+    """
+    version = content.metadata.get(_FORMAT, {}).get("version")
+    if version is None and not content.complete and not content.topics:
+        return
+    if version != str(FORMAT_VERSION):
+        raise UserError(
+            f"{path} is a record in format version {version or 1}, and only version {FORMAT_VERSION} can be read: "
+            "read it with the LAVT version that wrote it, or repeat the run"
+        )

@@ -16,7 +16,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 MISSING = int(np.iinfo(np.int64).min)
-"""Null in a column of whole numbers. A float could not hold wall times: beyond 2^60 it counts in steps of 256 ns."""
+"""Null in a column of integers. A float column would have a resolution of 256 ns only for wall times (over 2^60 ns)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +24,8 @@ class Table:
     """Messages of one channel, in the order they were recorded.
 
     `columns` has an array per field of the payload: int64 (null is `MISSING`), float64 (null is NaN), bool, or objects.
-    `mono_ns` and `wall_ns` say when each message was recorded, on the host that recorded it; a payload's own field of
-    that name is in `columns`.
+    `mono_ns` and `wall_ns` are the times of recording on the recording host's clocks; payload fields of these names
+    are in `columns`.
     """
 
     mono_ns: IntArray
@@ -36,14 +36,14 @@ class Table:
         return len(self.mono_ns)
 
     def ints(self, name: str) -> IntArray:
-        """Column of whole numbers; `MISSING` where there is none, or no such column."""
+        """Return a column of integers: `MISSING` for null and for a missing column."""
         column = self.columns.get(name)
         if column is None or column.dtype != np.int64:
             return _ints_of(column, len(self))
         return column
 
     def floats(self, name: str) -> FloatArray:
-        """Column of numbers; NaN where there is none, or no such column."""
+        """Return a column of numbers: NaN for null and for a missing column."""
         column = self.columns.get(name)
         if column is None:
             return np.full(len(self), np.nan)
@@ -54,34 +54,34 @@ class Table:
         return column.astype(np.float64)
 
     def flags(self, name: str) -> BoolArray:
-        """Column of truth values; False where there is none, or no such column."""
+        """Return a column of booleans: False for null and for a missing column."""
         column = self.columns.get(name)
         if column is None:
             return np.zeros(len(self), np.bool_)
         return np.array([value is True or value is np.True_ for value in column], np.bool_)
 
     def texts(self, name: str) -> list[str]:
-        """Column of texts; empty where there is none, or no such column."""
+        """Return a column of texts: "" for null and for a missing column."""
         column = self.columns.get(name)
         if column is None:
             return [""] * len(self)
         values = column.tolist()
-        if set(map(type, values)) <= {str}:  # as nearly always, in a tenth of the time
+        if set(map(type, values)) <= {str}:  # nearly always, and ten times as fast
             return list(values)
         return [value if isinstance(value, str) else "" for value in values]
 
     def objects(self, name: str) -> list[Any]:
-        """Column as plain Python values; None where there is none, or no such column."""
+        """Return a column as plain Python values: None for null and for a missing column."""
         column = self.columns.get(name)
         if column is None:
             return [None] * len(self)
         values = column.tolist()
-        if set(map(type, values)) <= {str, list, type(None)}:  # of which none but None is null
+        if set(map(type, values)) <= {str, list, type(None)}:  # no null other than None
             return list(values)
         return [None if _is_null(value) else value for value in values]
 
-    def where(self, chosen: BoolArray) -> Table:
-        """Choose the rows for which `chosen` is true."""
+    def where(self, chosen: BoolArray | IntArray) -> Table:
+        """Return the rows for which `chosen` is true, or those with the indexes `chosen` in that order."""
         return Table(
             self.mono_ns[chosen], self.wall_ns[chosen], _Columns(self.columns, lambda name: self.columns[name][chosen])
         )
@@ -107,41 +107,41 @@ EMPTY = Table(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], mono_ns: Sequence[int], wall_ns: Sequence[int]) -> Table:
-    """Make columns of `rows`; a field that a row lacks is null there."""
+    """Return a table of `rows`; a field that a row lacks is null there."""
     names = dict.fromkeys(name for fields in {tuple(row): None for row in rows} for name in fields)
     columns = _Columns(names, lambda name: _column([row.get(name) for row in rows]))
     return Table(np.array(mono_ns, np.int64), np.array(wall_ns, np.int64), columns)
 
 
 class _Columns(Mapping[str, NDArray[Any]]):
-    """Columns that are each made when they are first asked for: of most channels a few are ever looked at."""
+    """Columns that are each built on first access: of most channels only a few are ever read."""
 
-    def __init__(self, names: Iterable[str], make: Callable[[str], NDArray[Any]]) -> None:
-        self._made: dict[str, NDArray[Any] | None] = dict.fromkeys(names)
-        self._make = make
+    def __init__(self, names: Iterable[str], build: Callable[[str], NDArray[Any]]) -> None:
+        self._columns: dict[str, NDArray[Any] | None] = dict.fromkeys(names)
+        self._build = build
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        column = self._made[name]
+        column = self._columns[name]
         if column is None:
-            column = self._made[name] = self._make(name)
+            column = self._columns[name] = self._build(name)
         return column
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._made)
+        return iter(self._columns)
 
     def __len__(self) -> int:
-        return len(self._made)
+        return len(self._columns)
 
 
 def _column(values: list[Any]) -> NDArray[Any]:
     kinds = set(map(type, values))
-    nothing = type(None) in kinds
+    has_null = type(None) in kinds
     kinds.discard(type(None))
-    if kinds == {bool} and not nothing:
+    if kinds == {bool} and not has_null:
         return np.array(values, np.bool_)
     if kinds == {int} and max(abs(value) for value in values if value is not None) <= -(MISSING + 1):
-        return np.array([MISSING if value is None else value for value in values] if nothing else values, np.int64)
-    if kinds <= {int, float} and kinds != {int}:  # whole numbers too large for 64 bits stay what they are
+        return np.array([MISSING if value is None else value for value in values] if has_null else values, np.int64)
+    if kinds <= {int, float} and kinds != {int}:  # integers that need more than 64 bits remain objects
         return np.array(values, np.float64)
     column = np.empty(len(values), object)
     column[:] = values

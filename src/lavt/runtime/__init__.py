@@ -1,1 +1,1 @@
-"""What drives the nodes: the machine's time, or a virtual one."""
+"""The runtimes that run the nodes, in real or in virtual time."""

@@ -1,4 +1,4 @@
-"""What waits for a busy node: packets queue, of pictures and states only the newest stays; what is lost is counted."""
+"""The inbox of a node: bounded queues, and the newest message only for pictures and states; losses are counted."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from lavt.node import Message
 
 
 class Inbox:
-    """Messages in the order in which a node shall see them: all that queues first, then the newest of the rest.
+    """The waiting messages of a node: queued messages come first, in order of arrival, then the newest of the others.
 
-    Each channel has a queue of its own length, so that a flood on one loses nothing of another.
+    Each channel has its own queue length, so that a flood on one channel loses no message of another.
     """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.waiting = 0
-        """How many messages wait."""
+        """Number of waiting messages."""
         self._number = 0
         self._queues: defaultdict[str, deque[tuple[int, Message]]] = defaultdict(deque)
         self._newest: dict[str, Message] = {}
 
     def is_empty(self) -> bool:
-        """Whether no message waits."""
+        """Return whether no message waits."""
         return self.waiting == 0
 
     def put(self, message: Message) -> None:
-        """Let a message wait."""
+        """Add a message."""
         row = CHANNELS[message.channel]
         if row.waiting == "newest":
             if message.channel in self._newest:
@@ -46,7 +46,7 @@ class Inbox:
         queue.append((self._number, message))
 
     def take(self) -> Message | None:
-        """Take the next message; None when nothing waits."""
+        """Remove and return the next message; None: no message waits."""
         if not self.waiting:
             return None
         self.waiting -= 1
@@ -59,12 +59,12 @@ class Inbox:
         return self._newest.pop(next(iter(self._newest)))
 
     def take_arrived(self, until_ns: int) -> Message | None:
-        """Take a message that had arrived by a time of the monotonic clock.
+        """Remove and return a queued message of an inline channel that arrived by `until_ns` (monotonic), or None.
 
-        Only of a channel that queues and is walked at once: where only the newest counts a wake does not wait for it.
+        A wake does not wait for channels of which only the newest message counts.
         """
         for channel, queue in self._queues.items():
-            if CHANNELS[channel].at_once and queue and queue[0][1].arrived.mono_ns <= until_ns:
+            if CHANNELS[channel].inline and queue and queue[0][1].arrived.mono_ns <= until_ns:
                 self.waiting -= 1
                 return queue.popleft()[1]
         return None

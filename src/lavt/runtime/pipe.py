@@ -1,4 +1,4 @@
-"""One end of a pipe between two processes of this machine, for threads that must not wait."""
+"""One end of a pipe between two processes of this machine, whose senders never block."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from queue import SimpleQueue
 from typing import Any, Final
 
 CAPACITY: Final = 8192
-"""Entries that wait while the other process does not read: some ten seconds of a drive."""
+"""Entries that are queued while the other process does not read: some ten seconds of a drive."""
 
 CLOSE_S: Final = 1.0
 
@@ -22,35 +22,35 @@ log = logging.getLogger(__name__)
 
 
 class Pipe:
-    """Sends entries, any picklable objects, in order, and hands what comes to `take` in a thread of its own.
+    """A pipe end that sends any picklable entries in order, and calls `receive` for each entry in its own thread.
 
-    Nobody waits for the other process: what does not fit is dropped and counted. `gone` is called once, when the other
-    end is closed or its process has ended, or when an entry could not be sent or taken: half a pipe is none. Both ends
-    are processes of one program, which trust each other.
+    `send` never waits for the other process: entries that do not fit are dropped and counted. `on_closed` is called
+    once: when the other end is closed, its process has ended, or an entry could not be sent or received. An error in
+    one direction closes both. The processes belong to one program and trust each other.
     """
 
-    def __init__(self, connection: Connection, take: Callable[[Any], None], gone: Callable[[], None]) -> None:
+    def __init__(self, connection: Connection, receive: Callable[[Any], None], on_closed: Callable[[], None]) -> None:
         self.dropped = 0
         self._connection = connection
-        self._take, self._gone = take, gone
+        self._receive, self._on_closed = receive, on_closed
         self._entries: SimpleQueue[Any] = SimpleQueue()
         self._writer = threading.Thread(target=self._write, name="pipe writer", daemon=True)
         self._reader = threading.Thread(target=self._read, name="pipe reader", daemon=True)
 
     def start(self) -> None:
-        """Begin to send and to take."""
+        """Start to send and to receive."""
         self._writer.start()
         self._reader.start()
 
     def send(self, entry: Any) -> None:
-        """Send an entry as soon as may be."""
+        """Queue an entry to be sent; drop it if the queue is full."""
         if self._entries.qsize() < CAPACITY:
             self._entries.put(entry)
         else:
             self.dropped += 1
 
     def close(self, wait_s: float) -> None:
-        """Send what waits, for so long at most, and close; once more does nothing."""
+        """Send the queued entries within `wait_s`, and close; a second call does nothing."""
         if self._connection.closed:
             return
         self._entries.put(None)
@@ -60,34 +60,34 @@ class Pipe:
             self._join(thread, CLOSE_S)
         self._connection.close()
 
-    def wait_gone(self, wait_s: float) -> None:
-        """Wait until the other end is closed and all that came was taken, for so long at most."""
+    def wait_closed(self, wait_s: float) -> None:
+        """Wait for at most `wait_s` until the other end is closed and all its entries were received."""
         self._join(self._reader, wait_s)
 
     @staticmethod
     def _join(thread: threading.Thread, wait_s: float) -> None:
-        """Wait for a thread, if it was started."""
+        """Join a thread, if it was started."""
         if thread.ident is not None:
             thread.join(wait_s)
 
     def _shut(self) -> None:
-        """End what the threads wait for, here and there."""
+        """Shut the connection down, which ends the reads at both ends."""
         with socket.socket(fileno=os.dup(self._connection.fileno())) as end, suppress(OSError):
             end.shutdown(socket.SHUT_RDWR)
 
     def _write(self) -> None:
-        ends = False
-        while not ends:
+        is_last = False
+        while not is_last:
             entries = [self._entries.get()]
             while not self._entries.empty():
                 entries.append(self._entries.get())
-            ends = None in entries
+            is_last = None in entries
             try:
                 self._connection.send_bytes(pickle.dumps([each for each in entries if each is not None]))
             except (OSError, ValueError):  # the other process has ended, or this end was closed
                 return
-            except Exception as error:  # of an entry that cannot be pickled
-                log.critical("a pipe cannot be written to: %s", error, exc_info=error)
+            except Exception as error:  # an entry cannot be pickled
+                log.critical("cannot write to a pipe: %s", error, exc_info=error)
                 self._shut()
                 return
 
@@ -95,9 +95,9 @@ class Pipe:
         try:
             while True:
                 for entry in pickle.loads(self._connection.recv_bytes()):  # noqa: S301 (our own process wrote it)
-                    self._take(entry)
+                    self._receive(entry)
         except (EOFError, OSError, ValueError):
             pass
-        except Exception as error:  # of an entry that cannot be read or taken: nobody would hear the next one
-            log.critical("a pipe cannot be read: %s", error, exc_info=error)
-        self._gone()
+        except Exception as error:  # an entry cannot be read or processed: the pipe ends
+            log.critical("cannot read from a pipe: %s", error, exc_info=error)
+        self._on_closed()

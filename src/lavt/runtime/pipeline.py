@@ -1,19 +1,19 @@
-"""Walking a message through a node's hops, each with its own `now`, and writing down when each was done."""
+"""Runs a message through the stages of a pipeline, each with its own `now`, and records the time of each."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 from lavt.domain import Now
-from lavt.node import Hop, Message, Send
+from lavt.node import Message, Send, Stage
 from lavt.value import value
 
 
 @value
 class Timeline:
-    """When each hop of a chain was done, on the host's monotonic clock.
+    """The end times of the stages of a pipeline, on the host's monotonic clock.
 
-    The first entry is "wait": when the first hop began; `arrived_mono_ns` is when the message came.
+    The first entry is "wait", which ends when the first stage begins; `arrived_mono_ns` is the message's arrival.
     """
 
     node: str
@@ -25,17 +25,17 @@ class Timeline:
 
 @value
 class PipelineResult:
-    """What came of a message: what to send, when the node was done, and the timeline where there is a stamp."""
+    """The result of a pipeline run: the sends, the end time, and the timeline if a value had a stamp."""
 
     sends: list[Send]
     end: Now
     timeline: Timeline | None
     called: int
-    """How many hops were called."""
+    """Number of stages that were called."""
 
 
-def walk(node: str, stages: Sequence[Hop], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
-    """Call hop after hop; `ends`, asked after each, gives the time when it was done."""
+def run_stages(node: str, stages: Sequence[Stage], message: Message, start: Now, ends: Iterator[Now]) -> PipelineResult:
+    """Run a message through the stages; `ends` yields the end time of each stage."""
     value: object = message
     now = start
     stamp_ns: int | None = None

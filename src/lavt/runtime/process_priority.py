@@ -1,4 +1,4 @@
-"""Precedence of LAVT's processes over other programs, where the system allows it (as root)."""
+"""Process priority of LAVT's processes, raised if the system allows it (as root)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from contextlib import suppress
 from typing import Final
 
 NICENESS: Final = -10
-"""Of 20 below the ordinary: enough to go first, not enough to starve the system."""
-OF_THE_CAR: Final = -15
-"""Of the actuator's process, which goes before the server's own, and of a software car, which is not the server's."""
+"""Default priority: before ordinary programs, without starving the system (0 is normal, -20 the highest)."""
+VEHICLE_NICENESS: Final = -15
+"""Priority of the actuator's process, above that of the server, and of a software car."""
 
 
-def take(niceness: int = NICENESS) -> None:
-    """Ask for more of the processor than ordinary programs get; without the right to it, nothing changes.
+def raise_priority(niceness: int = NICENESS) -> None:
+    """Raise the priority of this process; without permission, do nothing.
 
-    Whatever else the machine does must not show as latency. Threads begun later have it too.
+    Other load on the machine must not show as latency. Threads started later inherit the priority.
     """
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, niceness)

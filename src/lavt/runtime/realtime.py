@@ -1,4 +1,4 @@
-"""Real time: sockets, Zenoh, a thread and an inbox for each node, the machine's clocks."""
+"""The real-time runtime: sockets, Zenoh, one thread and inbox for each node, the machine's clocks."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
+from lavt.runtime.pipeline import run_stages
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.wakeup import WakeEvent
 from lavt.transport.clock_sync.clock_report import ClockReport
 
 SWITCH_INTERVAL_S = 0.0005
-"""Python's default of 5 ms lets one busy thread hold up every other for that long."""
+"""With Python's default of 5 ms, one busy thread delays every other thread for that long."""
 
 log = logging.getLogger(__name__)
 
 
 class MessageLink(Protocol):
-    """What carries messages to the other side."""
+    """A carrier of messages to the other side."""
 
     def send(self, *sends: Send) -> None:
-        """Carry messages, in order; never waits, never raises for what the network does."""
+        """Send messages in order, without blocking and without raising network errors."""
         ...
 
 
 class Receiver(Protocol):
-    """Who takes messages for a node."""
+    """A receiver of a node's messages."""
 
     def put(self, message: Message) -> None:
-        """Take a message; never waits."""
+        """Accept a message without blocking."""
         ...
 
 
 class RealRuntime:
-    """Drives the nodes of one side by the machine's clocks.
+    """A runtime that runs the nodes of one side on the machine's clocks.
 
-    `links` carries what crosses the network, by carrier; `recorder` gets messages as they are, and must not wait. A
-    node that fails ends the run: `failed` says why. `elsewhere` takes messages for nodes in other processes.
+    `links` has the link of each network carrier. `recorder` gets messages undecoded and must not block. A node that
+    fails ends the run; `failed` is the error. `remote_receivers` are the receivers of nodes in other processes.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class RealRuntime:
         nodes: Sequence[Node],
         recorder: Recorder,
         clock_source: Callable[[], ClockReport | None],
-        elsewhere: Mapping[str, Receiver] = MappingProxyType({}),
+        remote_receivers: Mapping[str, Receiver] = MappingProxyType({}),
     ) -> None:
         self.links: dict[str, MessageLink] = {}
         self.failed: BaseException | None = None
@@ -65,19 +65,19 @@ class RealRuntime:
         self._recorder = recorder
         self._clock_source = clock_source
         self._workers = {node.name: _Worker(self, node) for node in nodes}
-        self._receivers: dict[str, Receiver] = {**elsewhere, **self._workers}
+        self._receivers: dict[str, Receiver] = {**remote_receivers, **self._workers}
 
     def start(self, links: Mapping[str, MessageLink]) -> None:
-        """Begin: from here on nodes are woken and messages delivered."""
+        """Start to wake nodes and to deliver messages."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.collect()
-        gc.freeze()  # what exists by now stays: a full collection over it would be a hitch
+        gc.freeze()  # a full collection over the objects that exist by now would stall the nodes
         self.links.update(links)
         for worker in self._workers.values():
             worker.thread.start()
 
     def stop(self) -> None:
-        """End all threads and write the counters down."""
+        """Stop all threads and record the counts."""
         self.stopped.set()
         for worker in self._workers.values():
             worker.notify()
@@ -90,45 +90,45 @@ class RealRuntime:
             self._recorder.write("counts", {"node": worker.node.name, **counts}, now)
 
     def deliver(self, channel: str, payload: Any, arrived: Now, peer: Peer = None) -> None:
-        """Let a message wait for its receivers; links call this, from threads of their own."""
+        """Deliver a message to its receivers, and record it if it is not local; links call this from their threads."""
         if CHANNELS[channel].carrier != "local":
             self._recorder.write(channel, payload, arrived)
         self.put(Message(channel, payload, arrived, peer))
 
     def put(self, message: Message) -> None:
-        """Let a message wait for its receivers, and write nothing down."""
+        """Deliver a message to its receivers without recording it."""
         for receiver in CHANNELS[message.channel].receivers:
             self._receivers[receiver].put(message)
 
     def record(self, topic: str, payload: Any, now: Now) -> None:
-        """Write down what happened in another process."""
+        """Record an entry of another process."""
         self._recorder.write(topic, payload, now)
 
     def carry(self, carrier: Carrier, sends: Sequence[Send]) -> None:
-        """Send what another process has written down."""
+        """Send messages that another process has recorded already."""
         self.links[carrier].send(*sends)
 
     def fail(self, error: BaseException) -> None:
-        """A thread ended with an error: so does the run."""
+        """End the run because of an error; the first error counts."""
         log.critical("%s: %s", type(error).__name__, error, exc_info=error)
-        self.failed = self.failed or error  # what comes after is of the first
+        self.failed = self.failed or error  # later errors follow from the first
         self.stopped.set()
 
     def run_pipeline(self, node: Node, message: Message) -> None:
-        """Walk a message through its hops and send what comes out."""
+        """Run a message through its pipeline and send the result."""
         readings = iter(self._clock.now, None)
-        outcome = walk(node.name, node.chains[message.channel], message, next(readings), readings)
+        outcome = run_stages(node.name, node.pipelines[message.channel], message, next(readings), readings)
         for carrier, sends in groupby(outcome.sends, lambda send: CHANNELS[send.channel].carrier):
             self._send(carrier, tuple(sends))
         if outcome.timeline is not None:
             self._recorder.write("timeline", outcome.timeline, outcome.end)
 
     def now(self) -> Now:
-        """Read the clocks."""
+        """Return a reading of the clocks."""
         return self._clock.now()
 
     def _send(self, carrier: Carrier, sends: Sequence[Send]) -> None:
-        """Send what goes the same way: the packets of a frame leave one right after the other."""
+        """Send and record messages of one carrier; the packets of a frame leave without a gap."""
         now = self._clock.now()
         if carrier == "local":
             for send in sends:
@@ -141,17 +141,17 @@ class RealRuntime:
             self._recorder.write(send.channel, send.payload, now)
 
     def _report_clock(self) -> None:
-        """Asking chrony takes a process of its own and some milliseconds: no node waits for it."""
+        """Query the clock source in this thread, because a query of chrony takes a process and some milliseconds."""
         report = self._clock_source()
         if report is not None:
             self.deliver("clock_report", report, self._clock.now())
 
 
 class _Worker:
-    """A node's thread: wakes it when it asked, hands it what waits, sleeps in between.
+    """The thread of a node, which runs its wakes and waiting messages and sleeps in between.
 
-    What is to be walked at once is walked by whoever brings it, unless the node is busy: no thread has to wake up for
-    it. Who walks has the turn.
+    Messages of inline channels run in the thread that delivers them, unless the node is busy, so that no thread has to
+    wake up. `_lock` is held by the thread that runs the node.
     """
 
     def __init__(self, runtime: RealRuntime, node: Node) -> None:
@@ -159,79 +159,74 @@ class _Worker:
         self.inbox = Inbox()
         self.thread = threading.Thread(target=self._work, name=node.name, daemon=True)
         self._runtime = runtime
-        self._turn = threading.Lock()
-        self._inbox_turn = threading.Lock()
-        self._bell = WakeEvent()
+        self._lock = threading.Lock()
+        self._inbox_lock = threading.Lock()
+        self._wake_event = WakeEvent()
         self._wake_ns: int | None = 0
-        """When the node wants to be woken, as it said when it was walked last; written by who has the turn."""
+        """`next_wake_ns` of the node after its last run; written under `_lock`."""
         self._sleeps_until_ns: int | None = 0
-        """When the thread wakes by itself; None: only when the bell rings; 0: it is awake."""
+        """When the thread wakes by itself; None: by `_wake_event` only; 0: it is awake."""
 
     def put(self, message: Message) -> None:
-        if CHANNELS[message.channel].at_once and self.inbox.is_empty() and self._turn.acquire(blocking=False):
+        if CHANNELS[message.channel].inline and self.inbox.is_empty() and self._lock.acquire(blocking=False):
             try:
-                self._walk(message)
+                self._run(message)
             finally:
-                self._turn.release()
+                self._lock.release()
             if self.inbox.is_empty() and not _is_before(self._wake_ns, self._sleeps_until_ns):
                 return
         else:
-            with self._inbox_turn:
+            with self._inbox_lock:
                 self.inbox.put(message)
         self.notify()
 
     def notify(self) -> None:
-        self._bell.ring()
+        self._wake_event.set()
 
     def _work(self) -> None:
         try:
             while not self._runtime.stopped.is_set():
-                with self._turn:
-                    outcome = self._walk_next()
-                if not outcome:
+                with self._lock:
+                    message = self._next_message()
+                    if message is not None:
+                        self._run(message)
+                if message is None:
                     self._sleep()
-        except BaseException as error:  # as in `_walk`
+        except BaseException as error:  # as in `_run`
             self._runtime.fail(error)
 
-    def _walk_next(self) -> bool:
-        """Walk what comes next through the node; False where nothing does. Needs the turn."""
-        message = self._next()
-        if message is not None:
-            self._walk(message)
-        return message is not None
-
-    def _walk(self, message: Message) -> None:
-        """Walk a message through the node. Needs the turn."""
+    def _run(self, message: Message) -> None:
+        """Run a message through the node; the caller holds `_lock`."""
         if self._runtime.stopped.is_set():
             return
         try:
             self._runtime.run_pipeline(self.node, message)
             self._wake_ns = self.node.next_wake_ns()
-        except BaseException as error:  # whatever ends a node must end the run, not leave half of it alive
+        except BaseException as error:  # any error of a node must end the run, not a part of it
             self._runtime.fail(error)
 
-    def _next(self) -> Message | None:
-        """What the node does next: a wake that is due, but before it what had arrived by then; else what waits."""
+    def _next_message(self) -> Message | None:
+        """Return a due wake, or before it an inline message that arrived by then; else the next waiting message."""
         self._wake_ns = wake_ns = self.node.next_wake_ns()
         if wake_ns is not None:
             now = self._runtime.now()
             if wake_ns <= now.mono_ns:
-                with self._inbox_turn:
+                with self._inbox_lock:
                     return self.inbox.take_arrived(wake_ns) or Message(WAKE, None, now)
-        with self._inbox_turn:
+        with self._inbox_lock:
             return self.inbox.take()
 
     def _sleep(self) -> None:
-        """Sleep until the node wants to be woken, or somebody says that there is something to do."""
-        self._bell.silence()
-        self._sleeps_until_ns = None  # from here on the bell is rung for whatever comes
+        """Sleep until the node's wake is due or a message arrives."""
+        self._wake_event.clear()
+        self._sleeps_until_ns = None  # from here on every message sets the event
         if self.inbox.is_empty() and not self._runtime.stopped.is_set():
             self._sleeps_until_ns = wake_ns = self._wake_ns
             pause_s = None if wake_ns is None else (wake_ns - self._runtime.now().mono_ns) / NS_PER_S
-            self._bell.wait(pause_s)
+            self._wake_event.wait(pause_s)
         self._sleeps_until_ns = 0
 
 
 def _is_before(one_ns: int | None, other_ns: int | None) -> bool:
-    """Compare two times, of which None is never."""
+    """Return whether a time is before another; None means never."""
     return one_ns is not None and (other_ns is None or one_ns < other_ns)

@@ -1,4 +1,4 @@
-"""What of the messages in and out goes into the record, and the queue in front of it."""
+"""Recording of messages: the recorded form of each, and a queue in front of the recorder."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lavt.value import value
 
 log = logging.getLogger(__name__)
 
-LOOK_PERIOD_S = 0.02
+POLL_PERIOD_S = 0.02
 
 
 class Recorder(Protocol):
-    """Something that keeps a record."""
+    """A destination of record entries."""
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
         """Write one entry."""
@@ -38,14 +38,14 @@ def _decoded(kind: type[Any]) -> Callable[[bytes], object]:
 
 
 def _without_token(data: bytes) -> object:
-    """The token opens the path of the video; it is not for the record."""
+    """Return a session reply without its token, which is a secret: it validates the video path."""
     reply = _decoded(SessionReply)(data)
     return replace(reply, token=b"") if isinstance(reply, SessionReply) else reply
 
 
 @value
 class Packet:
-    """A datagram of the video; sequence and timestamp where it is RTP (RFC 3550, section 5.1)."""
+    """A datagram of the video; sequence and timestamp only if it is RTP (RFC 3550, section 5.1)."""
 
     sequence: int | None
     timestamp: int | None
@@ -62,7 +62,7 @@ def _size(data: bytes) -> object:
     return {"size_bytes": len(data)}
 
 
-WIRE: dict[str, Callable[[bytes], object]] = {
+WIRE_DECODERS: dict[str, Callable[[bytes], object]] = {
     "rtp": _packet,
     "feedback": _size,
     "control": _decoded(Command),
@@ -72,42 +72,55 @@ WIRE: dict[str, Callable[[bytes], object]] = {
     "netem": _decoded(NetemRequest),
     "netem_reply": _decoded(NetemReply),
 }
-"""How the bytes of a channel that crosses the network are written down."""
+"""The function that decodes the bytes of each network channel for the record."""
 
 UNRECORDED = frozenset(
     {
-        "pose", "view", "video_token", "path_token", "access_unit", "picture_lost", "rest", "condition_in_force",
-        "server_ends", "clock_query", "clock_report", "probe_request", "probe_reply", "inject", "injected",
+        "pose",
+        "view",
+        "video_token",
+        "path_token",
+        "access_unit",
+        "picture_lost",
+        "rest",
+        "condition_in_force",
+        "server_ends",
+        "clock_query",
+        "clock_report",
+        "probe_request",
+        "probe_reply",
+        "inject",
+        "injected",
     }
-)  # fmt: skip
-"""Written down elsewhere (the truth, the pictures' units, samples of clocks and queues, exchanges), or secret."""
+)
+"""Channels whose content is recorded in another form (truth, video units, clock and queue samples), or secret."""
 
 
 def record(recorder: Recorder, channel: str, payload: Any, now: Now) -> None:
-    """Write down a message, if it belongs into the record."""
+    """Record a message, unless its channel is not recorded."""
     if channel not in UNRECORDED:
-        recorder.write(channel, as_written(channel, payload), now)
+        recorder.write(channel, decode_for_record(channel, payload), now)
 
 
-def as_written(channel: str, payload: Any) -> Any:
-    """Give a message as it is written down: what is bytes on the network in fields."""
-    read = WIRE.get(channel)
-    return payload if read is None else read(payload)
+def decode_for_record(channel: str, payload: Any) -> Any:
+    """Return the recorded form of a message: the bytes of a network channel are decoded to fields."""
+    decoder = WIRE_DECODERS.get(channel)
+    return payload if decoder is None else decoder(payload)
 
 
 class QueuedRecorder:
-    """A recorder behind a bounded queue and a thread of its own, so that no node ever waits for a disk.
+    """A recorder with a bounded queue and its own thread, so that no node waits for a disk.
 
-    Bytes of the network are taken apart in that thread too: the threads that receive them have better to do. It looks
-    into the queue from time to time and is never woken: a thousand times a second would cost more than the writing.
+    The thread also decodes network bytes, which relieves the receiving threads. It polls the queue: waking it a
+    thousand times a second would cost more than the writing.
 
-    What does not fit, or cannot be written, is counted in `overflow`; a run with an overflow is invalid.
+    Entries that do not fit or cannot be written are counted in `overflow`; a run with an overflow is invalid.
     """
 
     def __init__(self, recorder: Recorder, capacity: int = 8192) -> None:
         self.overflow = 0
         self.failed = False
-        """Whether the record has ended because it could not be written."""
+        """The record has ended, because it could not be written."""
         self._recorder = recorder
         self._capacity = capacity
         self._queue: deque[tuple[str, Any, Now]] = deque()
@@ -116,7 +129,7 @@ class QueuedRecorder:
         self._thread.start()
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Queue one entry, or count it as lost."""
+        """Queue one entry; count it as lost if the queue is full."""
         if topic in UNRECORDED:
             return
         if len(self._queue) < self._capacity:
@@ -125,16 +138,16 @@ class QueuedRecorder:
             self.overflow += 1
 
     def close(self, now: Now) -> None:
-        """Write what is queued, and how much was lost."""
+        """Write the queued entries and the number of lost ones."""
         self._closed.set()
         self._thread.join()
         if not self.failed:
             self._recorder.write("counts", Counter(record_overflow=self.overflow), now)
 
     def _drain(self) -> None:
-        last = False
-        while not last:
-            last = self._closed.wait(LOOK_PERIOD_S)
+        is_last = False
+        while not is_last:
+            is_last = self._closed.wait(POLL_PERIOD_S)
             while self._queue:
                 self._write(*self._queue.popleft())
 
@@ -143,8 +156,8 @@ class QueuedRecorder:
             self.overflow += 1
             return
         try:
-            self._recorder.write(topic, as_written(topic, payload), now)
-        except Exception as error:  # a full disk, or whatever it is, ends the record and not the drive
-            log.error("the record ends here, it cannot be written: %s", error)
+            self._recorder.write(topic, decode_for_record(topic, payload), now)
+        except Exception as error:  # a full disk or any other error ends the record, not the drive
+            log.error("the record ends here, because it cannot be written: %s", error)
             self.failed = True
             self.overflow += 1

@@ -1,7 +1,7 @@
-"""A node in a process of its own: both ends of what goes between its runtime and that of the other nodes of its side.
+"""A node in its own process: both ends of the connection to the runtime with the other nodes of its side.
 
-The node's own process walks its chains, and tells what came of them; links, record and the other nodes are the other
-process'. The clocks are the same: it is one machine.
+The node's process runs its pipelines and reports the results. The other process has the links, the record and the other
+nodes. Both use the same clocks, since they run on one machine.
 """
 
 from __future__ import annotations
@@ -20,139 +20,146 @@ from lavt.runtime.pipe import Pipe
 from lavt.runtime.realtime import MessageLink, RealRuntime
 
 LATE_NS: Final = 60 * NS_PER_MS
-"""A command that took longer from process to process is not obeyed: one of the two did not run meanwhile."""
-PEERS_KEPT: Final = 64
+"""A command that took longer between the processes is dropped, because one of them did not run meanwhile."""
+MAX_PENDING_PEERS: Final = 64
 CLOSE_S: Final = 1.0
 END: Final = ("end",)
 
-Tell = tuple[Any, ...]
-"""What the node's process tells: ("deliver", channel, payload, arrived), ("send", carrier, sends, when), ("record",
-topic, payload, when), ("note", what `note` gave), ("failed", why)."""
+Report = tuple[Any, ...]
+"""An entry from the node's process: ("deliver", channel, payload, arrived), ("send", carrier, sends, when), ("record",
+topic, payload, when), ("status", the result of `get_status`), ("failed", reason)."""
 
 
 class RemoteNodeProxy:
-    """Stands for the node where the other nodes are: takes its messages, and does what its process tells."""
+    """The proxy of a node in another process: it forwards messages to that process and executes its reports."""
 
     def __init__(self, name: str, connection: Connection) -> None:
         self.name = name
-        self.noted: Any = None
-        """What the node's process noted last."""
-        self._pipe = Pipe(connection, self._take, self._gone)
+        self.status: Any = None
+        """The last status that the node's process reported."""
+        self._pipe = Pipe(connection, self._receive, self._on_closed)
         self._runtime: RealRuntime | None = None
         self._peers: dict[int, Peer] = {}
         self._number = 0
-        self._ends = False
+        self._is_closing = False
 
     def start(self, runtime: RealRuntime) -> None:
-        """Begin to hand over."""
+        """Start to forward messages."""
         self._runtime = runtime
         self._pipe.start()
 
     def put(self, message: Message) -> None:
-        """Hand a message over to the node's process."""
+        """Forward a message to the node's process."""
         number = 0
         if message.peer is not None:
             self._number = number = self._number + 1
             self._peers[number] = message.peer
-            if len(self._peers) > PEERS_KEPT:
+            if len(self._peers) > MAX_PENDING_PEERS:
                 self._peers.pop(next(iter(self._peers)))
         self._pipe.send((message.channel, message.payload, message.arrived, number))
 
     def close(self, wait_s: float) -> None:
-        """Let the node's process end, and take what it still tells, for so long at most."""
-        self._ends = True
+        """End the node's process, and process its remaining reports for at most `wait_s`."""
+        self._is_closing = True
         self._pipe.send(END)
-        self._pipe.wait_gone(wait_s)
+        self._pipe.wait_closed(wait_s)
         self._pipe.close(CLOSE_S)
         if self._runtime is not None:
             lost = {"node": f"to the {self.name}'s process", "messages_dropped": self._pipe.dropped}
             self._runtime.record("counts", lost, self._runtime.now())
 
-    def _take(self, told: Tell) -> None:
+    def _receive(self, report: Report) -> None:
         runtime = self._runtime
         if runtime is None:
             return
-        kind, *rest = told
+        kind, *rest = report
         if kind == "record":
             runtime.record(*rest)
         elif kind == "send":
             carrier, sends, when = rest
-            if runtime.now().mono_ns - when.mono_ns > LATE_NS:  # this process did not run: nobody wants an old state
+            if runtime.now().mono_ns - when.mono_ns > LATE_NS:  # this process did not run: an old state is useless
                 return
             runtime.carry(carrier, [self._with_peer(send) for send in sends])
         elif kind == "deliver":
             runtime.deliver(*rest)
-        elif kind == "note":
-            (self.noted,) = rest
+        elif kind == "status":
+            (self.status,) = rest
         elif kind == "failed":
             runtime.fail(WorkError(rest[0]))
 
     def _with_peer(self, send: Send) -> Send:
         return send if send.peer is None else Send(send.channel, send.payload, self._peers.pop(send.peer, None))
 
-    def _gone(self) -> None:
-        if not self._ends and self._runtime is not None:
+    def _on_closed(self) -> None:
+        if not self._is_closing and self._runtime is not None:
             self._runtime.fail(WorkError(f"the process of the {self.name} has ended"))
 
 
-class _Outside:
-    """Where the node is: recorder, link, and the other nodes, which are all at the other end of the pipe."""
+class _OtherProcess:
+    """Recorder, link and other nodes for the node's runtime; all of them are at the other end of the pipe."""
 
-    def __init__(self, pipe: Pipe, clock: Clock, look: Callable[[], None]) -> None:
-        self._pipe, self._clock, self._look = pipe, clock, look
+    def __init__(self, pipe: Pipe, clock: Clock, report_status: Callable[[], None]) -> None:
+        self._pipe, self._clock, self._report_status = pipe, clock, report_status
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Tell one entry of the record."""
+        """Report one entry of the record."""
         self._pipe.send(("record", topic, payload, now))
 
     def send(self, *sends: Send) -> None:
-        """Tell what is to be sent by a link."""
-        self._look()
+        """Report messages to be sent by a link, after the node's status."""
+        self._report_status()
         self._pipe.send(("send", CHANNELS[sends[0].channel].carrier, sends, self._clock.now()))
 
     def put(self, message: Message) -> None:
-        """Tell what is for another node."""
+        """Report a message for another node."""
         self._pipe.send(("deliver", message.channel, message.payload, message.arrived))
 
 
 class NodeHost:
-    """The node's process: a runtime of this node alone. `note` is asked before it sends, and told when it changed.
+    """The runtime of a single node in its own process.
 
-    `parted` is called when the other process has ended, or lets this one end.
+    A changed `get_status` is reported before the node sends. `on_disconnect` is called when the other process has ended
+    or ends this one.
     """
 
     def __init__(
-        self, connection: Connection, clock: Clock, node: Node, *, note: Callable[[], Any], parted: Callable[[], None]
+        self,
+        connection: Connection,
+        clock: Clock,
+        node: Node,
+        *,
+        get_status: Callable[[], Any],
+        on_disconnect: Callable[[], None],
     ) -> None:
         self._clock = clock
         self._node = node
-        self._note, self._noted = note, None
-        self._parted = parted
+        self._get_status, self._status = get_status, None
+        self._on_disconnect = on_disconnect
         self._late: Counter[str] = Counter()
-        self._pipe = Pipe(connection, self._take, parted)
-        outside = _Outside(self._pipe, clock, self._look)
+        self._pipe = Pipe(connection, self._receive, on_disconnect)
+        other_process = _OtherProcess(self._pipe, clock, self._report_status)
         receivers = {receiver for row in CHANNELS.values() for receiver in row.receivers} - {node.name}
-        self.runtime = RealRuntime(clock, [node], outside, lambda: None, dict.fromkeys(receivers, outside))
-        self._links: dict[str, MessageLink] = {row.carrier: outside for row in CHANNELS.values()}
+        self.runtime = RealRuntime(clock, [node], other_process, lambda: None, dict.fromkeys(receivers, other_process))
+        self._links: dict[str, MessageLink] = {row.carrier: other_process for row in CHANNELS.values()}
 
     def start(self) -> None:
-        """Begin."""
+        """Start the runtime and the connection."""
         self.runtime.start(self._links)
         self._pipe.start()
 
-    def hand(self, channel: str, payload: Any) -> None:
-        """Give the node a message of this process' own."""
+    def deliver(self, channel: str, payload: Any) -> None:
+        """Deliver a message of this process to the node."""
         self.runtime.put(Message(channel, payload, self._clock.now()))
 
-    def _look(self) -> None:
-        """Tell what the node's `note` gives, where it is another."""
-        noted = self._note()
-        if noted != self._noted:
-            self._noted = noted
-            self._pipe.send(("note", noted))
+    def _report_status(self) -> None:
+        """Report the node's status if it has changed."""
+        status = self._get_status()
+        if status != self._status:
+            self._status = status
+            self._pipe.send(("status", status))
 
     def close(self) -> None:
-        """End the runtime, and tell what was counted, or why it failed."""
+        """Stop the runtime, and report its counts and its error, if any."""
         self.runtime.stop()
         if self.runtime.failed is not None:
             self._pipe.send(("failed", f"{self._node.name}: {self.runtime.failed}"))
@@ -160,11 +167,11 @@ class NodeHost:
         self._pipe.send(("record", "counts", lost, self._clock.now()))
         self._pipe.close(CLOSE_S)
 
-    def _take(self, told: tuple[Any, ...]) -> None:
-        if told == END:
-            self._parted()
+    def _receive(self, entry: tuple[Any, ...]) -> None:
+        if entry == END:
+            self._on_disconnect()
             return
-        channel, payload, arrived, peer = told
+        channel, payload, arrived, peer = entry
         now = self._clock.now()
         if now.mono_ns - arrived.mono_ns > LATE_NS:
             self._late[f"{channel}_late"] += 1

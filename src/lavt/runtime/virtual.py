@@ -1,7 +1,7 @@
-"""Virtual time: one heap of events, simulated links, hosts with clocks of their own, as fast as the machine goes.
+"""The virtual-time runtime: one event heap, simulated links, hosts with their own clocks, no waiting.
 
-Real pixels, the real codec and real packets pass through the nodes; only waiting is skipped. The same seed and the same
-configuration give the same result, bit for bit.
+Pixels, codec and packets are real; only waiting is skipped. The same seed and configuration give a byte-for-byte
+reproducible result.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from lavt.channels import CHANNELS
 from lavt.domain import NS_PER_S, Now
 from lavt.node import WAKE, Message, Node, Peer, Send
 from lavt.runtime.inbox import Inbox
-from lavt.runtime.pipeline import walk
-from lavt.runtime.recorder import UNRECORDED, WIRE, Recorder, record
+from lavt.runtime.pipeline import run_stages
+from lavt.runtime.recorder import UNRECORDED, WIRE_DECODERS, Recorder, record
 from lavt.transport.clock_sync.clock_report import ClockReport
 from lavt.transport.emulation.delay_line import DelayLine
 
@@ -26,10 +26,10 @@ NS_PER_PPB = 1_000_000_000
 
 @dataclass
 class HostClock:
-    """Both clocks of a virtual host, as exact functions of the true time.
+    """The two clocks of a virtual host, as exact functions of the true time.
 
-    `offset_ns` is the wall clock's at true time 0, `drift_ppb` how much too fast the host's oscillator is (parts in
-    10^9, in both clocks), and `steps` are sudden changes of the wall clock: (true time, change), in order.
+    `offset_ns` is the offset of the wall clock at true time 0, `drift_ppb` the drift of both clocks (parts in 10^9,
+    positive: too fast), and `steps` are steps of the wall clock: (true time, change), in order.
     """
 
     mono_start_ns: int
@@ -39,7 +39,7 @@ class HostClock:
     steps: Sequence[tuple[int, int]] = ()
 
     def at(self, true_ns: int) -> Now:
-        """Read both clocks at a true time."""
+        """Return the reading of both clocks at a true time."""
         drift_ppb = self.drift_ppb
         gone_ns = true_ns + true_ns * drift_ppb // NS_PER_PPB if drift_ppb else true_ns
         wall_ns = self.wall_start_ns + self.offset_ns + gone_ns
@@ -48,7 +48,7 @@ class HostClock:
         return Now(self.mono_start_ns + gone_ns, wall_ns)
 
     def true_ns(self, mono_ns: int) -> int:
-        """Tell the first true time at which the monotonic clock shows at least `mono_ns`."""
+        """Return the first true time at which the monotonic clock shows at least `mono_ns`."""
         gone_ns = mono_ns - self.mono_start_ns
         if not self.drift_ppb:
             return gone_ns
@@ -60,87 +60,90 @@ class HostClock:
 
 @dataclass
 class VirtualLink:
-    """A simulated link of one channel: a delay line, and how its packets are numbered for the delay law."""
+    """A simulated link of one channel: a delay line with the numbering of its packets."""
 
     line: DelayLine
     index: Callable[[bytes, int], int]
-    """(payload, number of the packet) to the index of its delay; packets of one frame share theirs."""
+    """Maps (payload, packet number) to the index of the packet's delay; packets of one frame share an index."""
     count: int = 0
     open: bool = True
-    """A closed link loses what is sent."""
+    """A closed link loses all packets."""
 
 
 @dataclass
 class VirtualHost:
-    """One side: its clock, nodes, record, the cost of each hop, and its source of clock reports."""
+    """A host of one side: its clock, nodes, recorder, processing times and clock source."""
 
     side: str
     clock: HostClock
     nodes: Sequence[Node]
     recorder: Recorder
     costs_ns: Mapping[tuple[str, str], int]
-    """(node, hop) to its cost, (node, "wait_CHANNEL") to that of waking the node; what is not named costs nothing."""
+    """Processing time by (node, stage), and by (node, "wait_CHANNEL") for waking the node; 0 if not listed."""
     clock_source: Callable[[int], ClockReport]
     peer: Peer = None
-    """How this host looks from the other side."""
+    """This host as the peer of its messages on the other side."""
     left_out: frozenset[str] = frozenset()
     """Channels that are not recorded."""
-    running: dict[str, _Running] = field(default_factory=dict)
+    runners: dict[str, _NodeRunner] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.unrecorded = UNRECORDED | self.left_out
-        self.running = {node.name: _Running(self, node) for node in self.nodes}
+        self.runners = {node.name: _NodeRunner(self, node) for node in self.nodes}
         self.receivers = {
-            channel: tuple(self.running[name] for name in row.receivers)
+            channel: tuple(self.runners[name] for name in row.receivers)
             for channel, row in CHANNELS.items()
-            if self.running.keys() >= set(row.receivers)
+            if self.runners.keys() >= set(row.receivers)
         }
-        """For each channel the nodes of this host that listen to it."""
+        """The receiving nodes of this host by channel."""
         self._read_ns = -1
         self._read = Now(0, 0)
 
     def now(self, true_ns: int) -> Now:
-        """Read both clocks; several things happen at one time, so the last reading is kept."""
+        """Return a reading of both clocks; the last reading is cached, because many events share a time."""
         if true_ns != self._read_ns:
             self._read_ns, self._read = true_ns, self.clock.at(true_ns)
         return self._read
 
 
-class _Running:
-    """A node at work: what waits for it, until when it is busy, and when it is looked at next."""
+class _NodeRunner:
+    """A node in virtual time: its inbox, the end of its present run, and its scheduled steps."""
 
     def __init__(self, host: VirtualHost, node: Node) -> None:
         self.host = host
         self.node = node
         self.inbox = Inbox()
-        self.chains = {
-            channel: (stages, _spent_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in stages))))
-            for channel, stages in node.chains.items()
+        self.pipelines = {
+            channel: (
+                stages,
+                _end_times_ns(host.costs_ns, node.name, (f"wait_{channel}", *(name for name, _ in stages))),
+            )
+            for channel, stages in node.pipelines.items()
         }
-        """Each chain, and how long after its begin the first hop begins and each hop is done."""
+        """Each pipeline with the times from its start to the start of the first stage and to the end of each stage."""
         self.next_wake_ns = node.next_wake_ns
         self.free_ns = 0
-        self.poke_ns: int | None = None
-        self.poked_ns: set[int] = set()
-        """When it is looked at next, and for when that has been asked: often again for a time that still stands."""
+        self.next_step_ns: int | None = None
+        self.scheduled_ns: set[int] = set()
+        """Times of the next step and of all steps in the event heap, so that no time is scheduled twice."""
         self.wake_mono_ns: int | None = None
         self.wake_ns: int | None = None
-        """When the node wants to be woken, on its host's monotonic clock and in true time."""
-        self.note_wake(node.next_wake_ns())
+        """`next_wake_ns` of the node, on its host's monotonic clock and in true time."""
+        self.set_wake(node.next_wake_ns())
 
-    def note_wake(self, wake_mono_ns: int | None) -> None:
-        """Note when the node wants to be woken."""
+    def set_wake(self, wake_mono_ns: int | None) -> None:
+        """Store the node's next wake."""
         self.wake_mono_ns = wake_mono_ns
         self.wake_ns = None if wake_mono_ns is None else self.host.clock.true_ns(wake_mono_ns)
 
 
-def _spent_ns(costs_ns: Mapping[tuple[str, str], int], node: str, steps: Sequence[str]) -> tuple[int, ...]:
-    """Tell after how long each step of a node is done, one after the other."""
+def _end_times_ns(costs_ns: Mapping[tuple[str, str], int], node: str, steps: Sequence[str]) -> tuple[int, ...]:
+    """Return the end time of each step, relative to the start of the first."""
     return tuple(accumulate(costs_ns.get((node, step), 0) for step in steps))
 
 
 class VirtualRuntime:
-    """Drives the nodes of two hosts and the links between them through virtual time."""
+    """A runtime that runs the nodes of two hosts and the links between them in virtual time."""
 
     def __init__(self, hosts: Sequence[VirtualHost], links: Mapping[str, VirtualLink]) -> None:
         self.true_ns = 0
@@ -150,8 +153,8 @@ class VirtualRuntime:
         self._heap: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._number = 0
         for host in hosts:
-            for running in host.running.values():
-                self._poke(running, 0)
+            for runner in host.runners.values():
+                self._schedule(runner, 0)
 
     def at(self, true_ns: int, action: Callable[..., None], *arguments: Any) -> None:
         """Call `action` with `arguments` at a true time."""
@@ -159,7 +162,7 @@ class VirtualRuntime:
         heapq.heappush(self._heap, (true_ns, self._number, action, arguments))
 
     def run(self, limit_ns: int, finished: Callable[[], bool]) -> bool:
-        """Run until `finished()` or to the limit; tell whether it finished."""
+        """Run until `finished()` or to the limit; return whether it finished."""
         heap, take = self._heap, heapq.heappop
         while heap and heap[0][0] <= limit_ns:
             self.true_ns, _, action, arguments = take(heap)
@@ -169,19 +172,19 @@ class VirtualRuntime:
         return False
 
     def close(self) -> None:
-        """Write the counters of nodes, inboxes and links that do more than delay into the records."""
+        """Record the counts of nodes, inboxes, and links that do more than delay."""
         for host in self.hosts.values():
             now = host.clock.at(self.true_ns)
-            for name, running in host.running.items():
-                counts: dict[str, Any] = {**running.node.counts, **running.inbox.counts}
+            for name, runner in host.runners.items():
+                counts: dict[str, Any] = {**runner.node.counts, **runner.inbox.counts}
                 host.recorder.write("counts", {"node": name, **counts}, now)
             for channel, link in self.links.items():
-                if link.line.link is not None and CHANNELS[channel].sender in host.running:
-                    did = {f"link_{name}": number for name, number in link.line.link.counts.items()}
-                    host.recorder.write("counts", {"node": f"link {channel}", **did}, now)
+                if link.line.link is not None and CHANNELS[channel].sender in host.runners:
+                    counts = {f"link_{name}": number for name, number in link.line.link.counts.items()}
+                    host.recorder.write("counts", {"node": f"link {channel}", **counts}, now)
 
     def deliver(self, side: str, channel: str, payload: Any, peer: Peer = None) -> None:
-        """Let a message arrive on a side, now; what came over the network is written down."""
+        """Deliver a message to a side, now; record it if it came over the network."""
         host = self.hosts[side]
         arrived = host.now(self.true_ns)
         if CHANNELS[channel].carrier != "local" and channel not in host.unrecorded:
@@ -190,43 +193,43 @@ class VirtualRuntime:
 
     def _put(self, host: VirtualHost, message: Message) -> None:
         true_ns = self.true_ns
-        for running in host.receivers[message.channel]:
-            running.inbox.put(message)
-            free_ns = running.free_ns
-            self._poke(running, max(true_ns, free_ns))
+        for runner in host.receivers[message.channel]:
+            runner.inbox.put(message)
+            free_ns = runner.free_ns
+            self._schedule(runner, max(true_ns, free_ns))
 
-    def _poke(self, running: _Running, true_ns: int) -> None:
-        """Look at a node at `true_ns`, unless it is looked at before anyway."""
-        if running.poke_ns is None or true_ns < running.poke_ns:
-            running.poke_ns = true_ns
-            if true_ns not in running.poked_ns:
-                running.poked_ns.add(true_ns)
+    def _schedule(self, runner: _NodeRunner, true_ns: int) -> None:
+        """Schedule a step of a node at `true_ns`, unless an earlier one is scheduled."""
+        if runner.next_step_ns is None or true_ns < runner.next_step_ns:
+            runner.next_step_ns = true_ns
+            if true_ns not in runner.scheduled_ns:
+                runner.scheduled_ns.add(true_ns)
                 self._number += 1
-                heapq.heappush(self._heap, (true_ns, self._number, self._look, (running, true_ns)))
+                heapq.heappush(self._heap, (true_ns, self._number, self._step, (runner, true_ns)))
 
-    def _look(self, running: _Running, true_ns: int) -> None:
-        running.poked_ns.remove(true_ns)
-        if running.poke_ns != true_ns:
-            return  # it was looked at earlier, and has asked anew
-        running.poke_ns = None
-        wake_ns = running.wake_ns
+    def _step(self, runner: _NodeRunner, true_ns: int) -> None:
+        runner.scheduled_ns.remove(true_ns)
+        if runner.next_step_ns != true_ns:
+            return  # an earlier step has replaced this one
+        runner.next_step_ns = None
+        wake_ns = runner.wake_ns
         if wake_ns is not None and wake_ns <= true_ns:
-            now = running.host.now(true_ns)
-            self._walk(running, Message(WAKE, None, now), now)
-        elif (message := running.inbox.take()) is not None:
-            self._walk(running, message, running.host.now(true_ns))
+            now = runner.host.now(true_ns)
+            self._run_pipeline(runner, Message(WAKE, None, now), now)
+        elif (message := runner.inbox.take()) is not None:
+            self._run_pipeline(runner, message, runner.host.now(true_ns))
         elif wake_ns is not None:
-            self._poke(running, wake_ns)
+            self._schedule(runner, wake_ns)
 
-    def _walk(self, running: _Running, message: Message, now: Now) -> None:
-        host, true_ns = running.host, self.true_ns
-        stages, spent_ns = running.chains[message.channel]
+    def _run_pipeline(self, runner: _NodeRunner, message: Message, now: Now) -> None:
+        host, true_ns = runner.host, self.true_ns
+        stages, ends_ns = runner.pipelines[message.channel]
         times: Iterator[Now] = repeat(now)
-        if spent_ns[-1]:
-            times = map(host.clock.at, map(true_ns.__add__, spent_ns))
-        outcome = walk(running.node.name, stages, message, next(times), times)
-        took_ns = spent_ns[outcome.called]
-        running.free_ns = free_ns = true_ns + took_ns
+        if ends_ns[-1]:
+            times = map(host.clock.at, map(true_ns.__add__, ends_ns))
+        outcome = run_stages(runner.node.name, stages, message, next(times), times)
+        took_ns = ends_ns[outcome.called]
+        runner.free_ns = free_ns = true_ns + took_ns
         if outcome.timeline is not None:
             host.recorder.write("timeline", outcome.timeline, outcome.end)
         if outcome.sends:
@@ -234,21 +237,21 @@ class VirtualRuntime:
                 self.at(free_ns, self._send_all, host, outcome.sends, outcome.end)
             else:
                 self._send_all(host, outcome.sends, outcome.end)
-        # When the node wants to be woken, nothing but a walk through its hops changes.
-        wake_mono_ns = running.next_wake_ns()
-        if wake_mono_ns != running.wake_mono_ns:
-            running.note_wake(wake_mono_ns)
-        if running.inbox.waiting:
-            self._poke(running, free_ns)
-        elif (wake_ns := running.wake_ns) is not None:
-            self._poke(running, max(wake_ns, free_ns))
+        # Only a run of its pipelines changes a node's next wake.
+        wake_mono_ns = runner.next_wake_ns()
+        if wake_mono_ns != runner.wake_mono_ns:
+            runner.set_wake(wake_mono_ns)
+        if runner.inbox.waiting:
+            self._schedule(runner, free_ns)
+        elif (wake_ns := runner.wake_ns) is not None:
+            self._schedule(runner, max(wake_ns, free_ns))
 
     def _send_all(self, host: VirtualHost, sends: Sequence[Send], now: Now) -> None:
         write, unrecorded = host.recorder.write, host.unrecorded
         for send in sends:
             channel = send.channel
-            if channel not in unrecorded:  # as in `record`, without a call for each message
-                write(channel, WIRE[channel](send.payload) if channel in WIRE else send.payload, now)
+            if channel not in unrecorded:  # as `record` does, without a call for each message
+                write(channel, WIRE_DECODERS[channel](send.payload) if channel in WIRE_DECODERS else send.payload, now)
             carrier = CHANNELS[channel].carrier
             if carrier == "record":
                 continue
@@ -275,7 +278,7 @@ class VirtualRuntime:
 
 
 def modelled_clock_source(clock: HostClock, host: str, error_s: float, bound_s: float) -> Callable[[int], ClockReport]:
-    """Model chrony on a virtual host: it reports the truth plus `error_s`, which lies inside its stated `bound_s`."""
+    """Return a model of chrony on a virtual host, which reports the true offset plus `error_s`, and `bound_s`."""
 
     def report(true_ns: int) -> ClockReport:
         now = clock.at(true_ns)

@@ -1,4 +1,4 @@
-"""What a thread sleeps by: rung while it sleeps, it wakes; rung before, it does not fall asleep."""
+"""An event that wakes one sleeping thread."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ import threading
 
 
 class WakeEvent:
-    """A bell for one sleeper and any who ring: a lock that is held while nothing has rung.
+    """An event for one waiting thread and any number of setting ones: a lock that is locked while the event is clear.
 
-    `threading.Event` and `Condition` do the same with several locks: with them a frame took 0.1 ms more of a processor
-    on either side of the video (measured).
+    `threading.Event` and `Condition` use several locks for this: with them a frame took 0.1 ms more processor time on
+    either side of the video (measured).
     """
 
     def __init__(self) -> None:
-        self._silent = threading.Lock()
-        self._silent.acquire()
+        self._clear = threading.Lock()
+        self._clear.acquire()
 
-    def ring(self) -> None:
-        """Wake the sleeper, or keep it from falling asleep; to ring twice is to ring once."""
+    def set(self) -> None:
+        """Wake the waiting thread, or let its next `wait` return at once; setting twice is setting once."""
         try:
-            self._silent.release()
-        except RuntimeError:  # it has rung already
+            self._clear.release()
+        except RuntimeError:  # it is set already
             return
 
-    def silence(self) -> None:
-        """Forget what has rung so far."""
-        self._silent.acquire(blocking=False)
+    def clear(self) -> None:
+        """Clear the event."""
+        self._clear.acquire(blocking=False)
 
     def wait(self, pause_s: float | None) -> None:
-        """Sleep until it rings, and for `pause_s` at most; None: until it rings."""
+        """Wait until the event is set, for at most `pause_s` (None: no limit), and clear it; do nothing from 0 down."""
         if pause_s is None:
-            self._silent.acquire()
+            self._clear.acquire()
         elif pause_s > 0:
-            self._silent.acquire(timeout=pause_s)
+            self._clear.acquire(timeout=pause_s)

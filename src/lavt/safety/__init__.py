@@ -1,1 +1,1 @@
-"""The safety gate of the vehicle: sessions, limits, the command gate and the path followed without commands."""
+"""Safety on the vehicle: sessions, limits, the command gate, the watchdog and the path followed without commands."""

@@ -1,4 +1,4 @@
-"""The last thing before the vehicle: limits of steering and speed that hold whatever is asked."""
+"""The last stage before the vehicle: limits of steering, throttle and brake for every command."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ from lavt.domain import NS_PER_S, Actuation, VehicleState
 from lavt.safety.limits import Limits
 
 COMMAND_PERIOD_S = CLIENT_LIMITS.command_period_ns / NS_PER_S
-"""A change of steering that the wheel may reach within this is not called changed by the limit of its rate."""
+"""A steering change that the rate limit allows within this time is not reported as limited."""
 
 
 class Limiter:
-    """Keeps what is asked within the limits, and tells which of them changed it.
+    """A limiter that keeps each requested actuation within the limits and names the limits that changed it.
 
-    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are the vehicle's own.
+    `wheelbase_m`, `max_steering_rad` and `max_braking_mps2` are properties of the vehicle.
     """
 
     def __init__(self, limits: Limits, *, wheelbase_m: float, max_steering_rad: float, max_braking_mps2: float) -> None:
         self.limits = limits
         self.max_braking_mps2 = max_braking_mps2
-        self.changed: tuple[str, ...] = ()
-        """Names of the limits that changed what was last asked."""
+        self.applied_limits: tuple[str, ...] = ()
+        """Names of the limits that changed the last request."""
         self.wheelbase_m = wheelbase_m
         self._max_steering_rad = max_steering_rad
         self._steering_rad: float | None = None
         self._at_ns = 0
 
-    def start(self, steering_rad: float, now_ns: int) -> None:
-        """Begin from where the wheel is."""
+    def reset(self, steering_rad: float, now_ns: int) -> None:
+        """Take the wheel's present angle as the last steering target."""
         self._steering_rad, self._at_ns = steering_rad, now_ns
 
     def target_rad(self, vehicle: VehicleState) -> float:
-        """Last steering target; before the first one, where the wheel is."""
+        """Return the last steering target; before the first one, the wheel's present angle."""
         return vehicle.steering_rad if self._steering_rad is None else self._steering_rad
 
     def limit(
         self, requested: Actuation, vehicle: VehicleState, now_ns: int, picture_age_ns: int | None = None
     ) -> Actuation:
-        """Bring `requested` within the limits at the vehicle's speed; the wheel turns no faster than the rate allows.
+        """Return `requested` within the limits at the vehicle's present speed.
 
-        `picture_age_ns` is the age of the picture that `requested` was made from; None: of no picture.
+        `picture_age_ns` is the age of the picture that `requested` was made from; None: it was made from none.
         """
         before_rad = self.target_rad(vehicle)
         step_rad = self.limits.steering_rate_radps * max(0, now_ns - self._at_ns) / NS_PER_S
@@ -63,30 +63,30 @@ class Limiter:
             if abs(steering_rad - before_rad) > self.limits.steering_rate_radps * COMMAND_PERIOD_S:
                 changed.append("steering rate")
         throttle = requested.throttle
-        known = math.isfinite(vehicle.speed_mps)
-        if throttle > 0 and not (known and vehicle.speed_mps <= self.limits.speed_limit_mps):
+        is_speed_known = math.isfinite(vehicle.speed_mps)
+        if throttle > 0 and not (is_speed_known and vehicle.speed_mps <= self.limits.speed_limit_mps):
             throttle = 0.0
             changed.append("speed")
         brake = requested.brake
-        if picture_age_ns is not None and known:
+        if picture_age_ns is not None and is_speed_known:
             excess_mps = vehicle.speed_mps - stopping_speed_limit_mps(picture_age_ns / NS_PER_S, self.limits)
-            least = self._stopping_distance_brake(excess_mps)
-            if excess_mps > 0 and (throttle > 0 or brake < least):
-                throttle, brake = 0.0, max(brake, least)
-                changed.append("sight")
+            minimum_brake = self._stopping_distance_brake(excess_mps)
+            if excess_mps > 0 and (throttle > 0 or brake < minimum_brake):
+                throttle, brake = 0.0, max(brake, minimum_brake)
+                changed.append("stopping distance")
         self._steering_rad, self._at_ns = reached_rad, max(now_ns, self._at_ns)
-        self.changed = tuple(changed)
+        self.applied_limits = tuple(changed)
         return Actuation(reached_rad, throttle, brake)
 
     def _stopping_distance_brake(self, excess_mps: float) -> float:
-        """Pedal that takes the excess away in the settling time, at most that of a safe stop."""
+        """Return the pedal that removes the excess speed in the settling time, at most that of a safe stop."""
         deceleration_mps2 = min(excess_mps / self.limits.stopping_brake_settling_s, self.limits.stop_deceleration_mps2)
         return min(1.0, deceleration_mps2 / self.max_braking_mps2)
 
     def _lateral_limit_rad(self, speed_mps: float) -> float:
-        """Road wheel angle at which the kinematic car has the lateral acceleration limit: v^2 tan(angle) / L.
+        """Return the road wheel angle at which the lateral acceleration v^2 tan(angle) / wheelbase is at its limit.
 
-        A speed that is no number counts as the highest.
+        A speed that is not finite counts as the speed limit.
         """
         if not math.isfinite(speed_mps):
             speed_mps = self.limits.speed_limit_mps
@@ -96,11 +96,13 @@ class Limiter:
 
 
 def stopping_speed_limit_mps(picture_age_s: float, limits: Limits) -> float:
-    """Speed from which the car comes to stand on the path that it was shown, should no other command come.
+    """Return the highest speed from which the car stops on the path of its last command, if no other command follows.
 
-    It has gone on for the picture's age, goes on until the safe stop begins, and brakes: the speed v solves
-    v (age + `stop_after`) + v^2 / (2 `stop_deceleration`) = `sight`. The older the picture, the less.
+    The car has driven on for the picture's age, drives on until the safe stop begins, and brakes: the speed v solves
+    v (age + `stop_after`) + v^2 / (2 `stop_deceleration`) = `stopping_distance_limit`. It falls with the picture's age.
     """
-    blind_s = picture_age_s + limits.stop_after_ns / NS_PER_S
+    unguided_s = picture_age_s + limits.stop_after_ns / NS_PER_S
     braking_mps2 = limits.stop_deceleration_mps2
-    return braking_mps2 * (math.sqrt(blind_s * blind_s + 2 * limits.stopping_distance_limit_m / braking_mps2) - blind_s)
+    return braking_mps2 * (
+        math.sqrt(unguided_s * unguided_s + 2 * limits.stopping_distance_limit_m / braking_mps2) - unguided_s
+    )

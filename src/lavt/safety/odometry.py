@@ -1,4 +1,4 @@
-"""Where a vehicle has been by its own account: speed and road wheel angle, added up on the server's monotonic clock."""
+"""Odometry from the vehicle's reported speed and road wheel angle, on the server's monotonic clock."""
 
 from __future__ import annotations
 
@@ -7,37 +7,37 @@ from bisect import bisect_right
 from collections import deque
 from operator import attrgetter
 
-from lavt.control.pure_pursuit import SEEN_FROM, Place, curvature_per_m, limited, moved
+from lavt.control.pure_pursuit import ORIGIN, PlanarPose, clamp, curvature_per_m, move_along_arc
 from lavt.domain import NS_PER_S, VehicleState
 from lavt.value import value
 
-SPEED_WITHIN_MPS = 100.0
-CURVATURE_WITHIN_PER_M = 1.0
-"""What a car reports beyond these is brought within: no sum may run away on one bad report."""
+MAX_SPEED_MPS = 100.0
+MAX_CURVATURE_PER_M = 1.0
+"""Reports beyond these are clamped, so that one bad report cannot ruin the sum."""
 
 
 @value
 class PoseFix:
-    """Where the rear axle was at a time, in the frame of the first fix, and how it went on from there."""
+    """The pose of the rear axle at a time, in the frame of the first fix, with its speed and curvature."""
 
     mono_ns: int
     travelled_m: float
-    place: Place
+    pose: PlanarPose
     speed_mps: float
     curvature_per_m: float
 
-    def at(self, mono_ns: int) -> PoseFix:
-        """Tell where it is at another time if it goes on like this; never before this fix."""
+    def extrapolate(self, mono_ns: int) -> PoseFix:
+        """Return the pose at a later time with this speed and curvature; an earlier time returns this pose."""
         step_m = self.speed_mps * max(0, mono_ns - self.mono_ns) / NS_PER_S
-        place = moved(self.place, step_m, self.curvature_per_m)
-        return PoseFix(mono_ns, self.travelled_m + step_m, place, self.speed_mps, self.curvature_per_m)
+        pose = move_along_arc(self.pose, step_m, self.curvature_per_m)
+        return PoseFix(mono_ns, self.travelled_m + step_m, pose, self.speed_mps, self.curvature_per_m)
 
 
 class Odometry:
-    """Adds up what the vehicle reports, however often it is looked at, and remembers the way for `memory_ns`.
+    """Dead reckoning from the vehicle's reports, with a memory of the last `memory_ns`.
 
-    The car is taken as one that rolls without slip (kinematic bicycle). Between two reports it has the mean of both
-    speeds and of both curvatures.
+    The model is the kinematic bicycle, which rolls without slip. Between two reports it has the mean of both speeds and
+    of both curvatures, so that the result hardly depends on the rate of the reports.
     """
 
     def __init__(self, wheelbase_m: float, memory_ns: int) -> None:
@@ -45,31 +45,31 @@ class Odometry:
         self._memory_ns = memory_ns
         self._fixes: deque[PoseFix] = deque()
 
-    def note(self, vehicle: VehicleState) -> None:
-        """Take over what the vehicle reports; a report that is not newer than the last one is left out.
+    def update(self, vehicle: VehicleState) -> None:
+        """Add a report of the vehicle; ignore one that is not newer than the last.
 
-        A speed or an angle that is no number is taken as the one before.
+        A speed or angle that is not finite is replaced by the one before it.
         """
-        last = self._fixes[-1] if self._fixes else PoseFix(vehicle.mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
+        last = self._fixes[-1] if self._fixes else PoseFix(vehicle.mono_ns, 0.0, ORIGIN, 0.0, 0.0)
         if self._fixes and vehicle.mono_ns <= last.mono_ns:
             return
-        speed_mps, bend_per_m = last.speed_mps, last.curvature_per_m
+        speed_mps, new_curvature_per_m = last.speed_mps, last.curvature_per_m
         if math.isfinite(vehicle.speed_mps):
-            speed_mps = limited(vehicle.speed_mps, SPEED_WITHIN_MPS)
+            speed_mps = clamp(vehicle.speed_mps, MAX_SPEED_MPS)
         if math.isfinite(vehicle.steering_rad):
-            bend_per_m = limited(curvature_per_m(vehicle.steering_rad, self._wheelbase_m), CURVATURE_WITHIN_PER_M)
+            new_curvature_per_m = clamp(curvature_per_m(vehicle.steering_rad, self._wheelbase_m), MAX_CURVATURE_PER_M)
         step_m = (last.speed_mps + speed_mps) / 2 * (vehicle.mono_ns - last.mono_ns) / NS_PER_S
-        place = moved(last.place, step_m, (last.curvature_per_m + bend_per_m) / 2)
-        self._fixes.append(PoseFix(vehicle.mono_ns, last.travelled_m + step_m, place, speed_mps, bend_per_m))
+        pose = move_along_arc(last.pose, step_m, (last.curvature_per_m + new_curvature_per_m) / 2)
+        self._fixes.append(PoseFix(vehicle.mono_ns, last.travelled_m + step_m, pose, speed_mps, new_curvature_per_m))
         while len(self._fixes) > 1 and self._fixes[1].mono_ns <= vehicle.mono_ns - self._memory_ns:
             self._fixes.popleft()
 
     def at(self, mono_ns: int) -> PoseFix:
-        """Tell where the vehicle was at a time, or will be if it goes on as it last did.
+        """Return the pose at a time, extrapolated from the last report before it.
 
-        A time before all that is remembered is taken as the first of that.
+        A time before the memory returns the oldest pose in it.
         """
         if not self._fixes:
-            return PoseFix(mono_ns, 0.0, SEEN_FROM, 0.0, 0.0)
+            return PoseFix(mono_ns, 0.0, ORIGIN, 0.0, 0.0)
         after = bisect_right(self._fixes, mono_ns, key=attrgetter("mono_ns"))
-        return self._fixes[max(0, after - 1)].at(mono_ns)
+        return self._fixes[max(0, after - 1)].extrapolate(mono_ns)

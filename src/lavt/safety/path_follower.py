@@ -1,7 +1,7 @@
-"""Steering without commands: along the path that the last command meant to follow, by the vehicle's own odometry.
+"""Steering without commands: along the planned path of the last command, by the vehicle's own odometry.
 
-A command says where it means to go from the place where its picture was taken. When commands cease, the car knows by
-odometry how far it has come along that path and how far beside it, and steers by pure pursuit of the path's points.
+Each command contains the planned path, which begins where its picture was taken. When commands cease, odometry tells
+how far the car has come along that path and how far it is off it; pure pursuit of the path's points steers it.
 """
 
 from __future__ import annotations
@@ -9,70 +9,70 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-from lavt.control.pure_pursuit import Place, curvature_per_m, lookahead_m, moved, steering_rad
+from lavt.control.pure_pursuit import PlanarPose, curvature_per_m, lookahead_m, move_along_arc, steering_rad
 from lavt.domain import PATH_STEP_M, VehicleState
 from lavt.safety.odometry import Odometry
 
 LOOKAHEAD_S = 0.5
-"""How far ahead on its path the car aims.
+"""Lookahead on the path, in seconds of driving.
 
-Aiming ahead is what makes up for the wheel's lag. Pure pursuit crosses over at 2.2 / lookahead with 65 degrees of phase
-left (`experiment/boundary/delay_margin.py`); at half a second a steering lag of 0.12 s takes 28 of these, and
-looking every 33 ms at most takes 4. 33 degrees stay: at 30 degrees a preset counts as designed, and less lookahead
+The lookahead compensates the wheel's lag. Pure pursuit crosses over at 2.2 / lookahead with a phase margin of 65
+degrees (`experiment/boundary/delay_margin.py`). At 0.5 s, a steering lag of 0.12 s costs 28 degrees and a sampling
+period of at most 33 ms costs 4, which leaves 33. A preset counts as designed from 30 degrees on; a shorter lookahead
 would leave less.
 """
 
 
 class PathFollower:
-    """Keeps the odometry and the path of the last command, and says how to steer along it.
+    """A path follower that keeps odometry and the path of the last command, and steers along that path.
 
-    `memory_ns`: for how long the place where a picture was taken is remembered.
+    `memory_ns` is how long odometry remembers the pose at which a picture was taken.
     """
 
     def __init__(self, wheelbase_m: float, memory_ns: int) -> None:
         self._wheelbase_m = wheelbase_m
         self._odometry = Odometry(wheelbase_m, memory_ns)
-        self._bends_per_m: tuple[float, ...] = ()
-        """Curvature at the beginning of the path and at each of its points; empty: there is no path."""
-        self._begin = self._odometry.at(0)
+        self._curvatures_per_m: tuple[float, ...] = ()
+        """Curvature at the start of the path and at each of its points; empty: there is no path."""
+        self._start = self._odometry.at(0)
 
-    def look(self, vehicle: VehicleState) -> None:
-        """Look where the vehicle has got to; at any times, the more often the better."""
-        self._odometry.note(vehicle)
+    def update_odometry(self, vehicle: VehicleState) -> None:
+        """Add a report of the vehicle to the odometry; more frequent reports make it more accurate."""
+        self._odometry.update(vehicle)
 
-    def take(self, angle_rad: float, path_curvature_per_m: tuple[float, ...], captured_ns: int) -> None:
-        """Take over the path of a command from a picture taken at `captured_ns`; `angle_rad` is how it steers there."""
-        self._bends_per_m = (curvature_per_m(angle_rad, self._wheelbase_m), *path_curvature_per_m)
-        self._begin = self._odometry.at(captured_ns)
+    def set_path(self, angle_rad: float, path_curvature_per_m: tuple[float, ...], captured_ns: int) -> None:
+        """Store the path of a command with steering angle `angle_rad`, made from a picture taken at `captured_ns`."""
+        self._curvatures_per_m = (curvature_per_m(angle_rad, self._wheelbase_m), *path_curvature_per_m)
+        self._start = self._odometry.at(captured_ns)
 
-    def forget(self) -> None:
-        """There is no path any more."""
-        self._bends_per_m = ()
+    def clear_path(self) -> None:
+        """Drop the path."""
+        self._curvatures_per_m = ()
 
     def steering_rad(self, now_ns: int) -> float | None:
-        """Give the road wheel angle that follows the path, or None where there is none.
+        """Return the road wheel angle that follows the path; None: there is no path.
 
-        Beyond its last point the path goes on as it bends there.
+        Beyond its last point, the path continues with the curvature there.
         """
-        if not self._bends_per_m:
+        if not self._curvatures_per_m:
             return None
         car = self._odometry.at(now_ns)
         distance_m = lookahead_m(LOOKAHEAD_S, car.speed_mps)
-        along_m = car.travelled_m - self._begin.travelled_m + distance_m
-        goal_x_m, goal_y_m, _ = point_of(self._begin.place, self._bends_per_m, along_m)
-        x_m, y_m, heading_rad = car.place
-        # A path that bends back on itself has its point nearer than the way there; the wheel has its limits anyway.
-        away_m = max(math.hypot(goal_x_m - x_m, goal_y_m - y_m), distance_m / 2)
-        aside_rad = math.atan2(goal_y_m - y_m, goal_x_m - x_m) - heading_rad
-        return steering_rad(2 * math.sin(aside_rad) / away_m, self._wheelbase_m)
+        along_m = car.travelled_m - self._start.travelled_m + distance_m
+        goal_x_m, goal_y_m, _ = pose_along_path(self._start.pose, self._curvatures_per_m, along_m)
+        x_m, y_m, heading_rad = car.pose
+        # On a path that bends back on itself the goal may be very near; the limiter bounds the angle anyway.
+        goal_distance_m = max(math.hypot(goal_x_m - x_m, goal_y_m - y_m), distance_m / 2)
+        bearing_rad = math.atan2(goal_y_m - y_m, goal_x_m - x_m) - heading_rad
+        return steering_rad(2 * math.sin(bearing_rad) / goal_distance_m, self._wheelbase_m)
 
 
-def point_of(begin: Place, bends_per_m: tuple[float, ...], along_m: float) -> Place:
-    """Find the place `along_m` along a path from `begin`, whose curvatures are `PATH_STEP_M` apart from there on."""
-    place = begin
-    for before, after in pairwise(bends_per_m):
+def pose_along_path(start: PlanarPose, curvatures_per_m: tuple[float, ...], along_m: float) -> PlanarPose:
+    """Return the pose after `along_m` on a path from `start`, whose curvatures are `PATH_STEP_M` apart."""
+    pose = start
+    for before, after in pairwise(curvatures_per_m):
         if along_m <= PATH_STEP_M:
-            return moved(place, along_m, (before + after) / 2)
-        place = moved(place, PATH_STEP_M, (before + after) / 2)
+            return move_along_arc(pose, along_m, (before + after) / 2)
+        pose = move_along_arc(pose, PATH_STEP_M, (before + after) / 2)
         along_m -= PATH_STEP_M
-    return moved(place, along_m, bends_per_m[-1])
+    return move_along_arc(pose, along_m, curvatures_per_m[-1])

@@ -1,4 +1,4 @@
-"""Who asks for a vehicle that somebody else holds, and for whom it is kept once that one has released it."""
+"""Requests of other clients for a controlled vehicle, and its reservation for the requester after a release."""
 
 from __future__ import annotations
 
@@ -13,44 +13,47 @@ class _TakeoverRequest:
     instance: int
     until_ns: int
 
-    def is_of(self, request: SessionRequest) -> bool:
+    def is_from(self, request: SessionRequest) -> bool:
         return (request.who, request.instance) == (self.who, self.instance)
 
 
 class TakeoverRequests:
-    """One client at a time asks, the first that does; then it is kept for that one. Both lapse by themselves.
+    """The pending handover request of at most one client, which becomes a reservation when control is released.
 
-    Times are of the server's monotonic clock.
+    The first requester has priority. Request and reservation both expire. Times are on the server's monotonic clock.
     """
 
-    def __init__(self, *, handover_request_timeout_ns: int, kept_ns: int) -> None:
+    def __init__(self, *, handover_request_timeout_ns: int, reservation_ns: int) -> None:
         self._handover_request_timeout_ns = handover_request_timeout_ns
-        self._kept_ns = kept_ns
-        self._asking: _TakeoverRequest | None = None
-        self._kept: _TakeoverRequest | None = None
+        self._reservation_ns = reservation_ns
+        self._request: _TakeoverRequest | None = None
+        self._reservation: _TakeoverRequest | None = None
 
-    def ask(self, request: SessionRequest, now_ns: int) -> str:
-        """Note that somebody asks, or asks on; give why not, empty: it is noted."""
-        if self._asking is not None and now_ns < self._asking.until_ns and not self._asking.is_of(request):
-            return f"{self._asking.who} asks for it already"
-        self._asking = _TakeoverRequest(request.who, request.instance, now_ns + self._handover_request_timeout_ns)
+    def add(self, request: SessionRequest, now_ns: int) -> str:
+        """Store or renew a handover request; return why it is rejected, or an empty string."""
+        if self._request is not None and now_ns < self._request.until_ns and not self._request.is_from(request):
+            return f"{self._request.who} has requested control already"
+        self._request = _TakeoverRequest(request.who, request.instance, now_ns + self._handover_request_timeout_ns)
         return ""
 
     def requested_by(self, now_ns: int) -> str:
-        """Give the name of who asks; empty: nobody, or not any more."""
-        return self._asking.who if self._asking is not None and now_ns < self._asking.until_ns else ""
+        """Return the name of the client whose request is pending; empty: there is none."""
+        return self._request.who if self._request is not None and now_ns < self._request.until_ns else ""
 
-    def release(self, now_ns: int) -> None:
-        """Keep the vehicle, which is free now, for who asks for it."""
-        requested = self.requested_by(now_ns) and self._asking
-        self._kept = _TakeoverRequest(requested.who, requested.instance, now_ns + self._kept_ns) if requested else None
-        self._asking = None
+    def reserve(self, now_ns: int) -> None:
+        """Reserve the released vehicle for the client whose request is pending, if there is one."""
+        granted = self.requested_by(now_ns) and self._request
+        reserved_ns = now_ns + self._reservation_ns
+        self._reservation = _TakeoverRequest(granted.who, granted.instance, reserved_ns) if granted else None
+        self._request = None
 
     def reserved_for(self, request: SessionRequest, now_ns: int) -> str:
-        """Give the name of the other for whom the vehicle is kept; empty: who requests may have it."""
-        kept = self._kept
-        return "" if kept is None or now_ns >= kept.until_ns or kept.is_of(request) else kept.who
+        """Return the name of another client that has a reservation; empty: this requester may acquire control."""
+        reservation = self._reservation
+        if reservation is None or now_ns >= reservation.until_ns or reservation.is_from(request):
+            return ""
+        return reservation.who
 
-    def forget(self) -> None:
-        """Somebody holds the vehicle now: all claims are over."""
-        self._asking = self._kept = None
+    def clear(self) -> None:
+        """Drop request and reservation: a client has acquired control."""
+        self._request = self._reservation = None

@@ -1,1 +1,1 @@
-"""How pictures and commands travel: steps 2 to 8 and 11 of the life of a frame."""
+"""Transport of video, commands and states between vehicle and operator: steps 2 to 8 and 11 of the life of a frame."""

@@ -1,4 +1,4 @@
-"""When a datagram arrived, by the kernel: a process that comes late to its socket must not count as delay."""
+"""Arrival times of datagrams by the kernel, so that a process that reads its socket late does not add to the delay."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import struct
 from lavt.domain import NS_PER_S, Now
 
 SO_TIMESTAMPNS = 35
-"""Linux: time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; not named in `socket`."""
+"""Linux: the time of arrival as two 64-bit numbers, seconds and nanoseconds of the wall clock; not in `socket`."""
 ANCILLARY_BYTES = 64
-"""Room for it in `recvmsg`."""
-QUEUED_LONGEST_NS = 10 * NS_PER_S
-"""A kernel's stamp further back than this is not believed: the wall clock was stepped in between."""
+"""The buffer size for ancillary data in `recvmsg`."""
+MAX_QUEUED_NS = 10 * NS_PER_S
+"""An older kernel timestamp is ignored: the wall clock was stepped in the meantime."""
 
 Ancillary = list[tuple[int, int, bytes]]
 
 
-def want_arrival_times(opened: socket.socket) -> None:
-    """Ask the kernel to stamp what comes in on a socket; where it cannot, `arrival` gives the time of reading."""
+def enable_arrival_times(opened: socket.socket) -> None:
+    """Enable kernel timestamps of received datagrams; without support `arrival` returns the time of reading."""
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     except OSError:
@@ -26,11 +26,14 @@ def want_arrival_times(opened: socket.socket) -> None:
 
 
 def arrival(ancillary: Ancillary, now: Now) -> Now:
-    """Bring the kernel's stamp, which is wall time, to both clocks; without one it is `now`, the time of reading."""
+    """Return the time of arrival on both clocks, from the kernel's wall-clock timestamp.
+
+    Without a plausible timestamp this is `now`, the time of reading.
+    """
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) >= 16:
             seconds, nanoseconds = struct.unpack_from("qq", data)
             queued_ns = now.wall_ns - (seconds * NS_PER_S + nanoseconds)
-            if 0 <= queued_ns < QUEUED_LONGEST_NS:
+            if 0 <= queued_ns < MAX_QUEUED_NS:
                 return now.later(-queued_ns)
     return now

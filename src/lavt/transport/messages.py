@@ -1,7 +1,7 @@
-"""Messages between the two sides: msgpack arrays with a version first, checked before anything else sees them.
+"""Encode and decode the messages between the two sides: msgpack arrays that begin with a version.
 
-A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` refuses what is
-too long, not msgpack, of another version or shape, not finite, or out of range, with `BadMessage`.
+A message on the wire is `[version, field, field, ..]`, the fields in the order of the class. `decode` raises
+`BadMessage` for data that is too long, not msgpack, of another version or shape, not finite, or out of range.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from lavt.errors import BadMessage
 VERSION = 2
 MAX_MESSAGE_BYTES = 1024
 NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,31}\Z")
-"""What a vehicle and a client may be called: nothing that means something in a Zenoh key."""
-LONGEST_DELAY_MS = 10_000.0
-"""That can be asked of a server: it is busy with clearing it for as long."""
+"""A valid name of a vehicle or client: it contains nothing that has a meaning in a Zenoh key."""
+MAX_DELAY_MS = 10_000.0
+"""Limits what a client can request of a server, which needs as long to clear the delay."""
 
 Check = Callable[[Any], bool]
 _NUMBERS = frozenset((int, float))
@@ -35,12 +35,12 @@ def _integer(low: int, high: int) -> Check:
 
 
 def _number(low: float, high: float) -> Check:
-    return lambda value: type(value) in _NUMBERS and low <= value <= high  # which what is not a number is not
+    return lambda value: type(value) in _NUMBERS and low <= value <= high  # false for NaN
 
 
-def _text(longest: int) -> Check:
-    """Check a text's bytes, not its letters: all that passes the checks together fits into a message."""
-    return lambda value: type(value) is str and len(value.encode()) <= longest
+def _text(max_bytes: int) -> Check:
+    """Return a check of a text's length in bytes, so that texts of any letters fit into a message."""
+    return lambda value: type(value) is str and len(value.encode()) <= max_bytes
 
 
 def _one_of(*choices: str) -> Check:
@@ -51,7 +51,7 @@ def _name(value: object) -> bool:
     return type(value) is str and NAME.match(value) is not None
 
 
-def _name_or_none(value: object) -> bool:
+def _name_or_empty(value: object) -> bool:
     return value == "" or _name(value)
 
 
@@ -60,7 +60,7 @@ def _bytes(*lengths: int) -> Check:
 
 
 def _curvatures(value: object) -> bool:
-    """Check all at once: the sum of what holds one that is no number, or infinite, is not finite."""
+    """Return whether the value is a tuple of curvatures; the sum is not finite if one of them is NaN or infinite."""
     return (
         type(value) is tuple
         and len(value) == PATH_POINTS
@@ -74,7 +74,7 @@ def _curvatures(value: object) -> bool:
 U64 = _integer(0, 2**64 - 1)
 TIME = _integer(0, 2**63 - 1)
 LAST_STOP = _integer(0, 2**62)
-"""No vehicle tells of an emergency stop with a higher number: its operator's next one must still be a `TIME`."""
+"""The highest number of an emergency stop in a reply: the operator's next number must still be a `TIME`."""
 ROAD_WHEEL = _number(-1.0, 1.0)
 UNIT = _number(0.0, 1.0)
 RATE = _integer(10_000, 10**11)
@@ -104,9 +104,9 @@ CHECKS: dict[type, dict[str, Check]] = {
         "applied_sequence": _integer(-1, 2**63 - 1),
         "rejected": _text(200),
         "limited": _text(100),
-        "active_operator": _name_or_none,
+        "active_operator": _name_or_empty,
         "active_operator_instance": U64,
-        "requested_by": _name_or_none,
+        "requested_by": _name_or_empty,
         "instance": U64,
     },
     SessionRequest: {
@@ -129,22 +129,22 @@ CHECKS: dict[type, dict[str, Check]] = {
         "instance": U64,
         "condition": _text(32),
         "lease_ms": _integer(0, 60_000),
-        "delay_ms": _number(0.0, LONGEST_DELAY_MS),
-        "jitter_ms": _number(0.0, LONGEST_DELAY_MS),
+        "delay_ms": _number(0.0, MAX_DELAY_MS),
+        "jitter_ms": _number(0.0, MAX_DELAY_MS),
         "jitter_correlation": UNIT,
         "jitter_distribution": _one_of("uniform", "normal", "pareto", "paretonormal"),
         "loss": UNIT,
         "loss_burst_packets": _number(0.0, 10_000.0),
         "rate_bps": lambda value: type(value) is int and (value == 0 or RATE(value)),
         "reorder": UNIT,
-        "state_delay_ms": _number(0.0, LONGEST_DELAY_MS),
+        "state_delay_ms": _number(0.0, MAX_DELAY_MS),
     },
     NetemReply: {"granted": lambda value: type(value) is bool, "reason": _text(400)},
 }
 
-_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
-_IN_ORDER: dict[type, tuple[Check, ...]] = {kind: tuple(checks.values()) for kind, checks in CHECKS.items()}
-_FIELDS: dict[type, Callable[[Any], tuple[Any, ...]]] = {
+_FIELD_NAMES: dict[type, tuple[str, ...]] = {kind: tuple(checks) for kind, checks in CHECKS.items()}
+_FIELD_CHECKS: dict[type, tuple[Check, ...]] = {kind: tuple(checks.values()) for kind, checks in CHECKS.items()}
+_FIELD_VALUES: dict[type, Callable[[Any], tuple[Any, ...]]] = {
     kind: attrgetter(*(field.name for field in fields(kind))) for kind in CHECKS
 }
 
@@ -152,33 +152,33 @@ Kind = TypeVar("Kind", Command, State, SessionRequest, SessionReply, NetemReques
 
 
 def encode(message: Command | State | SessionRequest | SessionReply | NetemRequest | NetemReply) -> bytes:
-    """Put `message` into bytes for the wire."""
-    packed: bytes = msgpack.packb([VERSION, *_FIELDS[type(message)](message)])
+    """Return the bytes of `message` on the wire."""
+    packed: bytes = msgpack.packb([VERSION, *_FIELD_VALUES[type(message)](message)])
     return packed
 
 
 def decode(kind: type[Kind], data: bytes) -> Kind:
-    """Read a message of class `kind`; raises `BadMessage` for anything that is not one, and nothing else."""
-    which: Any = kind
-    message: Kind = _decoded(which, bytes(data))
+    """Return the message of class `kind` in `data`; raise `BadMessage` for invalid data, and nothing else."""
+    untyped: Any = kind
+    message: Kind = _decode(untyped, bytes(data))
     return message
 
 
-@lru_cache(maxsize=512)  # in virtual time both records and the receiver read the same bytes
-def _decoded(kind: type[Any], data: bytes) -> Any:
+@lru_cache(maxsize=512)  # in virtual time both records and the receiver decode the same bytes
+def _decode(kind: type[Any], data: bytes) -> Any:
     if len(data) > MAX_MESSAGE_BYTES:
-        raise BadMessage(f"{len(data)} bytes are more than a message may have ({MAX_MESSAGE_BYTES})")
+        raise BadMessage(f"{len(data)} bytes exceed the maximum of a message ({MAX_MESSAGE_BYTES})")
     try:
         values = msgpack.unpackb(data, use_list=False, raw=False, strict_map_key=True)
     except Exception as error:  # the parser has half a dozen kinds of error, and bytes from outside may cause any
         raise BadMessage("not msgpack") from error
-    checks = _IN_ORDER[kind]
+    checks = _FIELD_CHECKS[kind]
     if type(values) is not tuple or len(values) != 1 + len(checks):
-        raise BadMessage(f"not the shape of a {kind.__name__}")
-    version, *given = values
+        raise BadMessage(f"not an array of the fields of a {kind.__name__}")
+    version, *field_values = values
     if type(version) is not int or version != VERSION:
         raise BadMessage("a message of another version")
     for index, check in enumerate(checks):
-        if not check(given[index]):
-            raise BadMessage(f"{kind.__name__}.{_NAMES[kind][index]} is out of range")
-    return kind(*given)
+        if not check(field_values[index]):
+            raise BadMessage(f"{kind.__name__}.{_FIELD_NAMES[kind][index]} is out of range")
+    return kind(*field_values)

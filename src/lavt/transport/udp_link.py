@@ -1,4 +1,4 @@
-"""UDP sockets, one on each side for the video and one for the probe, with the kernel's time of arrival."""
+"""UDP sockets for the video and the clock probe, with arrival times by the kernel."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from lavt.clock import Clock
 from lavt.domain import Now
 from lavt.errors import UserError
 from lavt.node import Send
-from lavt.transport.arrival import ANCILLARY_BYTES, arrival, want_arrival_times
+from lavt.transport.arrival import ANCILLARY_BYTES, arrival, enable_arrival_times
 
 Deliver = Callable[[str, Any, Now, Any], None]
-"""(channel, payload, arrived, peer): what a link does with what comes in."""
+"""Takes (channel, payload, arrived, peer) of each received message."""
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
-LONGEST_DATAGRAM = 65_535
+MAX_DATAGRAM_BYTES = 65_535
 
 
 class UdpLink:
     """A UDP socket and a thread that receives.
 
-    `channel` names what comes in, `name` says what the port is for. `peer` of what goes out is an address, or for a
-    client, whose server is known by `remote`, the port, which counts where that of `remote` is 0. A client hears its
-    server only: what comes from elsewhere is counted, not delivered. Who only listens may name the one host, by its
-    number, that is heard (`only_from`). Raises `UserError` for a port that cannot be opened and for a host that is not
-    known.
+    Received datagrams are delivered on `channel`; `name` is the purpose of the port in messages. Without `remote` the
+    peer of a `Send` is the destination address. With `remote`, the server of a client, datagrams go to that host; the
+    peer is then the port, which is used if the port of `remote` is 0. Datagrams from any other address than the
+    server's are counted and not delivered. A link that only receives may be restricted to the numeric host
+    `only_from`. Raises `UserError` for a port that cannot be opened and for an unknown host.
     """
 
     def __init__(
@@ -47,59 +47,59 @@ class UdpLink:
         self._clock = clock
         self._channel = channel
         self._deliver = deliver
-        self._remote = None if remote is None else (look_up("video.server", remote[0]), remote[1])
+        self._remote = None if remote is None else (resolve_host("video.server", remote[0]), remote[1])
         self._server: tuple[str, int] | None = None
         self._only_from = only_from
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        want_arrival_times(self._socket)
+        enable_arrival_times(self._socket)
         try:
             self._socket.bind(bind)
         except (OSError, ValueError) as error:
             self._socket.close()
             raise UserError(
-                f"the {name} port {bind[0]}:{bind[1]} cannot be opened ({_why(error)}): choose another, or 0 for any"
+                f"the {name} port {bind[0]}:{bind[1]} cannot be opened ({_reason(error)}): choose another, or 0 for any"
             ) from error
-        self._room = memoryview(bytearray(LONGEST_DATAGRAM))
+        self._buffer = memoryview(bytearray(MAX_DATAGRAM_BYTES))
         self._closing = False
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
 
     @property
     def port(self) -> int:
-        """The port that was opened."""
+        """The UDP port of the socket."""
         return int(self._socket.getsockname()[1])
 
     def start(self) -> None:
-        """Begin to receive."""
+        """Start to receive."""
         self._thread.start()
 
     def send(self, *sends: Send) -> None:
-        """Send datagrams; what the network refuses is counted."""
+        """Send datagrams; count those that the system rejects."""
         for send in sends:
             address = send.peer
             if self._remote is not None:
                 address = self._server = (self._remote[0], self._remote[1] or send.peer)
             try:
                 self._socket.sendto(send.payload, socket.MSG_DONTWAIT, address)
-            except OSError:  # what the system cannot take now is lost, as on the way: no frame waits for the one before
+            except OSError:  # lost, as on the network: no frame waits for the one before it
                 self.counts["datagrams_not_sent"] += 1
 
     def close(self) -> None:
         """Stop receiving and close the socket."""
         self._closing = True
-        with suppress(OSError):  # it says that there is no connection, and ends the waiting all the same
+        with suppress(OSError):  # it raises "not connected", but still ends the wait in recvmsg
             self._socket.shutdown(socket.SHUT_RD)
         if self._thread.is_alive():
             self._thread.join()
         self._socket.close()
 
     def _receive(self) -> None:
-        """Deliver what comes, one datagram for each call of the system; the waiting is in it."""
-        room = self._room
+        """Deliver datagrams, with one blocking system call each."""
+        buffer = self._buffer
         while True:
             try:
-                length, ancillary, _flags, address = self._socket.recvmsg_into((room,), ANCILLARY_BYTES)
-            except OSError:  # an ICMP error of an earlier datagram
+                length, ancillary, _flags, address = self._socket.recvmsg_into((buffer,), ANCILLARY_BYTES)
+            except OSError:  # an ICMP error for a datagram sent before
                 if self._closing:
                     return
                 self.counts["datagrams_rejected"] += 1
@@ -109,7 +109,7 @@ class UdpLink:
             if self._is_stranger(address):
                 self.counts["datagrams_from_strangers"] += 1
                 continue
-            self._deliver(self._channel, bytes(room[:length]), arrival(ancillary, self._clock.now()), address)
+            self._deliver(self._channel, bytes(buffer[:length]), arrival(ancillary, self._clock.now()), address)
 
     def _is_stranger(self, address: tuple[str, int]) -> bool:
         if self._only_from is not None and address[0] != self._only_from:
@@ -117,17 +117,17 @@ class UdpLink:
         return self._remote is not None and address != self._server
 
 
-def look_up(key: str, host: str) -> str:
-    """Look a host up, once: no datagram waits for a name server, and senders are compared by their numbers.
+def resolve_host(key: str, host: str) -> str:
+    """Return the numeric address of a host; raise `UserError` that names the config `key` if it is unknown.
 
-    Raises `UserError` naming the config `key` where nobody knows the host.
+    Resolved once, no datagram waits for a name server, and senders can be compared by address.
     """
     try:
         return socket.gethostbyname(host)
     except (OSError, ValueError) as error:
-        raise UserError(f"{key}: the host {host!r} is not known ({_why(error)}): name another") from error
+        raise UserError(f"{key}: the host {host!r} is not known ({_reason(error)}): name another") from error
 
 
-def _why(error: OSError | ValueError) -> str:
-    """Say why an address cannot be used; a ValueError is that of a host that cannot be a name at all."""
+def _reason(error: OSError | ValueError) -> str:
+    """Return the reason why an address cannot be used; a ValueError comes from a host that is not a valid name."""
     return str(error.strerror if isinstance(error, OSError) else error)

@@ -1,100 +1,101 @@
-"""What LAVT needs of a camera. Only the camera node calls it."""
+"""The camera interface. Only the camera node calls it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
-from lavt.domain import NS_PER_S, CameraModel, Pose, Sight
+from lavt.domain import NS_PER_S, CameraModel, FramePayload, Pose
 from lavt.value import value
 
 
 @value
 class CapturedFrame:
-    """A picture and when it was taken (server's monotonic clock, middle of exposure); None where it is not known.
+    """A picture with its capture time: the middle of the exposure on the server's monotonic clock, None if unknown.
 
-    Of a V4L2 device it is what its driver says, the beginning of the exposure or the end of the transfer
+    For a V4L2 device the capture time is the driver's: the beginning of the exposure or the end of the transfer
     (docs/camera.md).
 
-    The picture is (height, width, 3), blue green red, or what the camera gives in I420, (height * 3 / 2, width): that
-    goes into the encoder as it is.
+    The picture is (height, width, 3) in blue, green, red order, or I420 as the camera delivers it,
+    (height * 3 / 2, width), which goes into the encoder unchanged.
     """
 
     number: int
     capture_ns: int | None
-    picture: Sight
+    picture: FramePayload
 
 
 @value
 class FrameTimes:
-    """When a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
+    """The times at which a camera's shutter opens (or closes) for each frame, on the server's monotonic clock."""
 
     first_ns: int
     rate_hz: float
 
     def due_ns(self, number: int) -> int:
-        """When it does for frame `number`; from the number each time, so that nothing drifts."""
+        """Return the time of frame `number`, computed from the number so that no error accumulates."""
         return self.first_ns + round(number * NS_PER_S / self.rate_hz)
 
 
 def newest_pose(poses: Sequence[Pose], at_ns: int) -> Pose | None:
-    """Give the last pose at or before a time, of poses that are sorted by time; None when all are later."""
+    """Return the last pose at or before a time; None when all are later. The poses are sorted by time."""
     return next((pose for pose in reversed(poses) if pose.mono_ns <= at_ns), None)
 
 
 class Camera(Protocol):
-    """Something that gives a frame at a time."""
+    """A source of frames, captured one at a time."""
 
     @property
     def model(self) -> CameraModel:
-        """Geometry of the pictures."""
+        """The geometry of the pictures."""
         ...
 
     @property
     def rate_hz(self) -> float:
-        """Frames a second."""
+        """Frames per second."""
         ...
 
     @property
     def phase_ns(self) -> int:
-        """When frame 0 is taken, after the start, in [0, 1 / rate)."""
+        """The time from the start to frame 0, in [0, 1 / rate)."""
         ...
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
-        """Give frame `number`, taken at `at_ns`; None when there is no picture.
+        """Return frame `number`, captured at `at_ns`; None when there is no picture.
 
-        `pose` is the newest pose at or before `at_ns`; only a simulated camera has to do with it.
+        `pose` is the newest pose at or before `at_ns`; only a simulated camera uses it.
         """
         ...
 
 
 @runtime_checkable
 class TimedCamera(Camera, Protocol):
-    """A camera that knows how long its shutter is open and how long its pictures take; the others need not."""
+    """A camera that knows its exposure time and its sensor delay; other cameras need not."""
 
     @property
     def exposure_ns(self) -> int:
-        """How long the shutter is open; 0 is a moment."""
+        """The exposure time; 0 means an instant."""
         ...
 
     @property
     def sensor_delay_ns(self) -> int:
-        """From the end of the exposure to the picture being there."""
+        """The time from the end of the exposure until the picture is available."""
         ...
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-        """Give frame `number`, whose shutter opened at `begin_ns`; asked when its picture is there; None without one.
+        """Return frame `number`, whose shutter opened at `begin_ns`; None when there is no picture.
 
-        `poses` are those known by then, oldest first; only a simulated camera has to do with them.
+        It is called when the picture is available. `poses` are the poses known by then, oldest first; only a simulated
+        camera uses them.
         """
         ...
 
 
 @runtime_checkable
 class CountingCamera(Camera, Protocol):
-    """A camera of which pictures can get lost before anybody asks for them; the others need not count."""
+    """A camera that can lose pictures before they are requested, and counts them; other cameras need not."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What has happened to it so far; for the record."""
+        """The counters so far, for the record."""
         ...

@@ -1,4 +1,4 @@
-"""CAN frames as plain values, and what they come and go by."""
+"""CAN frames as plain values, and the interface of a CAN bus."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lavt.value import value
 
 @value
 class CanFrame:
-    """A CAN data frame; its length (DLC) is that of `data`, 0 to 8 bytes."""
+    """A CAN data frame. The length of `data`, 0 to 8 bytes, is the frame's DLC."""
 
     identifier: int
     data: bytes
@@ -19,36 +19,36 @@ class CanFrame:
 
 @value
 class ReceivedCanFrame:
-    """A frame that came from the bus, and when (this host's monotonic clock)."""
+    """A frame received from the bus, with its arrival time on this host's monotonic clock."""
 
     frame: CanFrame
     arrived_ns: int
 
 
 class BusGone(Exception):
-    """The bus cannot be written to or read from; the text says why."""
+    """Raised when the bus cannot be written to or read from; the message gives the reason."""
 
 
 class BusPort(Protocol):
-    """One side's access to a bus."""
+    """One participant's access to a CAN bus."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted."""
+        """Event counters by name."""
         ...
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Send frames that were made at a time, in order, without waiting; raises `BusGone`."""
+        """Send frames made at `made_ns`, in order and without blocking. Raises `BusGone`."""
         ...
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
-        """Take what has come since the last call, in order; own frames are not among it. Raises `BusGone`."""
+        """Return the frames received since the last call, in order, without own frames. Raises `BusGone`."""
         ...
 
     def next_wake_ns(self) -> int | None:
-        """When `take` has something at the latest; None: nobody knows."""
+        """Return the latest time at which `take` has a frame, or None if it is not known."""
         ...
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the connection to the bus."""
         ...

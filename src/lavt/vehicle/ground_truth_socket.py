@@ -1,4 +1,4 @@
-"""Where a software car's truth is heard: a UDP socket of this machine that never waits."""
+"""A non-blocking UDP socket that receives a software car's ground truth on the same machine."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from lavt.domain import GroundTruth, VehicleEvent
 from lavt.errors import UserError
 from lavt.vehicle.ground_truth_wire import MAX_BYTES, TruthReceiver
 
-MOST = 256
-"""So many datagrams are taken at a time: a second of them."""
+MAX_DATAGRAMS = 256
+"""Datagrams read in one call: a second of them."""
 
 
 class TruthSocket:
-    """Hears `lavt.vehicle.ground_truth_wire` on an address; raises `UserError` where it cannot."""
+    """A socket for datagrams of `lavt.vehicle.ground_truth_wire`. Raises `UserError` if its address cannot be bound."""
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._receiver = TruthReceiver()
@@ -25,29 +25,29 @@ class TruthSocket:
         except OSError as error:
             self._socket.close()
             raise UserError(
-                f"the truth of a software car cannot be heard on {address[0]}:{address[1]} ({error.strerror}): choose "
+                f"cannot receive a software car's ground truth on {address[0]}:{address[1]} ({error.strerror}): choose "
                 "another vehicle.dbw.truth"
             ) from None
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The local port."""
         return int(self._socket.getsockname()[1])
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What came."""
+        """Counters of received datagrams."""
         return self._receiver.counts
 
     def take(self, _now_ns: int) -> tuple[GroundTruth | None, list[VehicleEvent]]:
-        """Give the newest truth, None before there was one, and what has happened since the last call."""
+        """Return the newest truth, or None before the first one, and the events since the last call."""
         events: list[VehicleEvent] = []
-        for _ in range(MOST):
+        for _ in range(MAX_DATAGRAMS):
             try:
                 datagram = self._socket.recv(MAX_BYTES + 1)
             except BlockingIOError:
                 break
-            events += self._receiver.take(datagram)
+            events += self._receiver.receive(datagram)
         return self._receiver.newest, events
 
     def close(self) -> None:

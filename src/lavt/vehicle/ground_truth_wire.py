@@ -1,8 +1,8 @@
-"""The truth of a software car, and what happened to it, in datagrams to the server on the same machine.
+"""Datagrams that carry a software car's ground truth and events to the server on the same machine.
 
-A datagram is a msgpack array `[version, truth, events]`: `truth` has the fields of a `GroundTruth` in their order,
-`events` is a list of `[number, mono_ns, kind, detail]`. Events have growing numbers and are said again in the datagrams
-that follow, so that none is missed where some are lost. All times are of the monotonic clock of this one machine.
+A datagram is a msgpack array `[version, truth, events]`: `truth` has the fields of a `GroundTruth` in order,
+`events` is a list of `[number, mono_ns, kind, detail]`. Event numbers increase, and each event is repeated in the
+following datagrams, so that a lost datagram loses no event. All times are of the monotonic clock of this machine.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ from lavt.domain import EventKind, GroundTruth, VehicleEvent
 
 VERSION: Final = 1
 REPEATS: Final = 20
-"""So many datagrams say an event."""
+"""An event is sent in this many datagrams."""
 MAX_EVENTS: Final = 16
-"""So many events are in a datagram; more have to wait for the next."""
+"""Events per datagram; further events wait for the next one."""
 MAX_DETAIL: Final = 200
-"""Letters of an event's detail: longer ones are cut."""
+"""Characters of an event's detail; a longer detail is cut."""
 MAX_BYTES: Final = 16_384
-LATEST: Final = 2**63
+TIME_LIMIT_NS: Final = 2**63
 KINDS: Final = frozenset(get_args(EventKind))
 
-_NAMES = [field.name for field in fields(GroundTruth)]
-_numbers_of = attrgetter(*_NAMES)
+_TRUTH_FIELDS = [field.name for field in fields(GroundTruth)]
+_truth_values = attrgetter(*_TRUTH_FIELDS)
 
-Numbered = tuple[int, VehicleEvent]
-
-
-def write_truth(truth: GroundTruth, events: Sequence[Numbered]) -> bytes:
-    """Write a datagram of the truth and of numbered events, at most `MAX_EVENTS`."""
-    told = [(number, event.mono_ns, event.kind, event.detail[:MAX_DETAIL]) for number, event in events]
-    return bytes(msgpack.packb((VERSION, _numbers_of(truth), told)))
+NumberedEvent = tuple[int, VehicleEvent]
 
 
-def read_truth(datagram: bytes) -> tuple[GroundTruth, list[Numbered]] | None:
-    """Read what `write_truth` wrote; None for anything else."""
+def encode_truth(truth: GroundTruth, events: Sequence[NumberedEvent]) -> bytes:
+    """Return a datagram with the truth and numbered events, at most `MAX_EVENTS`."""
+    encoded = [(number, event.mono_ns, event.kind, event.detail[:MAX_DETAIL]) for number, event in events]
+    return bytes(msgpack.packb((VERSION, _truth_values(truth), encoded)))
+
+
+def decode_truth(datagram: bytes) -> tuple[GroundTruth, list[NumberedEvent]] | None:
+    """Decode a datagram of `encode_truth`; return None for anything else."""
     if len(datagram) > MAX_BYTES:
         return None
     try:
-        told = msgpack.unpackb(datagram, use_list=False)
+        decoded = msgpack.unpackb(datagram, use_list=False)
     except Exception:
         return None
-    if not (type(told) is tuple and len(told) == 3 and type(told[0]) is int and told[0] == VERSION):
+    if not (type(decoded) is tuple and len(decoded) == 3 and type(decoded[0]) is int and decoded[0] == VERSION):
         return None
-    _, numbers, events = told
-    if not (_is_truth(numbers) and type(events) is tuple and len(events) <= MAX_EVENTS and all(map(_is_event, events))):
+    _, values, events = decoded
+    if not (_is_truth(values) and type(events) is tuple and len(events) <= MAX_EVENTS and all(map(_is_event, events))):
         return None
-    return GroundTruth(*numbers), [(number, VehicleEvent(*event)) for number, *event in events]
+    return GroundTruth(*values), [(number, VehicleEvent(*event)) for number, *event in events]
 
 
 def _is_time(value: Any) -> bool:
-    return type(value) is int and 0 <= value < LATEST
+    return type(value) is int and 0 <= value < TIME_LIMIT_NS
 
 
-def _is_truth(numbers: Any) -> bool:
+def _is_truth(values: Any) -> bool:
     return (
-        type(numbers) is tuple
-        and len(numbers) == len(_NAMES)
-        and _is_time(numbers[0])
-        and all(type(number) is float and math.isfinite(number) for number in numbers[1:])
+        type(values) is tuple
+        and len(values) == len(_TRUTH_FIELDS)
+        and _is_time(values[0])
+        and all(type(number) is float and math.isfinite(number) for number in values[1:])
     )
 
 
@@ -84,42 +84,42 @@ def _is_event(event: Any) -> bool:
 
 
 class TruthSender:
-    """Numbers events and says each in `REPEATS` datagrams.
+    """An encoder that numbers events and repeats each in `REPEATS` datagrams.
 
-    The first number is the time of the start: those of a car that was started again are greater than any before.
+    Numbering begins with the start time, so that the numbers of a restarted car exceed all earlier ones.
     """
 
     def __init__(self, start_ns: int) -> None:
         self._number = start_ns
-        self._waiting: deque[tuple[int, Numbered]] = deque()
-        """How often each event is still to be said."""
+        self._pending: deque[tuple[int, NumberedEvent]] = deque()
+        """Remaining repetitions of each event."""
 
-    def datagram(self, truth: GroundTruth, happened: Sequence[VehicleEvent]) -> bytes:
-        """Make the next datagram; `happened` are the events since the last one."""
-        for event in happened:
+    def make_datagram(self, truth: GroundTruth, new_events: Sequence[VehicleEvent]) -> bytes:
+        """Return the next datagram; `new_events` are the events since the last one."""
+        for event in new_events:
             self._number += 1
-            self._waiting.append((REPEATS, (self._number, event)))
-        said = [self._waiting.popleft() for _ in range(min(MAX_EVENTS, len(self._waiting)))]
-        self._waiting.extendleft((left - 1, event) for left, event in reversed(said) if left > 1)
-        return write_truth(truth, [event for _, event in said])
+            self._pending.append((REPEATS, (self._number, event)))
+        chosen = [self._pending.popleft() for _ in range(min(MAX_EVENTS, len(self._pending)))]
+        self._pending.extendleft((left - 1, event) for left, event in reversed(chosen) if left > 1)
+        return encode_truth(truth, [event for _, event in chosen])
 
 
 class TruthReceiver:
-    """Takes datagrams from the network: anything may come, and whatever is not the truth is counted and dropped."""
+    """A decoder for untrusted datagrams; anything but a valid truth is counted and dropped."""
 
     def __init__(self) -> None:
         self.newest: GroundTruth | None = None
         self.counts: Counter[str] = Counter()
-        """`truths`, `garbage`, and `old`: older than the newest."""
+        """`truths`, `garbage`, and `old` (older than the newest)."""
         self._number = -1
 
-    def take(self, datagram: bytes) -> list[VehicleEvent]:
-        """Take a datagram: what is new of the truth is in `newest`; gives events that were not taken before."""
-        told = read_truth(datagram)
-        if told is None:
+    def receive(self, datagram: bytes) -> list[VehicleEvent]:
+        """Update `newest` from a datagram and return its events that were not returned before."""
+        decoded = decode_truth(datagram)
+        if decoded is None:
             self.counts["garbage"] += 1
             return []
-        truth, events = told
+        truth, events = decoded
         if self.newest is not None and truth.mono_ns < self.newest.mono_ns:
             self.counts["old"] += 1
         else:

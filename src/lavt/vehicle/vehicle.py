@@ -1,4 +1,4 @@
-"""What LAVT needs of a vehicle. Only the actuator node calls it."""
+"""The interface between LAVT and a vehicle. Only the actuator node calls it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavt.value import value
 
 @value
 class ReachedCommand:
-    """At `reached_ns` the vehicle said that it steers by what was applied at `applied_ns`."""
+    """A command, applied at `applied_ns`, that the vehicle reported at `reached_ns` to be steering by."""
 
     applied_ns: int
     reached_ns: int
@@ -20,11 +20,11 @@ class ReachedCommand:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a vehicle is and can do."""
+    """The properties of a vehicle that LAVT depends on."""
 
     simulated: bool
     virtual_time: bool
-    """It can be driven in virtual time."""
+    """The vehicle can be driven in virtual time."""
     ground_truth: bool
     reset: bool
     wheelbase_m: float
@@ -37,51 +37,51 @@ class Capabilities:
 
 
 class Vehicle(Protocol):
-    """A car that can be driven by command."""
+    """A car that is driven by commands."""
 
     @property
     def capabilities(self) -> Capabilities:
-        """What this vehicle is and can do."""
+        """The properties of this vehicle."""
         ...
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
-        """Live on to `to_ns` (server's monotonic clock) and return what happened on the way, in order."""
+        """Advance to `to_ns` (server's monotonic clock) and return the events since the last call, in order."""
         ...
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Obey `actuation` from `now_ns` on, until the next one."""
+        """Apply `actuation` from `now_ns` on, until the next call."""
         ...
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Be ready to obey, or need not be any more; may be called again and again.
+        """Engage or disengage the vehicle. Repeated calls with the same `wanted` have no effect.
 
-        A vehicle that takes time for it says in its state when it is engaged. One that is not wanted any more obeys
-        nothing but a brake, and holds itself once it stands.
+        A vehicle that needs time to engage reports in its state when it is engaged. A disengaged vehicle accepts no
+        command but the brake, and stays in place once it is stationary.
         """
         ...
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Take what of the applied was seen to reach the wheels since the last call; empty where it cannot be seen."""
+        """Return the commands reported as reached since the last call; empty if the vehicle cannot report them."""
         ...
 
     def state(self) -> VehicleState:
-        """Tell the newest state the vehicle reports of itself."""
+        """Return the newest state that the vehicle reported."""
         ...
 
     def ground_truth(self) -> GroundTruth | None:
-        """Tell the truth, where there is one (`capabilities.ground_truth`)."""
+        """Return the ground truth, or None if the vehicle has none (`capabilities.ground_truth`)."""
         ...
 
     def next_wake_ns(self) -> int:
-        """Tell when the vehicle wants `advance` called next."""
+        """Return the time by which `advance` should be called next."""
         ...
 
 
 @runtime_checkable
 class CountingVehicle(Vehicle, Protocol):
-    """A vehicle that counts what goes wrong on the way to it; the others need not."""
+    """A vehicle with error counters of its own; optional."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted so far; for the record."""
+        """Counters so far, for the record."""
         ...

@@ -1,4 +1,4 @@
-"""A real camera: a V4L2 device, or a file or an address that OpenCV opens, read by a thread of its own."""
+"""A real camera: a V4L2 device, or a file or address that OpenCV opens, read in a thread of its own."""
 
 from __future__ import annotations
 
@@ -24,22 +24,24 @@ from lavt.vehicle.camera import CapturedFrame
 log = logging.getLogger(__name__)
 
 RETRY_S: Final = 1.0
-"""A camera that gives nothing is opened again so often."""
-KNOWN_RATE_HZ: Final = 1000.0
-"""Streams without a rate of their own name that of their time stamps (90 kHz), which is none of pictures."""
+"""The interval at which a camera without pictures is reopened."""
+MAX_CREDIBLE_RATE_HZ: Final = 1000.0
+"""Streams without a frame rate report that of their timestamps (90 kHz), which is ignored."""
 RATE_TOLERANCE: Final = 0.01
-"""30 and 29.97 Hz are one rate."""
-OLDEST_BUFFER_NS: Final = NS_PER_S
-"""A buffer's time that lies longer ago is of another clock: V4L2 drivers hold a few pictures at most."""
-LATE_PERIODS: Final = 0.25
-"""So long a picture is waited for: a camera runs by a clock of its own, and where its pictures come just when they are
-asked for, many would be missed by a hair. They may be late by more than they vary, and one is missed only when the
-clocks have drifted apart by a period."""
-WAITS_PERIODS: Final = 2
-"""With equal rates a picture waits for one period at most; one that waited for two is of a camera that has stopped."""
-COUNTED: Final = (
+"""Relative: 30 and 29.97 Hz count as equal."""
+MAX_BUFFER_AGE_NS: Final = NS_PER_S
+"""An older buffer time is from another clock, because V4L2 drivers queue a few pictures at most."""
+WAIT_PERIODS: Final = 0.25
+"""The longest wait of `capture` for a picture, in frame periods.
+
+A camera has a clock of its own. Where pictures arrive just when they are requested, jitter would make `capture` miss
+many of them. The wait exceeds the jitter, so a picture is missed only when the clocks have drifted apart by a period.
+"""
+MAX_AGE_PERIODS: Final = 2
+"""With equal rates a picture waits one period at most; after two periods the camera has stopped."""
+COUNTER_NAMES: Final = (
     "pictures_read",
-    "pictures_replaced",  # by a newer one, before anybody asked
+    "pictures_replaced",  # by a newer one, before a request
     "pictures_too_old",
     "pictures_without_a_time",
     "pictures_of_another_size",
@@ -47,41 +49,41 @@ COUNTED: Final = (
     "times_back",
     "times_opened_again",
 )
-CLOSING_S: Final = 2.0
+CLOSE_TIMEOUT_S: Final = 2.0
 _TIMEOUT_MS: Final = 3000
 
-# A camera that is gone is said here once, in words, and not by OpenCV at each attempt.
+# This module logs a lost camera once; without this OpenCV would print a message at each attempt.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 @value
 class DeviceFormat:
-    """What a device gives: its pictures' size, and their rate as it says itself; None where it does not."""
+    """The size of a device's pictures, and the rate it reports; None if it reports none."""
 
     width_px: int
     height_px: int
     rate_hz: float | None
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Return the size and rate as text."""
         rate = "" if self.rate_hz is None else f" at {self.rate_hz:.4g} Hz"
         return f"{self.width_px}x{self.height_px}{rate}"
 
 
 @value
-class _Arrived:
+class _BufferedPicture:
     picture: Picture
     arrived_ns: int
     capture_ns: int | None
 
 
 class VideoDevice:
-    """A `Camera` that gives the newest picture that came since the last one it gave.
+    """A `Camera` that returns the newest picture received since its last frame.
 
-    `device` is a V4L2 device (its path or its number), or a file or address that OpenCV opens (FFmpeg): a file is
-    played at its own pace, over and over. `pixel_format` is V4L2's name of a format (four characters, such as MJPG);
-    empty: the driver's choice. Raises `UserError` for what cannot be opened, or gives pictures of another size or rate
-    than asked. What vanishes later is tried again each second; meanwhile there are no pictures.
+    `device` is a V4L2 device (its path or number), or a file or address that OpenCV opens with FFmpeg. A file is played
+    at its own rate in a loop. `pixel_format` is V4L2's name of a format (four characters, such as MJPG); if it is empty
+    the driver chooses. A `UserError` is raised if the device cannot be opened or has another size or rate than
+    requested. If the device disappears later, it is reopened each second; meanwhile there are no pictures.
     """
 
     phase_ns = 0
@@ -96,179 +98,181 @@ class VideoDevice:
         self._clock = clock
         self._is_v4l2 = self._device.startswith("/dev/")
         self._is_file = Path(self._device).is_file()
-        self._counts = Counter(dict.fromkeys(COUNTED, 0))
-        self._newest: _Arrived | None = None
-        self._came = threading.Condition()
+        self._counts = Counter(dict.fromkeys(COUNTER_NAMES, 0))
+        self._newest: _BufferedPicture | None = None
+        self._changed = threading.Condition()
         self._stopped = threading.Event()
         capture, picture = self._first_picture()
         self._due_ns = clock.now().mono_ns
-        self._keep(capture, picture)
-        self._thread = threading.Thread(target=self._work, args=(capture,), name="camera device", daemon=True)
+        self._store(capture, picture)
+        self._thread = threading.Thread(target=self._run, args=(capture,), name="camera device", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # nothing else closes a camera: it shall be free when the program has ended
+        atexit.register(self.close)  # nothing else releases the device when the program ends
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What became of the pictures, and how often the device was lost and tried again."""
-        with self._came:
+        """The number of pictures by outcome, and how often the device was lost, came back and was reopened."""
+        with self._changed:
             return dict(self._counts)
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:  # noqa: ARG002 (Camera's)
-        """Give the newest picture that was not given before, waiting a little for one; None when there is none.
+        """Return the newest picture not returned before, after a short wait if there is none yet.
 
-        Nor is there one when the newest has waited for too long.
+        None without a picture, or when the newest picture is too old.
         """
-        with self._came:
-            self._came.wait_for(self._has_one, LATE_PERIODS / self.rate_hz)
+        with self._changed:
+            self._changed.wait_for(self._has_picture, WAIT_PERIODS / self.rate_hz)
             newest, self._newest = self._newest, None
             if newest is None:
                 return None
-            if at_ns - newest.arrived_ns > WAITS_PERIODS * NS_PER_S / self.rate_hz:
+            if at_ns - newest.arrived_ns > MAX_AGE_PERIODS * NS_PER_S / self.rate_hz:
                 self._counts["pictures_too_old"] += 1
                 return None
             return CapturedFrame(number, newest.capture_ns, newest.picture)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until there is a picture to give; whether there is one."""
-        with self._came:
-            return self._came.wait_for(self._has_one, timeout_s)
+        """Wait until a picture is available and return whether one is."""
+        with self._changed:
+            return self._changed.wait_for(self._has_picture, timeout_s)
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Stop the thread, which releases the device."""
         atexit.unregister(self.close)
         self._stopped.set()
-        self._thread.join(CLOSING_S)
+        self._thread.join(CLOSE_TIMEOUT_S)
 
-    def _has_one(self) -> bool:
+    def _has_picture(self) -> bool:
         return self._newest is not None
 
     def _first_picture(self) -> tuple[cv2.VideoCapture, Picture]:
-        """Open the device and read one picture, which must be as asked."""
+        """Open the device and read one picture; raise `UserError` unless it has the requested format."""
         capture = self._open()
-        picture = _read(capture)
+        picture = _read_picture(capture)
         if picture is None:
-            raise UserError(_no_picture(self._device, is_open=capture.isOpened()))
-        if self._pixel_format and round(capture.get(cv2.CAP_PROP_FOURCC)) != _four_characters(self._pixel_format):
+            raise UserError(_no_picture_message(self._device, is_open=capture.isOpened()))
+        if self._pixel_format and round(capture.get(cv2.CAP_PROP_FOURCC)) != _fourcc(self._pixel_format):
             raise UserError(
-                f"{self._device} gives no pictures in the format {self._pixel_format}: choose another camera.format "
-                "(`v4l2-ctl --list-formats-ext` names them), or none"
+                f"{self._device} has no pictures in the format {self._pixel_format}: choose another camera.format "
+                "(`v4l2-ctl --list-formats-ext` lists them), or none"
             )
-        said_hz = capture.get(cv2.CAP_PROP_FPS)
-        offer = DeviceFormat(picture.shape[1], picture.shape[0], said_hz if 0 < said_hz <= KNOWN_RATE_HZ else None)
+        reported_hz = capture.get(cv2.CAP_PROP_FPS)
+        reported = DeviceFormat(
+            picture.shape[1], picture.shape[0], reported_hz if 0 < reported_hz <= MAX_CREDIBLE_RATE_HZ else None
+        )
         requested = DeviceFormat(self.model.width_px, self.model.height_px, self.rate_hz)
-        if not _is_as_requested(offer, self.model, self.rate_hz):
+        if not _matches_request(reported, self.model, self.rate_hz):
             capture.release()
             raise UserError(
-                f"{self._device} gives {offer}, but camera asks for {requested}: set camera.width_px, height_px and "
-                "rate_hz to what it gives, or camera.format to one in which it gives that"
+                f"{self._device} has {reported}, but camera requests {requested}: set camera.width_px, height_px and "
+                "rate_hz to the device's values, or camera.format to a format that has the requested ones"
             )
         return capture, picture
 
     def _open(self) -> cv2.VideoCapture:
-        """Open the device, or what cannot be read from if it is not there."""
+        """Open the device; without a device the result cannot be read from."""
         if not self._is_v4l2:
             limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT_MS]
-            one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further one of FFmpeg's is a picture of delay
+            one_thread = [cv2.CAP_PROP_N_THREADS, 1]  # each further FFmpeg thread adds a frame of delay
             return cv2.VideoCapture(self._device, cv2.CAP_FFMPEG, [*limits, *one_thread])
         capture = cv2.VideoCapture(self._device, cv2.CAP_V4L2)
         if capture.isOpened():
             if self._pixel_format:
-                capture.set(cv2.CAP_PROP_FOURCC, _four_characters(self._pixel_format))
+                capture.set(cv2.CAP_PROP_FOURCC, _fourcc(self._pixel_format))
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.model.width_px)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.model.height_px)
             capture.set(cv2.CAP_PROP_FPS, self.rate_hz)
         return capture
 
-    def _work(self, capture: cv2.VideoCapture) -> None:
-        """Read until told to stop; open again what has ended: a file at once, anything else after a while."""
+    def _run(self, capture: cv2.VideoCapture) -> None:
+        """Read until closed; when the source ends, reopen a file at once and anything else after `RETRY_S`."""
         while True:
-            pictures = self._play(capture)
+            pictures = self._read_until_end(capture)
             capture.release()
             if self._stopped.is_set():
                 return
             if not (self._is_file and pictures):
-                self._lose()
+                self._mark_lost()
                 self._stopped.wait(RETRY_S)
             capture = self._open()
-            with self._came:
+            with self._changed:
                 self._counts["times_opened_again"] += 1
 
-    def _play(self, capture: cv2.VideoCapture) -> int:
-        """Read pictures until there are no more, or until told to stop, and tell how many there were."""
+    def _read_until_end(self, capture: cv2.VideoCapture) -> int:
+        """Read pictures until the source ends or the camera is closed; return how many there were."""
         pictures = 0
-        while not self._stopped.wait(self._pause_s()):
-            picture = _read(capture)
+        while not self._stopped.wait(self._wait_s()):
+            picture = _read_picture(capture)
             if picture is None:
                 break
             pictures += 1
-            self._keep(capture, picture)
+            self._store(capture, picture)
         return pictures
 
-    def _pause_s(self) -> float:
-        """How long the next picture of a file is not due; a device's comes by itself."""
+    def _wait_s(self) -> float:
+        """Return how long until the next picture of a file is due; 0 for a device, whose read blocks."""
         return max(0.0, (self._due_ns - self._clock.now().mono_ns) / NS_PER_S) if self._is_file else 0.0
 
-    def _keep(self, capture: cv2.VideoCapture, picture: Picture) -> None:
+    def _store(self, capture: cv2.VideoCapture, picture: Picture) -> None:
         arrived_ns = self._clock.now().mono_ns
-        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # what is late is not caught up
+        self._due_ns = max(self._due_ns + round(NS_PER_S / self.rate_hz), arrived_ns)  # delays are not caught up
         capture_ns = buffer_time_ns(capture.get(cv2.CAP_PROP_POS_MSEC), arrived_ns) if self._is_v4l2 else None
-        with self._came:
+        with self._changed:
             if picture.shape != (self.model.height_px, self.model.width_px, 3):
                 self._counts["pictures_of_another_size"] += 1
                 return
             self._counts["pictures_read"] += 1
             self._counts["pictures_without_a_time"] += capture_ns is None
             self._counts["pictures_replaced"] += self._newest is not None
-            self._newest = _Arrived(picture, arrived_ns, capture_ns)
+            self._newest = _BufferedPicture(picture, arrived_ns, capture_ns)
             is_back = self._counts["times_lost"] > self._counts["times_back"]
             self._counts["times_back"] += is_back
-            self._came.notify_all()
+            self._changed.notify_all()
         if is_back:
-            log.warning("the camera %s gives pictures again", self._device)
+            log.warning("camera %s: pictures received again", self._device)
 
-    def _lose(self) -> None:
-        with self._came:
+    def _mark_lost(self) -> None:
+        with self._changed:
             is_new = self._counts["times_lost"] == self._counts["times_back"]
             self._counts["times_lost"] += is_new
         if is_new:
-            log.warning("the camera %s gives no pictures any more: it is opened again each second", self._device)
+            log.warning("camera %s: no more pictures; reopening it every %g s", self._device, RETRY_S)
 
 
 def buffer_time_ns(position_ms: float, arrived_ns: int) -> int | None:
-    """Give a V4L2 buffer's time, which OpenCV tells as the position; None where it is not of the monotonic clock.
+    """Return a V4L2 buffer's time, which OpenCV reports as the position; None if it is not of the monotonic clock.
 
-    A buffer's time is of the clock its driver likes, and OpenCV does not tell which: it counts where it lies in the
-    second before the picture came. Linux, Documentation/userspace-api/media/v4l/buffer.rst.
+    The driver chooses the clock of a buffer's time, and OpenCV does not report it. The time is therefore accepted only
+    within the second before the picture arrived. See Linux, Documentation/userspace-api/media/v4l/buffer.rst.
     """
     if not math.isfinite(position_ms):
         return None
     buffer_ns = round(position_ms * NS_PER_MS)
-    return buffer_ns if 0 <= arrived_ns - buffer_ns <= OLDEST_BUFFER_NS else None
+    return buffer_ns if 0 <= arrived_ns - buffer_ns <= MAX_BUFFER_AGE_NS else None
 
 
-def _four_characters(pixel_format: str) -> int:
+def _fourcc(pixel_format: str) -> int:
     return cv2.VideoWriter.fourcc(*pixel_format)
 
 
-def _read(capture: cv2.VideoCapture) -> Picture | None:
-    """Read one picture; None where there is none, or it is not in three bytes a pixel."""
+def _read_picture(capture: cv2.VideoCapture) -> Picture | None:
+    """Read one picture; None if there is none or it does not have three bytes per pixel."""
     try:
         good, picture = capture.read()
-    except cv2.error:  # of a picture that cannot be decoded, on some devices
+    except cv2.error:  # raised by some devices for a picture that cannot be decoded
         return None
     return cast("Picture", picture) if good and picture.ndim == 3 and picture.dtype == np.uint8 else None
 
 
-def _is_as_requested(offer: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
-    """Whether a device gives what it was asked for; a rate that it does not tell is not held against it."""
-    is_of_size = (offer.width_px, offer.height_px) == (model.width_px, model.height_px)
-    return is_of_size and (offer.rate_hz is None or math.isclose(offer.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))
+def _matches_request(reported: DeviceFormat, model: CameraModel, rate_hz: float) -> bool:
+    """Return whether a device has the requested size and rate; an unreported rate is accepted."""
+    is_of_size = (reported.width_px, reported.height_px) == (model.width_px, model.height_px)
+    return is_of_size and (reported.rate_hz is None or math.isclose(reported.rate_hz, rate_hz, rel_tol=RATE_TOLERANCE))
 
 
-def _no_picture(device: str, *, is_open: bool) -> str:
+def _no_picture_message(device: str, *, is_open: bool) -> str:
     if is_open:
-        return f"{device} opens, but no picture comes of it: see that no other program has it, and that it is a camera"
+        return f"{device} opens, but has no pictures: check that no other program uses it and that it is a camera"
     return (
-        f"{device} cannot be opened as a camera: see that it is there (`ls -l /dev/v4l/by-id`), and that this user may "
+        f"{device} cannot be opened as a camera: check that it exists (`ls -l /dev/v4l/by-id`) and that this user may "
         "read it (group video)"
     )

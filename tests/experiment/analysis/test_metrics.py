@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lavt.experiment.analysis.latency import picture_age, rtp_timestamp
-from lavt.experiment.analysis.metrics import RunMeasurement, count, driving_interval, measure
+from lavt.experiment.analysis.metrics import RunMeasurement, driving_interval, last_count, measure
 from lavt.experiment.analysis.steering import steering_reversals
 from lavt.experiment.analysis.tracking import (
-    cross_track,
-    heading,
+    cross_track_metrics,
+    heading_metrics,
     p95_by_10m,
     per_km,
     route_length_m,
@@ -35,7 +35,7 @@ def table(rows: list[dict[str, Any]]) -> Table:
 
 
 def recorded(*events: tuple[str, int, str], last_ns: int = 0, **channels: list[dict[str, Any]]) -> Record:
-    """Make a record in memory of events and further channels."""
+    """Return a record in memory of events and further channels."""
     named = [{"kind": kind, "mono_ns": mono_ns, "detail": detail} for kind, mono_ns, detail in events]
     tables = {name: table(rows) for name, rows in {"event": named, **channels}.items()}
     return Record(Path("in memory"), True, tables, {}, last_ns)
@@ -60,19 +60,19 @@ BEGAN, ENDED = ("drive_began", 100, ""), ("ending", 200, "completed")
         ([], (501, 500, None)),
     ],
 )
-def test_the_drive_is_from_its_first_event_to_its_ending(
-    events: list[tuple[str, int, str]], interval: tuple[int, int, str | None]
-) -> None:
-    """The drive is from the first `drive_began` to the first `ending` after it; without these it is open or empty."""
+def test_the_driving_interval(events: list[tuple[str, int, str]], interval: tuple[int, int, str | None]) -> None:
+    """The drive reaches from the first `drive_began` to the next `ending`; it is empty or open where one is missing."""
     assert driving_interval(recorded(*events, last_ns=500)) == interval
 
 
-def test_what_happens_at_the_edges_of_the_drive_counts() -> None:
-    """A collision that ends the drive counts, as does what happens when it begins; what is outside does not."""
+def test_the_driving_interval_includes_its_edges() -> None:
+    """Events and truth at the start and the end of the drive are included, those outside are not."""
     collisions = [("collision", at_ns, "a tree") for at_ns in (99, 100, 150, 200, 201)]
     invasions = [("lane_invasion", at_ns, "left") for at_ns in (99, 100, 200, 201, 202)]
-    truth = [{"mono_ns": at_ns, "progress_m": progress_m, "cross_track_m": 1.0 if 100 <= at_ns <= 200 else 9.0}
-        for at_ns, progress_m in ((99, 0.0), (100, 10.0), (150, 20.0), (200, 30.0), (201, 90.0))]  # fmt: skip
+    truth = [
+        {"mono_ns": at_ns, "progress_m": progress_m, "cross_track_m": 1.0 if 100 <= at_ns <= 200 else 9.0}
+        for at_ns, progress_m in ((99, 0.0), (100, 10.0), (150, 20.0), (200, 30.0), (201, 90.0))
+    ]
     server = recorded(BEGAN, *collisions, *invasions, ENDED, truth=truth)
     entry = measure(server, recorded()).entry
     assert (entry["collisions"], entry["lane_invasions"]) == (3, 2)
@@ -82,21 +82,21 @@ def test_what_happens_at_the_edges_of_the_drive_counts() -> None:
     assert entry["ending"] == "completed"
 
 
-def test_a_drive_of_no_time_is_a_drive() -> None:
-    """A drive that ended in the moment in which it began took 0 s; where nothing was driven there is no duration."""
+def test_duration_of_an_empty_drive() -> None:
+    """A drive that ended at its start has a duration of 0 s; without a drive the duration is null."""
     assert measure(recorded(BEGAN, ("ending", 100, "aborted")), recorded()).entry["duration_s"] == 0.0
     assert measure(recorded(last_ns=100), recorded()).entry["duration_s"] is None
 
 
-def test_the_last_known_count_is_given() -> None:
-    """Of a counter the last value that was recorded is given, None where none ever was."""
+def test_the_last_recorded_count_is_returned() -> None:
+    """The last recorded value of a counter is returned, and None without one."""
     record = recorded(counts=[{"late": 1}, {"late": 5}, {"other": 9}])
-    assert (count(record, "late"), count(record, "other"), count(record, "neither")) == (5, 9, None)
-    assert count(recorded(), "late") is None
+    assert [last_count(record, name) for name in ("late", "other", "neither")] == [5, 9, None]
+    assert last_count(recorded(), "late") is None
 
 
 def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Path) -> None:
-    """With clocks 250 ms apart and drifting by 20 ppm, tau_v, tau_c and the loop come out as they were made."""
+    """With clocks 250 ms apart that drift by 20 ppm, tau_v, tau_c and the loop latency are exact to 1 us."""
     entry = measured(make_run, tmp_path).entry
     for name, p50_ms, spread_ms in (("tau_v_ms", 62.0, 2.0), ("loop_ms", 76.0, 2.0), ("tau_c_ms", 9.0, 0.0)):
         assert entry[name]["p50"] == pytest.approx(p50_ms, abs=MICROSECOND_MS)
@@ -105,23 +105,23 @@ def test_latencies_are_right_to_the_microsecond(make_run: MakeRun, tmp_path: Pat
     assert entry["delta"]["ms"] == pytest.approx(250.0, abs=0.2)
 
 
-def test_the_offset_between_the_clocks_matters(make_run: MakeRun, tmp_path: Path) -> None:
-    """Without the correction tau_v would be short by the 250 ms between the clocks, and the loop the same as ever."""
+def test_the_clock_offset_affects_one_way_latencies_only(make_run: MakeRun, tmp_path: Path) -> None:
+    """Without the correction, tau_v is wrong by the 250 ms between the clocks, and the loop latency is correct."""
     entry = measured(make_run, tmp_path, corrected=False).entry
     assert entry["tau_v_ms"]["p50"] == pytest.approx(62.0 - 250.0, abs=0.2)
     assert entry["tau_c_ms"]["p50"] == pytest.approx(9.0 + 250.0, abs=0.2)
     assert entry["loop_ms"]["p50"] == pytest.approx(76.0, abs=MICROSECOND_MS)
 
 
-def test_every_split_latency_has_the_bound_of_both_hosts(make_run: MakeRun, tmp_path: Path) -> None:
-    """The bound printed with tau_v and tau_c is the sum of the bounds of both hosts."""
+def test_one_way_latencies_have_the_bound_of_both_hosts(make_run: MakeRun, tmp_path: Path) -> None:
+    """The bound of tau_v and tau_c is the sum of the bounds of both hosts."""
     entry = measured(make_run, tmp_path, bound_s=0.0003).entry
     assert entry["tau_v_ms"]["bound"] == pytest.approx(0.6)
     assert entry["tau_c_ms"]["bound"] == pytest.approx(0.6)
 
 
 def test_hosts_that_share_a_kernel_share_a_clock(make_run: MakeRun, tmp_path: Path) -> None:
-    """Where both sides report the same host, Delta is 0 with bound 0, whatever a time service says."""
+    """If both sides report the same host, Delta is 0 with bound 0, regardless of the time sources."""
     settings = {"server_host": "one", "client_host": "one", "offset_s": 0.0, "drift": 0.0}
     good = measured(make_run, tmp_path / "a", **settings)
     assert good.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=1e-9)
@@ -129,37 +129,37 @@ def test_hosts_that_share_a_kernel_share_a_clock(make_run: MakeRun, tmp_path: Pa
 
 
 def test_hosts_without_a_name_are_not_taken_for_one(make_run: MakeRun, tmp_path: Path) -> None:
-    """Two sides that do not say on which host they ran do not get a bound of 0."""
+    """Two sides that do not report their host do not get a bound of 0."""
     run = measured(make_run, tmp_path, server_host="", client_host="", bound_s=None, probes=False)
     assert run.clocks.bound_ms is None
     assert run.entry["tau_v_ms"]["p50"] == pytest.approx(62.0, abs=MICROSECOND_MS)
     assert run.entry["tau_v_ms"]["bound"] is None
 
 
-def test_the_parts_of_the_loop_make_the_whole(make_run: MakeRun, tmp_path: Path) -> None:
-    """tau_v, client time, tau_c and actuator time add up to the loop to the microsecond though the clocks drift."""
+def test_the_parts_of_the_loop_add_up(make_run: MakeRun, tmp_path: Path) -> None:
+    """tau_v, client time, tau_c and actuator time add up to the loop latency to 1 us, although the clocks drift."""
     closure_ms = measured(make_run, tmp_path).closure_p95_ms
     assert closure_ms is not None
     assert closure_ms < MICROSECOND_MS
 
 
-def test_what_is_missing_between_the_parts_and_the_whole_has_no_sign(make_run: MakeRun, tmp_path: Path) -> None:
-    """A client whose clock loses 1 % finds 30 of its 3000 us missing, which is how far the parts are from the whole."""
+def test_the_closure_error_is_absolute(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a client clock that loses 1 %, the closure error is 30 us of the client time of 3000 us, without a sign."""
     closure_ms = measured(make_run, tmp_path, drift=0.01, spread_ms=0.0).closure_p95_ms
     assert closure_ms == pytest.approx(0.03, abs=0.002)
 
 
-def test_the_parts_are_compared_with_the_whole_by_the_95th_percentile(
+def test_the_closure_error_is_the_95th_percentile(
     make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the parts are 0, 1, .. 100 ms from the whole the value given is 95 ms, whatever their sign."""
+    """For closure errors of 0, 1, .. 100 ms of either sign, the closure error is 95 ms."""
     missing_ns = np.arange(101) * 1_000_000 * np.resize([1, -1], 101)
     monkeypatch.setattr("lavt.experiment.analysis.metrics.closure_ns", lambda *_: missing_ns)
     assert measured(make_run, tmp_path, seconds=0.1).closure_p95_ms == pytest.approx(95.0)
 
 
-def test_where_no_picture_was_read_there_is_no_bound(make_run: MakeRun, tmp_path: Path) -> None:
-    """Without pictures neither tau_v, nor its bound, nor a sum of parts is known; tau_c and its bound are."""
+def test_without_pictures_tau_v_is_unknown(make_run: MakeRun, tmp_path: Path) -> None:
+    """Without pictures, tau_v, its bound and the closure error are unknown; tau_c and its bound are known."""
     make_run(tmp_path, server_host="one", client_host="one")
     server = read_record(tmp_path / "server.mcap")
     run = measure(server, read_record(tmp_path / "client.mcap", channels=("clock",)))
@@ -169,16 +169,16 @@ def test_where_no_picture_was_read_there_is_no_bound(make_run: MakeRun, tmp_path
     assert run.closure_p95_ms is None
 
 
-def test_a_step_of_the_clock_does_not_touch_the_loop(make_run: MakeRun, tmp_path: Path) -> None:
-    """When the client's wall clock steps by 100 ms, loop latency and picture age stay what they were."""
+def test_a_clock_step_does_not_change_the_loop_latency(make_run: MakeRun, tmp_path: Path) -> None:
+    """If the client's wall clock steps by 100 ms, loop latency and picture age do not change."""
     still, stepped = measured(make_run, tmp_path / "a"), measured(make_run, tmp_path / "b", step_s=0.1)
     assert stepped.entry["loop_ms"] == still.entry["loop_ms"]
     assert stepped.entry["picture_age_ms"] == still.entry["picture_age_ms"]
     assert stepped.entry["tau_v_ms"]["p95"] > still.entry["tau_v_ms"]["p95"] + 50
 
 
-def test_only_the_drive_counts(make_run: MakeRun, tmp_path: Path) -> None:
-    """Frames before the drive began are no part of it, and unreadable pictures are counted and give no latency."""
+def test_only_frames_of_the_drive_are_counted(make_run: MakeRun, tmp_path: Path) -> None:
+    """Frames before the drive are excluded; unreadable pictures are counted and have no latency."""
     entry = measured(make_run, tmp_path).entry
     assert entry["frames_sent"] == 361
     assert entry["frames_decoded"] == 361
@@ -187,28 +187,28 @@ def test_only_the_drive_counts(make_run: MakeRun, tmp_path: Path) -> None:
     assert entry["duration_s"] == 12.0
 
 
-def test_what_the_decoder_gave_nothing_for_is_no_picture(make_run: MakeRun, tmp_path: Path) -> None:
-    """An access unit without a picture is neither decoded nor unreadable, and gives no latency."""
+def test_an_undecoded_access_unit_is_not_a_picture(make_run: MakeRun, tmp_path: Path) -> None:
+    """An access unit that was not decoded is counted neither as decoded nor as unreadable, and has no latency."""
     entry = measured(make_run, tmp_path, undecoded=5).entry
     assert (entry["frames_sent"], entry["frames_decoded"], entry["frames_unreadable"]) == (361, 356, 7)
     assert entry["tau_v_ms"]["n"] == 349
 
 
-def test_a_record_that_does_not_say_what_was_decoded(make_run: MakeRun, tmp_path: Path) -> None:
-    """Where a record does not say of a picture whether it was decoded, it counts as decoded."""
+def test_pictures_without_the_field_decoded_are_decoded(make_run: MakeRun, tmp_path: Path) -> None:
+    """Pictures without the field `decoded` count as decoded."""
     entry = measured(make_run, tmp_path, undecoded=None).entry
     assert (entry["frames_decoded"], entry["frames_unreadable"]) == (361, 7)
 
 
-def test_picture_age_is_the_loop_and_half_the_hold(make_run: MakeRun, tmp_path: Path) -> None:
-    """With a constant loop of 76 ms and a new picture every 33.3 ms the mean picture age is 92.7 ms."""
+def test_picture_age_is_the_loop_latency_plus_half_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a constant loop latency of 76 ms and a picture every 33.3 ms, the mean picture age is 92.7 ms."""
     age = measured(make_run, tmp_path, spread_ms=0.0).entry["picture_age_ms"]
     assert age["mean"] == pytest.approx(76 + 33.333 / 2, abs=0.05)
     assert age["p95"] == pytest.approx(76 + 33.333 * 0.95, abs=0.1)
 
 
-def test_picture_age_by_hand() -> None:
-    """The age runs from 10 to 20, from 10 to 30 and from 5 to 15 ms: mean 16.25, p95 28 ms."""
+def test_picture_age_of_three_commands() -> None:
+    """For ages from 10 to 20, from 10 to 30 and from 5 to 15 ms the mean is 16.25 ms and the 95th percentile 28 ms."""
     millisecond = 1_000_000
     frames = table(
         [{"stamp_ns": n, "stamped_mono_ns": stamped * millisecond} for n, stamped in ((1, 0), (2, 10), (3, 35))]
@@ -224,8 +224,8 @@ def test_picture_age_by_hand() -> None:
     assert age.p95_ms == pytest.approx(28.0)
 
 
-def test_nothing_recorded_is_null_not_zero(make_run: MakeRun, tmp_path: Path) -> None:
-    """A client that recorded nothing leaves tau_v and the bound undefined, and the loop as it was."""
+def test_missing_data_are_null_not_zero(make_run: MakeRun, tmp_path: Path) -> None:
+    """If the client recorded nothing, tau_v and its bound are null, and the loop latency is unchanged."""
     make_run(tmp_path / "a")
     make_run(tmp_path / "b", seconds=0.01)
     server = read_record(tmp_path / "a" / "server.mcap")
@@ -238,7 +238,7 @@ def test_nothing_recorded_is_null_not_zero(make_run: MakeRun, tmp_path: Path) ->
 
 
 def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
-    """A car that swings 0.5 m about the lane's centre has mean 2/pi, rms 1/sqrt(2) and maximum 1 of that amplitude."""
+    """A sinusoidal path has a mean error of 2/pi, an RMS of 1/sqrt(2) and a maximum of 1 of its amplitude."""
     entry = measured(make_run, tmp_path, seconds=12 * np.pi).entry
     assert entry["mae_m"] == pytest.approx(0.5 * 2 / np.pi, abs=0.005)
     assert entry["rms_m"] == pytest.approx(0.5 / np.sqrt(2), abs=0.005)
@@ -250,39 +250,39 @@ def test_tracking_of_a_sine(make_run: MakeRun, tmp_path: Path) -> None:
 
 
 def test_samples_begin_at_the_first_row() -> None:
-    """Errors are interpolated every 0.25 m from the first row on, wherever the route was entered."""
+    """Errors are interpolated every 0.25 m from the first row on, at any position of the route."""
     rows = [{"progress_m": 2.0, "cross_track_m": 4.0}, {"progress_m": 3.0, "cross_track_m": 8.0}]
     assert sampled_by_distance(table(rows), "cross_track_m").tolist() == [4.0, 5.0, 6.0, 7.0, 8.0]
 
 
-def test_percentiles_of_errors_that_grow_evenly() -> None:
-    """Of errors that grow evenly from 0 to 1 the mean is 0.5, the 95th percentile 0.95 and the maximum 1."""
+def test_percentiles_of_linear_errors() -> None:
+    """For errors that grow linearly from 0 to 1, the mean is 0.5, the 95th percentile 0.95 and the maximum 1."""
     rows = [
         {"progress_m": index * 0.25, "cross_track_m": index / 100, "heading_error_rad": -index / 100}
         for index in range(101)
     ]
-    errors_m, errors_rad = cross_track(table(rows)), heading(table(rows))
+    errors_m, errors_rad = cross_track_metrics(table(rows)), heading_metrics(table(rows))
     assert [errors_m[name] for name in ("mae_m", "p95_m", "max_m")] == pytest.approx([0.5, 0.95, 1.0])
     assert [errors_rad[name] for name in ("heading_mae_rad", "heading_p95_rad")] == pytest.approx([0.5, 0.95])
     assert p95_by_10m(table(rows)) == pytest.approx([0.38, 0.76])
 
 
-def test_standing_still_weighs_nothing() -> None:
-    """Errors are sampled by distance: a car that waits 1 m off the centre for 1000 rows has the error of its way."""
-    way = [{"progress_m": index * 0.1, "cross_track_m": 0.0} for index in range(101)]
+def test_a_stationary_car_has_no_weight() -> None:
+    """Errors are sampled by distance: 1000 rows of a car that waits 1 m off the centre do not change the error."""
+    driving = [{"progress_m": index * 0.1, "cross_track_m": 0.0} for index in range(101)]
     waiting = [{"progress_m": 10.0, "cross_track_m": 1.0}] * 1000
-    assert cross_track(table(way + waiting))["mae_m"] == 0.0
+    assert cross_track_metrics(table(driving + waiting))["mae_m"] == 0.0
 
 
-def test_going_back_counts_the_first_passage() -> None:
-    """Where the progress shrinks and grows again, the error of the first passage is taken."""
+def test_the_first_passage_counts() -> None:
+    """Where the progress decreases and increases again, the error of the first passage is used."""
     rows = [(0.0, 0.0), (1.0, 0.0), (0.5, 9.0), (0.9, 9.0), (2.0, 0.0)]
     samples = sampled_by_distance(table([{"progress_m": p, "cross_track_m": c} for p, c in rows]), "cross_track_m")
     assert samples.tolist() == [0.0] * 9
 
 
 def test_p95_up_to_every_ten_metres() -> None:
-    """An error of 1 m over 10 m and then of 3 m: 1 m up to 10 m, 3 m up to 20 m; the last 5 m are no whole ten."""
+    """With an error of 1 m for 10 m and then 3 m, P95 is 1 m up to 10 m and 3 m up to 20 m; a partial 10 m has none."""
     rows = [{"progress_m": 5.0 + index * 0.25, "cross_track_m": -1.0 if index <= 40 else 3.0} for index in range(101)]
     assert p95_by_10m(table(rows)) == [1.0, 3.0]
     assert p95_by_10m(table(rows[:41])) == [1.0]
@@ -291,31 +291,31 @@ def test_p95_up_to_every_ten_metres() -> None:
 
 
 def test_the_last_p95_is_that_of_the_whole_drive() -> None:
-    """Where a drive ends at a whole 10 m, the last of `p95_by_10m` is `p95_m`."""
+    """If a drive ends at a multiple of 10 m, the last of `p95_by_10m` is `p95_m`."""
     rows = [{"progress_m": index * 0.25, "cross_track_m": np.sin(index)} for index in range(121)]
-    assert p95_by_10m(table(rows))[-1] == cross_track(table(rows))["p95_m"]
+    assert p95_by_10m(table(rows))[-1] == cross_track_metrics(table(rows))["p95_m"]
 
 
-def test_heading_by_hand() -> None:
-    """Of 0.1 rad left over half the way and 0.3 rad right over the other: mean 0.2, rms 0.2236, p95 0.3 rad."""
+def test_heading_error_of_two_halves() -> None:
+    """For 0.1 rad left over one half and 0.3 rad right over the other, mean is 0.2, RMS 0.2236 and P95 0.3 rad."""
     rows = [{"progress_m": index * 0.25, "heading_error_rad": 0.1 if index < 50 else -0.3} for index in range(100)]
-    statistics = heading(table(rows))
+    statistics = heading_metrics(table(rows))
     assert statistics["heading_mae_rad"] == pytest.approx(0.2)
     assert statistics["heading_rms_rad"] == pytest.approx(np.sqrt(0.05))
     assert statistics["heading_p95_rad"] == pytest.approx(0.3)
-    assert set(heading(table([])).values()) == {None}
+    assert set(heading_metrics(table([])).values()) == {None}
 
 
 def test_rates_by_distance() -> None:
-    """Two events in 500 m are 4 a kilometre; where nothing was driven, or nobody knows, there is no rate."""
+    """Two events in 500 m are 4 per kilometre; without a known distance there is no rate."""
     assert per_km(2, 500.0) == 4.0
     assert per_km(0, 500.0) == 0.0
     assert per_km(0, 0.0) is None
     assert per_km(1, None) is None
 
 
-def test_the_route_says_how_long_it_is(make_run: MakeRun, tmp_path: Path) -> None:
-    """The length is that of the recorded route; without one it is null."""
+def test_the_route_length_is_recorded(make_run: MakeRun, tmp_path: Path) -> None:
+    """The route length is that of the recorded route, and null without one."""
     entry = measured(make_run, tmp_path, seconds=6.0).entry
     assert entry["route_length_m"] == 100.0
     assert entry["lane_invasions_per_km"] == pytest.approx(1 / 0.048)
@@ -327,13 +327,13 @@ def test_the_route_says_how_long_it_is(make_run: MakeRun, tmp_path: Path) -> Non
     ("angles", "reversals"),
     [([], 0), ([0.0], 0), ([0.0, 0.2, 0.1], 1), ([0.0, 0.2, 0.195, 0.3], 0), ([0.0, -0.1, 0.1, -0.1, 0.1], 3)],
 )
-def test_reversals_ignore_what_is_smaller_than_the_deadband(angles: list[float], reversals: int) -> None:
-    """A turn back counts from 0.01 rad on; smaller ones are noise."""
+def test_reversals_within_the_deadband_are_ignored(angles: list[float], reversals: int) -> None:
+    """A turn back counts as a reversal from 0.01 rad on."""
     assert steering_reversals(np.array(angles)) == reversals
 
 
 def test_rtp_timestamps_do_not_overflow() -> None:
-    """The RTP timestamp of a stamp of our time equals that of exact arithmetic."""
+    """The RTP timestamp of a current stamp equals the result of exact arithmetic."""
     stamps = [1_700_000_000_123_456_789, 1_999_999_999_999_999_999]
     expected = [stamp * 9 // 100_000 % 2**32 for stamp in stamps]
     assert rtp_timestamp(np.array(stamps)).tolist() == expected

@@ -38,37 +38,39 @@ def reasons(
     return recorded_reasons(record(video, drove=True), record(control), "L4", requested_ms)
 
 
-def test_a_condition_that_was_in_force_all_the_time_is_no_reason() -> None:
-    """Both queues said before the drive that they do as asked, and nothing else until its end; after it all is free."""
+def test_a_condition_in_force_throughout_the_drive_is_valid() -> None:
+    """Queues that do as requested from before the drive to its end are valid; what they do after it is irrelevant."""
     assert reasons(VIDEO, CONTROL) == []
     assert reasons([(2, "", "", 0.0, None, ""), *VIDEO, (21, "", "", 0.0, None, "")], CONTROL) == []
 
 
 @pytest.mark.parametrize(
-    ("video", "control", "said"),
+    ("video", "control", "expected"),
     [
-        ([], CONTROL, "the server did not say"),
-        (VIDEO, [], "the client did not say"),
-        (VIDEO[1:], CONTROL, "the server did not say"),
-        ([*VIDEO, (18, "", "", 0.0, None, "")], CONTROL, "not in force as asked on the server"),
-        ([(5, "L5", "video", 225.0, 225.1, ""), *VIDEO[1:]], CONTROL, "not in force as asked on the server"),
+        ([], CONTROL, "the server did not report"),
+        (VIDEO, [], "the client did not report"),
+        (VIDEO[1:], CONTROL, "the server did not report"),
+        ([*VIDEO, (18, "", "", 0.0, None, "")], CONTROL, "not in force as requested on the server"),
+        ([(5, "L5", "video", 225.0, 225.1, ""), *VIDEO[1:]], CONTROL, "not in force as requested on the server"),
         ([VIDEO[0], (15, "L4", "video", 150.0, None, "no tc")], CONTROL, "on the server all the time: no tc"),
-        (VIDEO, [*CONTROL, (9, "L4", "control", 75.0, 79.0, "late")], "asked on the client all the time: late"),
-        (VIDEO, [(1, "L4", "control", 75.0, None, "")], "nobody measured"),
+        (VIDEO, [*CONTROL, (9, "L4", "control", 75.0, 79.0, "late")], "requested on the client all the time: late"),
+        (VIDEO, [(1, "L4", "control", 75.0, None, "")], "control was not measured"),
     ],
 )
-def test_each_way_of_not_being_in_force_is_a_reason(video: list[Sample], control: list[Sample], said: str) -> None:
-    """A side that says nothing before the drive, another condition, a failure or a doubt makes the run invalid."""
-    assert [reason for reason in reasons(video, control) if said in reason]
+def test_a_condition_that_was_not_in_force_is_a_reason(
+    video: list[Sample], control: list[Sample], expected: str
+) -> None:
+    """A side without a report before the drive, with another condition, a failure or a doubt makes the run invalid."""
+    assert [reason for reason in reasons(video, control) if expected in reason]
 
 
-def test_what_was_not_requested_for_need_not_be_measured() -> None:
-    """Under a condition that delays the video only, nobody has to measure the control."""
+def test_an_unrequested_delay_need_not_be_measured() -> None:
+    """Under a condition that delays only the video, the control delay need not be measured."""
     assert reasons(VIDEO, [(1, "L4", "", 0.0, None, "")], {"video": 150.0, "control": 0.0}) == []
 
 
-def test_a_long_silence_is_a_reason() -> None:
-    """Where a queue was not measured for more than 20 s of the drive nobody knows what it did."""
+def test_a_long_gap_between_measurements_is_a_reason() -> None:
+    """A run is invalid if a queue was not measured for more than 20 s of the drive."""
     early = [(-15, "L4", "video", 150.0, 150.2, "")]
     (reason,) = reasons(early, CONTROL)
     assert reason.startswith("the server ")
@@ -79,8 +81,8 @@ def test_a_long_silence_is_a_reason() -> None:
     assert reason.endswith(" 29 s")
 
 
-def test_a_drive_without_a_condition_must_not_have_anothers() -> None:
-    """A run that asked for nothing is invalid where another client's condition was in force."""
+def test_a_run_without_a_condition_must_not_have_another_clients() -> None:
+    """A run without a condition is invalid if another client's condition was in force."""
     (reason,) = recorded_reasons(record(VIDEO, drove=True), record([]), "", REQUESTED_MS)
     assert "L4 was in force on the server" in reason
     ended = [VIDEO[0], (8, "", "", 0.0, None, "")]
@@ -91,10 +93,9 @@ def test_a_drive_without_a_condition_must_not_have_anothers() -> None:
     ("tau_v_ms", "tau_c_ms", "flows"),
     [(151.0, 76.0, []), (140.0, 70.0, []), (30.0, 76.0, ["video"]), (151.0, 5.0, ["control"]), (None, None, [])],
 )
-def test_latencies_that_are_too_short_for_what_was_injected(
+def test_latencies_below_the_injected_delay_are_a_reason(
     tau_v_ms: float | None, tau_c_ms: float | None, flows: list[str]
 ) -> None:
-    """Where video or control took less than was injected into them, the delay was on another path: invalid."""
+    """If the video or control latency is below the injected delay, the delay was on another path: invalid."""
     entry = {"tau_v_ms": {"p50": tau_v_ms, "bound": 0.2}, "tau_c_ms": {"p50": tau_c_ms, "bound": None}}
-    said = absent_reasons(entry, REQUESTED_MS)
-    assert [each.split()[1] for each in said] == flows
+    assert [reason.split()[1] for reason in absent_reasons(entry, REQUESTED_MS)] == flows

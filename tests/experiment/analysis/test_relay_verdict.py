@@ -1,4 +1,4 @@
-"""What is asked of the relay, and how it is judged by what it says it did."""
+"""Tests of the relay's request, and of the reasons that its measurements give."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def planned(condition: str, **network: Any) -> PlannedRun:
 
 
 @pytest.mark.parametrize("name", sorted(conditions()))
-def test_the_relay_is_told_all(name: str) -> None:
-    """From a run's condition to the flows of the relay nothing is lost: the same law, trace, queue and seed."""
+def test_the_relay_receives_the_whole_condition(name: str) -> None:
+    """The relay's flows have the delay law, impairment, trace and seed of the run's condition."""
     run = planned(name, inherent="paper_wifi5")
     video, control = flows(_relay_config(run, 5600, 7448))
     requested = run.requested
@@ -36,50 +36,51 @@ def _inherent_ms() -> float:
     return video.downstream.constant_ms
 
 
-def said(
+def reasons(
     held: tuple[float | None, float | None], late: tuple[float | None, float | None], **requested: Any
 ) -> list[str]:
-    ways = ("video downstream", "control upstream")
+    directions = ("video downstream", "control upstream")
     return relay_reasons(
         {
             "requested_ms": requested,
-            "held_ms": dict(zip(ways, held, strict=True)),
-            "late_ms": dict(zip(ways, late, strict=True)),
+            "held_ms": dict(zip(directions, held, strict=True)),
+            "late_ms": dict(zip(directions, late, strict=True)),
         }
     )
 
 
-def test_constant_delays_are_judged_by_their_median() -> None:
-    """A constant delay must be held within 1 ms, whatever the relay thinks of its punctuality."""
-    assert said((75.9, 0.1), (0.9, 0.1), video=75.0, control=0.0) == []
-    assert said((76.1, 0.1), (0.0, 0.1), video=75.0, control=0.0) == [
-        "video was delayed by 76.1 ms where 75 ms was asked"
-    ]
-    assert said((75.0, None), (0.0, None), video=75.0, control=0.0) == ["nobody measured the injected delay of control"]
+def test_a_constant_delay_is_judged_by_its_median() -> None:
+    """The median of a constant delay must be within 1 ms of the request, whatever the reported lateness."""
+    assert reasons((75.9, 0.1), (0.9, 0.1), video=75.0, control=0.0) == []
+    (reason,) = reasons((76.1, 0.1), (0.0, 0.1), video=75.0, control=0.0)
+    assert reason.startswith("video was delayed by 76.1 ms")
+    (reason,) = reasons((75.0, None), (0.0, None), video=75.0, control=0.0)
+    assert "control was not measured" in reason
 
 
-def test_what_varies_is_judged_by_its_lateness() -> None:
-    """Where more than a constant delay was asked, no hold is wrong, but leaving over 1 ms late is."""
-    assert said((500.0, 0.1), (0.3, 0.1), video=None, control=0.0) == []
-    assert said((75.0, 0.1), (1.5, 0.1), video=None, control=0.0) == [
-        "video left the relay 1.5 ms later than was asked, in the median"
-    ]
-    assert said((None, 0.1), (None, 0.1), video=None, control=0.0) == ["nobody measured the injected delay of video"]
+def test_a_variable_delay_is_judged_by_its_lateness() -> None:
+    """With more than a constant delay, only packets that are sent over 1 ms late are a reason."""
+    assert reasons((500.0, 0.1), (0.3, 0.1), video=None, control=0.0) == []
+    (reason,) = reasons((75.0, 0.1), (1.5, 0.1), video=None, control=0.0)
+    assert reason.startswith("video left the relay 1.5 ms later")
+    (reason,) = reasons((None, 0.1), (None, 0.1), video=None, control=0.0)
+    assert "video was not measured" in reason
 
 
-def test_a_relay_that_said_nothing() -> None:
-    """Without a word of the relay nobody knows what was injected."""
-    assert relay_reasons({}) == [f"nobody measured the injected delay of {flow}" for flow in ("video", "control")]
+def test_a_relay_without_measurements_is_a_reason() -> None:
+    """Without the relay's measurements, the injected delay of each flow is unknown."""
+    for reason, flow in zip(relay_reasons({}), ("video", "control"), strict=True):
+        assert f"{flow} was not measured" in reason
 
 
-def test_requested_of_the_relay() -> None:
-    """A median is asked of a flow with a constant delay only."""
+def test_only_a_constant_delay_has_a_requested_median() -> None:
+    """Only a flow with a constant delay has a requested median."""
     assert _requested_ms(planned("L4")) == {"video": 150, "control": 75}
     assert _requested_ms(planned("jitter")) == {"video": None, "control": 0}
 
 
-def test_least() -> None:
-    """A latency is too short for a condition only where jitter and overtaking do not explain it."""
+def test_least_expected_delay() -> None:
+    """Jitter and reordering reduce the least expected delay of a condition."""
     assert injected_entry(conditions()["L4"]) == {"injected_ms": {"video": 150, "control": 75}}
     jitter, early = ImpairmentConfig(jitter_ms=10), ImpairmentConfig(reorder=0.5)
     requested = Condition(video_ms=75, control_ms=30, video=jitter, control=jitter)

@@ -14,8 +14,8 @@ from lavt.recording.table import table_of
 MakeRun = Callable[..., Path]
 
 
-def test_every_stage_is_timed_in_the_order_of_a_frame(make_run: MakeRun, tmp_path: Path) -> None:
-    """Hops have their recorded durations; a link is tau less what the nodes did, whatever the clocks show."""
+def test_stage_latencies_in_pipeline_order(make_run: MakeRun, tmp_path: Path) -> None:
+    """Stages have their recorded durations; a link has tau minus the nodes' times, at any clock offset."""
     make_run(tmp_path)
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
     stages = {(stage["node"], stage["stage"]): stage for stage in entry["stages_ms"]}
@@ -35,21 +35,21 @@ def test_every_stage_is_timed_in_the_order_of_a_frame(make_run: MakeRun, tmp_pat
     assert stages["network", "control link"]["p50"] == entry["tau_c_ms"]["p50"]
 
 
-def test_links_need_the_offset_between_the_clocks(make_run: MakeRun, tmp_path: Path) -> None:
-    """Where Delta is not known, the nodes' own hops are there and the links are not."""
+def test_links_need_the_clock_offset(make_run: MakeRun, tmp_path: Path) -> None:
+    """If Delta is unknown, the nodes' stages are present and the network links are not."""
     unknown = {"client_clock": lambda _second: {"correction_s": None}, "probes": False}
     make_run(tmp_path, **unknown)
     entry = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
     assert {stage["node"] for stage in entry["stages_ms"]} == {"camera", "receiver", "driver"}
 
 
-def test_each_accepted_command_has_the_age_of_its_picture() -> None:
-    """Of a picture stamped at 10 ms, commands applied at 30 and 50 ms are 20 and 40 ms old; a refused one has none."""
+def test_frame_age_of_each_accepted_command() -> None:
+    """Commands applied 20 and 40 ms after their frame's stamp have this age; a rejected one has none."""
     milliseconds = 1_000_000
     frames = table_of([{"stamp_ns": 7, "stamped_mono_ns": 10 * milliseconds}], [0], [0])
     rows = [(30, 7, "accepted"), (40, 7, "rejected"), (50, 7, "accepted"), (60, 8, "accepted"), (90, 7, "accepted")]
     admissions = table_of(
-        [{"applied_mono_ns": at * milliseconds, "stamp_ns": stamp, "verdict": said} for at, stamp, said in rows],
+        [{"applied_mono_ns": at * milliseconds, "stamp_ns": stamp, "verdict": verdict} for at, stamp, verdict in rows],
         [0] * len(rows),
         [0] * len(rows),
     )
@@ -57,8 +57,8 @@ def test_each_accepted_command_has_the_age_of_its_picture() -> None:
     assert np.divide(ages_ns, milliseconds).tolist() == [20.0, 40.0]
 
 
-def test_age_at_actuation_is_that_of_every_command(make_run: MakeRun, tmp_path: Path) -> None:
-    """With a loop of 76 ms and a second command from each picture 15 ms later, the median age is between the two."""
+def test_age_at_actuation_includes_repeated_commands(make_run: MakeRun, tmp_path: Path) -> None:
+    """With a loop latency of 76 ms and a second command 15 ms later, ages range from 76 to 91 ms."""
     make_run(tmp_path, spread_ms=0.0)
     age = measure(read_record(tmp_path / "server.mcap"), read_record(tmp_path / "client.mcap")).entry
     assert age["age_at_actuation_ms"]["p5"] == pytest.approx(76.0, abs=1e-3)

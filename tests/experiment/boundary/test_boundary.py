@@ -1,4 +1,4 @@
-"""The search for boundaries: its parts on cases made by hand, and one real search."""
+"""Tests of the search for boundaries: its parts on simple cases, and one real search."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from lavt.experiment.boundary.boundary import (
     departed,
     not_completed,
     plan_boundary,
-    search,
-    search_all,
+    run_search,
+    run_searches,
     theoretical_ms,
     with_video_delay,
 )
 from lavt.experiment.boundary.oscillation_growth import growth_per_s
 from lavt.experiment.report.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.report.table_format import html_of
-from lavt.experiment.runs.monitored_run import MonitoredRun, watched
+from lavt.experiment.runs.monitored_run import MonitoredRun, summarize_drive
 from lavt.experiment.runs.plan import PlannedRun
-from lavt.experiment.statistics.boundary_summary import groups_of, summary
+from lavt.experiment.statistics.boundary_summary import summarize_boundaries, summarize_groups
 from lavt.experiment.sweep.workers import Workers
 from lavt.nodes.payloads import Admission, Event, FrameWritten
 
@@ -42,48 +42,48 @@ GRID_MS = [0.0, 100.0, 200.0, 300.0]
 MS = 1_000_000
 
 
-def counted(function: Callable[[float], Any]) -> tuple[Callable[[float], Any], list[float]]:
-    requested: list[float] = []
+def record_calls(function: Callable[[float], Any]) -> tuple[Callable[[float], Any], list[float]]:
+    calls: list[float] = []
 
-    def ask(delay_ms: float) -> Any:
-        requested.append(delay_ms)
+    def recorded(delay_ms: float) -> Any:
+        calls.append(delay_ms)
         return function(delay_ms)
 
-    return ask, requested
+    return recorded, calls
 
 
 # The search.
 
 
-def test_bisection_closes_in_on_the_first_crossing() -> None:
-    """What begins at 137 ms is bracketed to 2 ms: the grid is asked first, then six halves of 100 ms."""
-    happens, requested = counted(lambda delay_ms: delay_ms >= 137)
-    found = first_bracket(happens, GRID_MS, 2.0)
+def test_bisection_brackets_the_first_crossing() -> None:
+    """A crossing at 137 ms is bracketed to 2 ms: the grid is evaluated first, then six bisections of 100 ms."""
+    criterion, calls = record_calls(lambda delay_ms: delay_ms >= 137)
+    found = first_bracket(criterion, GRID_MS, 2.0)
     assert found == Bracket(135.9375, 137.5, monotone=True)
-    assert requested[:4] == GRID_MS
-    assert len(requested) == 10
+    assert calls[:4] == GRID_MS
+    assert len(calls) == 10
 
 
-def test_what_stops_again_is_told() -> None:
-    """The first crossing counts where there are several, and the bracket says that it was not monotone."""
+def test_a_criterion_that_is_not_monotone_is_marked() -> None:
+    """Of several crossings the first is bracketed, and the bracket is marked as not monotone."""
     found = first_bracket(lambda delay_ms: 50 <= delay_ms < 250, GRID_MS, 2.0)
     assert found == Bracket(48.4375, 50.0, monotone=False)
 
 
-def test_what_never_begins_has_only_a_lower_end() -> None:
-    """Nothing within the range: the last delay tried is the lower end, and there is no upper one."""
+def test_without_a_crossing_the_bracket_has_no_upper_end() -> None:
+    """Without a crossing in the range, the last delay is the lower end, and there is no upper end."""
     assert first_bracket(lambda _: False, GRID_MS, 2.0) == Bracket(300.0, None)
 
 
-def test_what_has_begun_without_delay_has_only_an_upper_end() -> None:
-    """What happens at the first delay of the grid began below the range."""
+def test_a_crossing_below_the_range_has_no_lower_end() -> None:
+    """A criterion that is met at the first delay has a bracket without a lower end."""
     assert first_bracket(lambda _: True, GRID_MS, 2.0) == Bracket(None, 0.0)
     assert first_bracket(lambda delay_ms: delay_ms != 100, GRID_MS, 2.0) == Bracket(None, 0.0, monotone=False)
 
 
 @pytest.mark.parametrize("guess_ms", [0.0, 130.0, 137.0, 300.0, 1000.0])
-def test_a_rate_is_followed_to_its_zero(guess_ms: float) -> None:
-    """Wherever the guess lies, a smooth rate's zero is between ends 2 ms apart; infinite rates only have a sign."""
+def test_the_zero_of_a_rate_is_bracketed(guess_ms: float) -> None:
+    """For any guess, the zero of a smooth rate is bracketed to 2 ms, also if the rate is infinite elsewhere."""
 
     def rate(delay_ms: float) -> float:
         return math.inf if delay_ms > 200 else (delay_ms - 137) / 500
@@ -96,8 +96,8 @@ def test_a_rate_is_followed_to_its_zero(guess_ms: float) -> None:
 
 
 @pytest.mark.parametrize("zero_ms", [7.1, 12.0, 18.3, 23.2, 137.0])
-def test_a_zero_lies_between_its_ends(zero_ms: float) -> None:
-    """Also that of a rate of which only the sign is known, where nothing but halving helps."""
+def test_the_zero_of_a_step_is_bracketed(zero_ms: float) -> None:
+    """The zero is within the bracket if only the sign of the rate is known."""
     found = zero_bracket(lambda delay_ms: math.copysign(math.inf, delay_ms - zero_ms), 100.0, 200.0, 2.0)
     assert found.low_ms is not None
     assert found.high_ms is not None
@@ -105,8 +105,8 @@ def test_a_zero_lies_between_its_ends(zero_ms: float) -> None:
 
 
 @pytest.mark.parametrize("zero_ms", [0.3, 199.8])
-def test_the_ends_of_a_zero_are_within_the_range(zero_ms: float) -> None:
-    """Of a zero nearer to an end of the range than the bracket reaches, that end is the bracket's."""
+def test_a_bracket_is_within_the_range(zero_ms: float) -> None:
+    """For a zero near an end of the range, the bracket ends there."""
     found = zero_bracket(lambda delay_ms: (delay_ms - zero_ms) / 500, 100.0, 200.0, 2.0)
     assert found.low_ms is not None
     assert found.high_ms is not None
@@ -114,8 +114,8 @@ def test_the_ends_of_a_zero_are_within_the_range(zero_ms: float) -> None:
     assert found.low_ms == 0 or found.high_ms == 200
 
 
-def test_a_rate_without_zero_in_the_range_is_out_of_it() -> None:
-    """A rate that is positive everywhere is zero below, one that is negative everywhere is zero above."""
+def test_a_rate_without_a_zero_is_out_of_range() -> None:
+    """The zero of a rate is below the range if the rate is always positive, and above it if always negative."""
     assert zero_bracket(lambda _: 0.1, 137.0, 400.0, 2.0) == Bracket(None, 0.0)
     assert zero_bracket(lambda _: -math.inf, 137.0, 400.0, 2.0) == Bracket(400.0, None)
 
@@ -125,17 +125,33 @@ def test_a_rate_without_zero_in_the_range_is_out_of_it() -> None:
 
 def frame(number: int) -> FrameWritten:
     return FrameWritten(
-        number=number, stamp_ns=number, stamped_mono_ns=number * 33 * MS + 5 * MS, capture_ns=number * 33 * MS,
-        pixel_crc=0, size_bytes=0,
-    )  # fmt: skip
+        number=number,
+        stamp_ns=number,
+        stamped_mono_ns=number * 33 * MS + 5 * MS,
+        capture_ns=number * 33 * MS,
+        pixel_crc=0,
+        size_bytes=0,
+    )
 
 
 def admission(stamp: int, applied_ns: int, *, verdict: str = "accepted", limited: str = "") -> Admission:
     return Admission(
-        epoch=0, stamp_ns=stamp, sequence=0, sent_wall_ns=0, stamp_received_wall_ns=0, received_mono_ns=applied_ns,
-        received_wall_ns=0, applied_mono_ns=applied_ns if verdict == "accepted" else None, verdict=verdict, reason="",
-        limited=limited, mode="drive", steering_rad=0.0, throttle=0.0, brake=0.0,
-    )  # fmt: skip
+        epoch=0,
+        stamp_ns=stamp,
+        sequence=0,
+        sent_wall_ns=0,
+        stamp_received_wall_ns=0,
+        received_mono_ns=applied_ns,
+        received_wall_ns=0,
+        applied_mono_ns=applied_ns if verdict == "accepted" else None,
+        verdict=verdict,
+        reason="",
+        limited=limited,
+        mode="drive",
+        steering_rad=0.0,
+        throttle=0.0,
+        brake=0.0,
+    )
 
 
 def truth(mono_ns: int) -> GroundTruth:
@@ -147,7 +163,7 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
         "truth": [truth(number * 20 * MS) for number in range(100)],
         "event": [Event(100 * MS, "drive_began", ""), *events],
         "frame": [frame(number) for number in range(60)],
-        # Of each frame one that is refused, one that comes into force after 80 ms, and its repetition.
+        # For each frame a rejected command, one that is applied after 80 ms, and its repetition.
         "admission": [
             each
             for number in range(10, 50)
@@ -160,9 +176,9 @@ def payloads(*events: Event) -> dict[str, list[Any]]:
     }
 
 
-def test_a_drive_is_what_lies_between_its_beginning_and_its_ending() -> None:
-    """Rows and events outside do not count, times are since the beginning, a frame's first obeyed command counts."""
-    drive = watched(
+def test_a_monitored_run_covers_the_drive_only() -> None:
+    """Rows and events outside the drive are excluded, and times count from its start."""
+    drive = summarize_drive(
         payloads(
             Event(50 * MS, "lane_invasion", ""),
             Event(600 * MS, "lane_invasion", ""),
@@ -175,8 +191,8 @@ def test_a_drive_is_what_lies_between_its_beginning_and_its_ending() -> None:
     assert drive.limited_s.tolist() == [pytest.approx(0.64)]
 
 
-def test_a_drive_departs_with_the_first_invasion_and_fails_with_any_other_ending() -> None:
-    """Departure is one lane invasion or more; completion is lost with any ending but `completed`, and without one."""
+def test_departure_and_completion() -> None:
+    """A lane invasion is a departure; any ending but `completed`, and a missing ending, is no completion."""
     invasion = Event(600 * MS, "lane_invasion", "")
     for events, expected in (
         ((Event(900 * MS, "ending", "completed"),), (False, False)),
@@ -185,32 +201,32 @@ def test_a_drive_departs_with_the_first_invasion_and_fails_with_any_other_ending
         ((invasion, Event(900 * MS, "ending", "collision")), (True, True)),
         ((), (False, True)),
     ):
-        drive = watched(payloads(*events))
+        drive = summarize_drive(payloads(*events))
         assert (departed(drive), not_completed(drive)) == expected
 
 
-def test_a_vehicle_that_is_never_armed_has_not_completed() -> None:
-    """Without a beginning there are no rows and no delay; nothing was left, nothing completed, and nothing swings."""
-    never = payloads()
-    never["event"] = [Event(600 * MS, "lane_invasion", "")]
-    drive = watched(never)
+def test_a_drive_that_never_began() -> None:
+    """A drive that never began has no rows, no delay, no departure, no completion and no oscillation."""
+    recorded = payloads()
+    recorded["event"] = [Event(600 * MS, "lane_invasion", "")]
+    drive = summarize_drive(recorded)
     assert (len(drive.time_s), math.isnan(drive.total_delay_ms)) == (0, True)
     assert (departed(drive), not_completed(drive), growth_per_s(drive)) == (False, True, -math.inf)
 
 
-# What many say together.
+# The summary of many seeds.
 
 
-def test_ranks_count_what_is_out_of_range() -> None:
-    """Of six seeds, two beyond the range: quartiles and interval are null where they fall among these."""
-    found = summary([300.0, 310.0, 320.0, 330.0, math.inf, math.inf])
+def test_values_out_of_range_have_a_rank() -> None:
+    """With two of six seeds out of range, quartiles and interval are null where they fall among these."""
+    found = summarize_boundaries([300.0, 310.0, 320.0, 330.0, math.inf, math.inf])
     assert found == {"p25": 312.5, "p50": 325.0, "p75": None, "interval": [300.0, None], "n": 4}
 
 
-def test_the_interval_is_that_of_order_statistics() -> None:
-    """Of ten seeds the interval of the median reaches from the second to the ninth (98 %), of five there is none."""
-    assert summary([float(value) for value in range(10)])["interval"] == [1.0, 8.0]
-    assert summary([1.0, 2.0, 3.0, 4.0, 5.0])["interval"] is None
+def test_the_interval_consists_of_order_statistics() -> None:
+    """The median's interval of ten seeds reaches from the second to the ninth (98 %); five seeds have none."""
+    assert summarize_boundaries([float(value) for value in range(10)])["interval"] == [1.0, 8.0]
+    assert summarize_boundaries([1.0, 2.0, 3.0, 4.0, 5.0])["interval"] is None
 
 
 def run_entry(route: str, repetition: int, **changes: Any) -> dict[str, Any]:
@@ -237,8 +253,8 @@ RUNS = [
 
 
 def test_groups_are_of_each_route_and_of_all() -> None:
-    """Each route has a group, and all of them together one without a route, with counts of what was not monotone."""
-    one, other, both = groups_of(RUNS)
+    """There is a group for each route and one for all routes, with counts of searches that were not monotone."""
+    one, other, both = summarize_groups(RUNS)
     assert [(each["route"], each["n"]) for each in (one, other, both)] == [("a", 6), ("b", 1), (None, 7)]
     assert one["departure_ms"] == {"p25": 372.5, "p50": 385.0, "p75": 397.5, "interval": [360.0, 410.0], "n": 6}
     assert one["completion_ms"] == {"p25": None, "p50": None, "p75": None, "interval": [None, None], "n": 0}
@@ -249,18 +265,21 @@ def test_groups_are_of_each_route_and_of_all() -> None:
 
 def test_figure_and_table_show_every_group() -> None:
     """The figure has a panel for each preset and a row for each route; the table has a row for each group."""
-    found = {"runs": RUNS, "groups": groups_of(RUNS)}
+    found = {"runs": RUNS, "groups": summarize_groups(RUNS)}
     (axes,) = boundary_figure(found).axes
     assert [label.get_text() for label in axes.get_yticklabels()] == ["all routes", "b", "a"]
     assert {text.get_text() for text in axes.texts} == {
-        "\N{RIGHTWARDS ARROW}6", "\N{RIGHTWARDS ARROW}1", "\N{LEFTWARDS ARROW}1", "\N{RIGHTWARDS ARROW}7",
-    }  # fmt: skip
+        "\N{RIGHTWARDS ARROW}6",
+        "\N{RIGHTWARDS ARROW}1",
+        "\N{LEFTWARDS ARROW}1",
+        "\N{RIGHTWARDS ARROW}7",
+    }
     html = html_of(boundary_table(found))
     assert html.count("<tr>") == 4
     assert "360\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}410" in html
 
 
-# What is planned.
+# The plan.
 
 
 def config(*changes: str) -> BoundaryConfig:
@@ -268,31 +287,31 @@ def config(*changes: str) -> BoundaryConfig:
 
 
 def test_first_seeds_of_all_come_before_second_ones() -> None:
-    """So that a search that is stopped has as many seeds of each."""
+    """The first seed of every route and preset is searched before any second seed."""
     names = [each.name for each in plan_boundary(config("routes=[a, b]", "repetitions=2"))]
     assert names[:4] == ["a designed 00", "a paper_calibrated 00", "b designed 00", "b paper_calibrated 00"]
     assert len(names) == 8
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "expected"),
     [
         ("time=real", "virtual time"),
-        ("network.video.delay_ms=10", "leave it out"),
+        ("network.video.delay_ms=10", "delay_ms"),
         ("routes=[a, a]", "each once"),
         ("presets=[]", "at least one"),
         ("presets=[swift]", "no preset 'swift'"),
         ("network.condition=L9", "no condition 'L9'"),
     ],
 )
-def test_what_cannot_be_searched_is_rejected(change: str, says: str) -> None:
-    """Each is said in a sentence before anything is driven."""
-    with pytest.raises(UserError, match=says):
+def test_invalid_boundary_configs_are_rejected(change: str, expected: str) -> None:
+    """An invalid boundary config is rejected before anything is driven."""
+    with pytest.raises(UserError, match=expected):
         plan_boundary(config(change))
 
 
-def test_the_delay_is_put_in_place_of_the_condition() -> None:
-    """The video's constant delay is the one searched, to the nanosecond; everything else is as configured."""
+def test_the_video_delay_replaces_the_conditions() -> None:
+    """The constant video delay is the given one, rounded to 1 ns; everything else is unchanged."""
     before = config("network.condition=L4")
     after = with_video_delay(before, 1 / 3)
     assert after.network.video.delay_ms == 0.333333
@@ -300,7 +319,7 @@ def test_the_delay_is_put_in_place_of_the_condition() -> None:
     assert after.model_copy(update={"network": before.network}) == before
 
 
-# For real.
+# Real searches.
 
 
 def small(*changes: str) -> BoundaryConfig:
@@ -309,10 +328,10 @@ def small(*changes: str) -> BoundaryConfig:
 
 @pytest.mark.full
 def test_one_real_search() -> None:
-    """One seed: the swing grows within 10 ms of the theory, then the car leaves its lane, then it does not arrive."""
-    (requested,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
-    found = search(requested)
-    assert found["theory_ms"] == theoretical_ms(requested.planned.config)
+    """Onset, within 10 ms of theory, departure and completion are found in this order of delay."""
+    (search,) = plan_boundary(small("grid_ms=200", "within_ms=10"))
+    found = run_search(search)
+    assert found["theory_ms"] == theoretical_ms(search.planned.config)
     assert found["onset_ms"] == pytest.approx(found["theory_ms"], abs=10)
     assert found["onset_ms"] < found["departure_ms"] < found["completion_ms"]
     low_ms, high_ms = found["searched_ms"]
@@ -322,24 +341,24 @@ def test_one_real_search() -> None:
 
 
 @pytest.mark.full
-def test_a_limit_on_the_age_of_pictures_ends_completion() -> None:
-    """With a limit of 100 ms the vehicle is not even armed beyond it: completion ends there, and no swing has begun."""
-    (requested,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
-    found = search(requested)
+def test_the_frame_age_limit_ends_completion() -> None:
+    """With a frame age limit of 100 ms the vehicle is not armed beyond: completion ends without oscillation."""
+    (search,) = plan_boundary(small("grid_ms=200", "within_ms=100", "safety.picture_age_limit_ms=100"))
+    found = run_search(search)
     assert (found["onset_ms"], found["departure_ms"]) == (None, None)
     assert found["completion_ms"] == pytest.approx(100, abs=60)
     assert found["searched_ms"][1] == pytest.approx(412, abs=2)
 
 
-def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Departure is searched where drives begin: found or not there, and what never begins beyond says nothing of it."""
+def test_departure_is_searched_where_drives_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Departure is searched at delays at which drives begin, and drives that never begin do not affect it."""
 
     def fake(planned: PlannedRun) -> MonitoredRun:
         delay_ms = planned.config.network.video.delay_ms or 0.0
         begins = delay_ms <= 250
         return MonitoredRun(
             ending="completed" if begins else "time_limit",
-            lane_invasions=int(begins and delay_ms >= leaves_ms),
+            lane_invasions=int(begins and delay_ms >= departure_ms),
             total_delay_ms=delay_ms + 10 if begins else math.nan,
             time_s=np.arange(int(begins), dtype=np.float64),
             cross_track_m=np.zeros(int(begins)),
@@ -347,41 +366,41 @@ def test_nobody_leaves_a_lane_where_nobody_drives(monkeypatch: pytest.MonkeyPatc
             limited_s=np.zeros(0),
         )
 
-    monkeypatch.setattr(boundary_module, "watch_drive", fake)
+    monkeypatch.setattr(boundary_module, "drive_monitored", fake)
     monkeypatch.setattr(boundary_module, "straight_growth", lambda _: (math.nan, -math.inf))
-    (requested,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
-    leaves_ms = 137
-    found = search(requested)
+    (search,) = plan_boundary(small("grid_ms=100", "within_ms=2"))
+    departure_ms = 137
+    found = run_search(search)
     assert found["departure_ms"] == pytest.approx(147, abs=1)
     assert found["not_monotone"] == []
     assert found["completion_ms"] == pytest.approx(260, abs=1)
-    leaves_ms = 0
-    assert (search(requested)["below"], search(requested)["not_monotone"]) == (["departure"], [])
-    leaves_ms = 300
-    assert (search(requested)["departure_ms"], search(requested)["searched_ms"]) == (None, [10, 410])
+    departure_ms = 0
+    assert (run_search(search)["below"], run_search(search)["not_monotone"]) == (["departure"], [])
+    departure_ms = 300
+    assert (run_search(search)["departure_ms"], run_search(search)["searched_ms"]) == (None, [10, 410])
 
 
-def test_a_search_that_fails_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is told with its reason, and what the others found is there."""
+def test_a_failed_search_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failed search is listed with its reason, and the others are completed."""
 
-    def fake(requested: boundary_module.BoundarySearch) -> dict[str, Any]:
-        if requested.name.endswith("01"):
+    def fake(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+        if search.name.endswith("01"):
             raise WorkError("the vehicle was never armed")
         return run_entry("a_key", 0)
 
-    monkeypatch.setattr(boundary_module, "search", fake)
-    monkeypatch.setattr(boundary_module, "processes", in_this_process)
-    told: list[str] = []
-    found, failed, done = search_all(plan_boundary(small("repetitions=3")), jobs=1, tell=told.append)
+    monkeypatch.setattr(boundary_module, "run_search", fake)
+    monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
+    lines: list[str] = []
+    found, failed, done = run_searches(plan_boundary(small("repetitions=3")), jobs=1, on_progress=lines.append)
     assert (len(found), done) == (2, True)
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the vehicle was never armed"}]
-    assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in told
+    assert "a_key paper_calibrated 01: failed: the vehicle was never armed" in lines
 
 
-def killed_by(requested: boundary_module.BoundarySearch) -> dict[str, Any]:
-    """Search as if it were one of repetition 1 that its process does not survive, and of 2 that dies the first time."""
-    repetition = int(requested.name[-2:])
-    mark = Path(requested.planned.config.study.participant or "") / str(repetition)
+def killed_by(search: boundary_module.BoundarySearch) -> dict[str, Any]:
+    """Kill the process in repetition 1, and once in repetition 2; return an entry otherwise."""
+    repetition = int(search.name[-2:])
+    mark = Path(search.planned.config.study.participant or "") / str(repetition)
     if repetition == 1 or (repetition == 2 and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -389,31 +408,31 @@ def killed_by(requested: boundary_module.BoundarySearch) -> dict[str, Any]:
 
 
 @pytest.mark.full
-def test_a_process_that_dies_costs_no_search(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What a process that died was at is searched again, alone; only the one that dies there too has failed."""
-    monkeypatch.setattr(boundary_module, "search", killed_by)
+def test_searches_of_a_dead_process_are_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Searches of a process that died are repeated alone; only one that kills its process again has failed."""
+    monkeypatch.setattr(boundary_module, "run_search", killed_by)
     searches = plan_boundary(small("repetitions=5", f"study.participant={tmp_path}"))
-    found, failed, done = search_all(searches, jobs=2, tell=lambda _: None)
+    found, failed, done = run_searches(searches, jobs=2, on_progress=lambda _: None)
     assert [run["repetition"] for run in found] == [0, 2, 3, 4]
     assert failed == [{"name": "a_key paper_calibrated 01", "why": "the process that searched it died"}]
     assert done
 
 
-def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Ctrl-C after the second seed: what was under way is taken too, nothing more, and the files hold it."""
-    monkeypatch.setattr(boundary_module, "search", lambda requested: run_entry("a_key", int(requested.name[-2:])))
-    monkeypatch.setattr(boundary_module, "processes", in_this_process)
+def test_ctrl_c_keeps_the_found_boundaries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """After Ctrl-C the searches in progress are finished, no others are started, and the files have all results."""
+    monkeypatch.setattr(boundary_module, "run_search", lambda search: run_entry("a_key", int(search.name[-2:])))
+    monkeypatch.setattr(boundary_module, "process_workers", in_this_process)
     monkeypatch.setattr(_InThisProcess, "begins", 3)
-    told: list[str] = []
+    lines: list[str] = []
 
     def tell(line: str) -> None:
-        told.append(line)
-        if len(told) == 2:
+        lines.append(line)
+        if len(lines) == 2:
             raise KeyboardInterrupt
 
-    requested = small("repetitions=5")
-    found, done = boundary_module.boundary(requested, plan_boundary(requested), tmp_path, jobs=1, tell=tell)
-    assert (len(told), done) == (3, False)
+    config = small("repetitions=5")
+    found, done = boundary_module.search_boundary(config, plan_boundary(config), tmp_path, jobs=1, on_progress=tell)
+    assert (len(lines), done) == (3, False)
     assert [run["repetition"] for run in found["runs"]] == [0, 1, 2]
     assert json.loads((tmp_path / "boundary.json").read_text()) == found
     assert (tmp_path / "boundary.csv").read_text().count("\n") == 4
@@ -421,7 +440,7 @@ def test_what_was_found_at_ctrl_c_is_written(monkeypatch: pytest.MonkeyPatch, tm
 
 
 class _InThisProcess:
-    """An executor that needs no processes; of what is submitted it only begins some."""
+    """An executor in this process that runs only the first `begins` submitted calls."""
 
     begins = 100
 
@@ -448,12 +467,12 @@ class _InThisProcess:
 @contextmanager
 def in_this_process(jobs: int) -> Iterator[Workers]:
     executor: Any = _InThisProcess()
-    yield Workers(executor, jobs, far=False)
+    yield Workers(executor, jobs, remote=False)
 
 
-def test_paths_of_roads_can_be_routes(tmp_path: Path) -> None:
-    """A road of one's own is a route like those that come with LAVT."""
+def test_the_path_of_a_road_file_is_a_route(tmp_path: Path) -> None:
+    """The path of a road file works as a route."""
     road = tmp_path / "bend.yaml"
     road.write_text("title: Bend\nsegments: [{length_m: 60}, {length_m: 40, curvature_per_m: 0.02}]\n")
-    (requested,) = plan_boundary(small(f"routes=[{road}]"))
-    assert requested.planned.identity["route"] == str(road)
+    (search,) = plan_boundary(small(f"routes=[{road}]"))
+    assert search.planned.identity["route"] == str(road)

@@ -19,7 +19,7 @@ from lavt.experiment.boundary.delay_margin import (
 )
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 
-PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an independent computation of the same model
+INDEPENDENT_RESULTS = [  # lookahead s, steering lag s, delay margin ms: an independent computation of the same model
     (0.60, 0.15, 114),
     (0.70, 0.15, 162),
     (0.70, 0.10, 200),
@@ -30,34 +30,36 @@ PROTOTYPE_TABLE = [  # lookahead s, steering lag s, critical delay ms: an indepe
 ]
 
 
-@pytest.mark.parametrize(("lookahead_s", "steering_lag_s", "critical_ms"), PROTOTYPE_TABLE)
-def test_reproduces_the_prototype(lookahead_s: float, steering_lag_s: float, critical_ms: float) -> None:
-    """The critical delays are those of an independent computation, within 3 ms."""
+@pytest.mark.parametrize(("lookahead_s", "steering_lag_s", "critical_ms"), INDEPENDENT_RESULTS)
+def test_delay_margins_match_an_independent_computation(
+    lookahead_s: float, steering_lag_s: float, critical_ms: float
+) -> None:
+    """The delay margins are those of an independent computation, within 3 ms."""
     loop = LateralLoop(lookahead_s, car=replace(LINCOLN_MKZ, steering_lag_s=steering_lag_s))
     assert 1e3 * critical_delay_s(loop) == pytest.approx(critical_ms, abs=3)
 
 
-def test_without_lag_filter_and_hold_the_bound_is_the_textbook_one() -> None:
-    """As lag, averaging, hold and tyres vanish, the critical delay becomes 0.5205 lookahead / speed."""
+def test_the_simplified_loop_has_the_textbook_delay_margin() -> None:
+    """As lag, averaging, hold and tyre dynamics vanish, the delay margin approaches 0.5205 lookahead / speed."""
     bare = LateralLoop(
         2.0, speed_mps=1.0, frame_rate_hz=100.0, smoothing=1.0, car=replace(LINCOLN_MKZ, steering_lag_s=1e-3)
     )
     bound_s = DELAY_PER_LOOKAHEAD * 2.0
     assert pytest.approx(0.52049, abs=1e-5) == DELAY_PER_LOOKAHEAD
-    # 1 ms of lag, half a frame of hold and the 7 ms in which tyres relax at 1 m/s take their share.
+    # The rest is 1 ms of lag, half a frame of hold and the 7 ms relaxation of the tyres at 1 m/s.
     assert spectral_radius(bare, 0.97 * bound_s) < 1 < spectral_radius(bare, bound_s)
 
 
-def test_the_plant_turns_as_the_kinematic_car_at_walking_pace() -> None:
-    """At 1 m/s the yaw rate settles at speed x wheel angle / wheelbase: the tyres do not matter."""
+def test_the_plant_is_kinematic_at_low_speed() -> None:
+    """At 1 m/s the yaw rate settles at speed x wheel angle / wheelbase, independent of the tyres."""
     loop = LateralLoop(1.0, speed_mps=1.0)
     a, _ = plant(loop)
     settled = np.linalg.solve(a[:2, :2], -a[:2, 4])  # lateral speed and yaw rate for a wheel angle of 1 rad
     assert settled[1] == pytest.approx(1.0 / loop.car.wheelbase_m, rel=0.01)
 
 
-def test_the_margin_vanishes_where_the_loop_turns_unstable() -> None:
-    """Phase margin and spectral radius, computed on different ways, agree on the critical delay."""
+def test_the_phase_margin_is_zero_at_the_delay_margin() -> None:
+    """Phase margin and spectral radius, computed in different ways, agree on the delay margin."""
     loop = LateralLoop(0.74)
     critical_s = critical_delay_s(loop)
     assert phase_margin_rad(loop, critical_s) == pytest.approx(0, abs=1e-3)
@@ -65,15 +67,15 @@ def test_the_margin_vanishes_where_the_loop_turns_unstable() -> None:
     assert phase_margin_rad(loop, critical_s - 0.05) > 0 > phase_margin_rad(loop, critical_s + 0.05)
 
 
-def test_a_fraction_of_a_frame_joins_the_whole_frames() -> None:
-    """The phase margin is continuous in the delay where the fraction turns into one more frame."""
+def test_the_phase_margin_is_continuous_in_the_delay() -> None:
+    """The phase margin is continuous in the delay where a fraction of a frame becomes a whole frame."""
     loop = LateralLoop(1.0)
     before, after = (phase_margin_rad(loop, 3 / 30 + shift) for shift in (-1e-7, 1e-7))
     assert before == pytest.approx(after, abs=1e-5)
 
 
-def test_the_smallest_lookahead_leaves_just_the_margin() -> None:
-    """With the smallest lookahead the margin is what was asked for; with less it is smaller."""
+def test_the_smallest_lookahead_has_the_requested_margin() -> None:
+    """The smallest lookahead has exactly the requested phase margin, and a shorter one has less."""
     lookahead_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
     assert math.degrees(phase_margin_rad(LateralLoop(lookahead_s), 0.081)) == pytest.approx(30, abs=0.01)
     assert math.degrees(phase_margin_rad(LateralLoop(lookahead_s - 0.05), 0.081)) < 30
@@ -91,18 +93,18 @@ def test_the_smallest_lookahead_leaves_just_the_margin() -> None:
         ),
     ],
 )
-def test_whatever_slows_the_loop_costs_delay(slower: LateralLoop, faster: LateralLoop) -> None:
-    """Speed, a low frame rate, more averaging and a lazier steering each lower the critical delay."""
+def test_a_slower_loop_has_a_smaller_delay_margin(slower: LateralLoop, faster: LateralLoop) -> None:
+    """A higher speed, a lower frame rate, more averaging and a longer steering lag each reduce the delay margin."""
     assert critical_delay_s(slower) < critical_delay_s(faster)
 
 
-def test_a_lookahead_that_is_too_short_is_unstable_without_any_delay() -> None:
-    """The lags of the car alone can use up the whole margin."""
+def test_too_short_a_lookahead_is_unstable_without_delay() -> None:
+    """With too short a lookahead, the lags of the car alone make the loop unstable."""
     assert critical_delay_s(LateralLoop(0.2)) == 0.0
 
 
-def test_the_designed_preset_is_what_the_model_gives() -> None:
-    """The lookahead in the table of presets is the smallest with 30 degrees of margin at 81 ms, rounded up."""
+def test_the_designed_preset_comes_from_the_model() -> None:
+    """The preset `designed` has the smallest lookahead with a phase margin of 30 degrees at 81 ms, rounded up."""
     smallest_s = smallest_lookahead_s(math.radians(30), total_delay_s=0.081)
     assert PRESETS["designed"].lookahead_s == math.ceil(100 * smallest_s) / 100
 
@@ -111,9 +113,9 @@ def config(*changes: str) -> RunConfig:
     return load_config(RunConfig, shipped("configs/demo.yaml"), changes)
 
 
-def test_the_loop_as_configured_is_the_one_driven() -> None:
-    """Preset, what replaces its settings, frame rate, car and lags are those of the run."""
-    assert configured_loop(config()) == LateralLoop(0.74, supposed_wheelbase_m=LINCOLN_MKZ.wheelbase_m)
+def test_the_configured_loop_has_the_settings_of_the_run() -> None:
+    """The configured loop has the preset, changed settings, frame rate, car and lags of the run."""
+    assert configured_loop(config()) == LateralLoop(0.74, controller_wheelbase_m=LINCOLN_MKZ.wheelbase_m)
     changed = configured_loop(
         config(
             "controller.preset=designed",
@@ -130,30 +132,30 @@ def test_the_loop_as_configured_is_the_one_driven() -> None:
         10.0,
         15.0,
         car=replace(LINCOLN_MKZ, steering_lag_s=0.2, steering_dead_time_s=0.06),
-        supposed_wheelbase_m=3.0,
+        controller_wheelbase_m=3.0,
     )
 
 
 @pytest.mark.parametrize(("lookahead_s", "speed_mps", "driven_m"), [(0.74, 5.0, 4.0), (3.0, 10.0, 20.0)])
 def test_the_lookahead_is_within_the_controllers_bounds(lookahead_s: float, speed_mps: float, driven_m: float) -> None:
-    """What would be nearer than 4 m or farther than 20 m is driven at 4 or 20 m."""
+    """Lookaheads below 4 m and above 20 m are limited to 4 and 20 m, as in the controller."""
     loop = configured_loop(config(f"controller.lookahead_s={lookahead_s}", f"controller.speed_mps={speed_mps}"))
     assert loop is not None
     assert loop.lookahead_s * speed_mps == pytest.approx(driven_m)
 
 
 @pytest.mark.parametrize("change", ["controller.kind=my_controller", "vehicle.kind=my_car"])
-def test_of_others_nothing_is_known(change: str) -> None:
-    """For a controller or a vehicle that is not of LAVT there is no model."""
+def test_other_controllers_and_vehicles_have_no_model(change: str) -> None:
+    """A controller or a vehicle that is not LAVT's has no model."""
     assert configured_loop(config(change)) is None
 
 
-def test_dead_time_of_the_steering_comes_off_the_delay() -> None:
-    """With 60 ms of dead time the loop bears just 60 ms less."""
+def test_steering_dead_time_reduces_the_delay_margin() -> None:
+    """A steering dead time of 60 ms reduces the delay margin by 60 ms."""
     late = LateralLoop(1.01, car=replace(LINCOLN_MKZ, steering_dead_time_s=0.06))
     assert critical_delay_s(late) == pytest.approx(critical_delay_s(LateralLoop(1.01)) - 0.06, abs=1e-6)
 
 
-def test_a_wheelbase_supposed_too_long_steers_too_much() -> None:
-    """The controller's gain is that of the wheelbase it supposes, so more of it bears less delay."""
-    assert critical_delay_s(LateralLoop(1.01, supposed_wheelbase_m=3.5)) < critical_delay_s(LateralLoop(1.01))
+def test_too_long_a_controller_wheelbase_reduces_the_delay_margin() -> None:
+    """A longer wheelbase in the controller increases its gain and reduces the delay margin."""
+    assert critical_delay_s(LateralLoop(1.01, controller_wheelbase_m=3.5)) < critical_delay_s(LateralLoop(1.01))

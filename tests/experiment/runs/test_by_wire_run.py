@@ -1,4 +1,4 @@
-"""A run whose vehicle is a software car behind a by-wire kit, in virtual time."""
+"""Tests of runs in virtual time whose vehicle is a software car behind a by-wire kit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GENERATIONS = ("dataspeed_gen1", "dataspeed_gen2")
 
 
 def result_of(out: Path, kind: str, profile: str = GENERATIONS[0]) -> dict[str, Any]:
-    said = {
+    settings = {
         "vehicle": {
             "kind": kind,
             "route": "a_key",
@@ -24,12 +24,12 @@ def result_of(out: Path, kind: str, profile: str = GENERATIONS[0]) -> dict[str, 
         },
         "fidelity": "geometry",
     }
-    return run_once(plan_run(parse_config(RunConfig, said, "the run")), out)
+    return run_once(plan_run(parse_config(RunConfig, settings, "the run")), out)
 
 
 @pytest.mark.parametrize("profile", [pytest.param(GENERATIONS[0], marks=pytest.mark.full), GENERATIONS[1]])
 def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None:
-    """Over a bus the key part of route A is driven about as well as without, and each hop to the wheel is timed."""
+    """A route is driven through the by-wire kit about as well as without, and the latency to the wheel is measured."""
     result, without = result_of(tmp_path / "by-wire", "dbw", profile), result_of(tmp_path / "without", "simulator")
     assert (result["ending"], result["valid"]) == ("completed", True)
     assert result["p95_m"] <= 0.22
@@ -42,7 +42,7 @@ def test_a_route_is_driven_through_the_kit(profile: str, tmp_path: Path) -> None
 
 
 @pytest.mark.full
-def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
-    """Bus, kit and adapter are as deterministic as all else in virtual time."""
+def test_a_by_wire_run_is_reproducible(tmp_path: Path) -> None:
+    """A run with bus, kit and adapter in virtual time is byte-for-byte reproducible."""
     first, second = result_of(tmp_path / "first", "dbw"), result_of(tmp_path / "second", "dbw")
     assert first["digest"] == second["digest"]

@@ -1,4 +1,4 @@
-"""The three fidelities of a virtual run: what must not differ between them, and what may by how much."""
+"""Tests of the three fidelities of a virtual run: equal latencies, and driving within a tolerance."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from lavt.experiment.runs.virtual_run import build_loop, drive
 from lavt.recording.record import read_record
 
 P95_WITHIN_M = 0.05
-"""The detector counts paint in cells of 0.05 m, and sees the lane up to that much beside the truth; largest difference
-measured between geometry and video, L0 and L2, both presets, two seeds: 0.027 m. Pixels against video: 0.008 m."""
+"""The detector has cells of 0.05 m, which is its largest error of the lane. The largest measured difference between
+geometry and video (L0 and L2, both presets, two seeds) is 0.027 m, between pixels and video 0.008 m."""
 
 
 def planned(*changes: str) -> PlannedRun:
@@ -31,7 +31,7 @@ def planned(*changes: str) -> PlannedRun:
 
 @cache
 def result(fidelity: str, condition: str) -> dict[str, Any]:
-    """Drive once for all tests of this file."""
+    """Return the result of a run, which is driven once for all tests of this file."""
     with TemporaryDirectory() as folder:
         return run_once(planned(f"fidelity={fidelity}", f"network.condition={condition}"), Path(folder) / "run")
 
@@ -39,8 +39,8 @@ def result(fidelity: str, condition: str) -> dict[str, Any]:
 @pytest.mark.full
 @pytest.mark.parametrize("condition", ["L0", "L2"])
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
-def test_latency_is_the_same_in_all(fidelity: str, condition: str) -> None:
-    """With the same seed every latency is that of video within 1 ms: costs, links and order act on all alike."""
+def test_latencies_are_the_same_at_all_fidelities(fidelity: str, condition: str) -> None:
+    """With the same seed, every latency is that of fidelity video within 1 ms."""
     video, other = result("video", condition), result(fidelity, condition)
     for name in ("loop_ms", "tau_v_ms", "tau_c_ms"):
         for share in ("p5", "p50", "p95"):
@@ -52,16 +52,16 @@ def test_latency_is_the_same_in_all(fidelity: str, condition: str) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("condition", ["L0", "L2"])
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
-def test_driving_is_similar_in_all(fidelity: str, condition: str) -> None:
-    """With the same seed the drive ends alike, as long, and with a cross-track P95 that a cell of the grid explains."""
+def test_driving_is_similar_at_all_fidelities(fidelity: str, condition: str) -> None:
+    """With the same seed, ending and duration are those of video, and P95 differs by at most one cell of the grid."""
     video, other = result("video", condition), result(fidelity, condition)
     assert (other["fidelity"], other["ending"], other["valid"]) == (fidelity, video["ending"], True)
     assert other["duration_s"] == pytest.approx(video["duration_s"], abs=0.1)
     assert other["p95_m"] == pytest.approx(video["p95_m"], abs=P95_WITHIN_M)
 
 
-def test_what_fails_by_delay_fails_without_pixels_too(tmp_path: Path) -> None:
-    """At L5 the calibrated preset leaves its lane at fidelity geometry: it is the loop's dynamics, not the pixels'."""
+def test_delay_has_its_effect_at_fidelity_geometry(tmp_path: Path) -> None:
+    """At L5 the calibrated preset leaves its lane at fidelity geometry, too: the cause is the loop, not the pixels."""
     changes = ("fidelity=geometry", "network.inherent=paper_wifi5", "network.condition=L5")
     entry = run_once(planned(*changes), tmp_path / "run")
     assert entry["ending"] != "completed"
@@ -69,8 +69,8 @@ def test_what_fails_by_delay_fails_without_pixels_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
-def test_the_digest_repeats(fidelity: str, tmp_path: Path) -> None:
-    """Equal runs have equal digests at every fidelity, and another seed has another."""
+def test_the_digest_is_reproducible_at_every_fidelity(fidelity: str, tmp_path: Path) -> None:
+    """Equal runs have equal digests at every fidelity, and another seed changes the digest."""
     digests = []
     for number, seed in enumerate((1, 1, 2)):
         loop = build_loop(planned(f"fidelity={fidelity}", f"seed={seed}"), tmp_path / str(number))
@@ -80,21 +80,21 @@ def test_the_digest_repeats(fidelity: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fidelity", ["pixels", "geometry"])
-def test_what_is_no_video_is_not_recorded_as_one(fidelity: str, tmp_path: Path) -> None:
-    """Only at video there are access units in the record, and at geometry nothing that another channel says as well."""
+def test_records_without_video(fidelity: str, tmp_path: Path) -> None:
+    """Access units are recorded at fidelity video only, and at geometry no channel repeats another's data."""
     loop = build_loop(planned(f"fidelity={fidelity}"), tmp_path / "run")
     drive(loop, limit_ns=3 * NS_PER_S)
     server, client = (read_record(tmp_path / "run" / name) for name in ("server.mcap", "client.mcap"))
     assert server.video() == client.video() == []
-    said_twice = {"rtp", "control", "state"}
+    redundant = {"rtp", "control", "state"}
     assert {"frame", "truth", "admission", "timeline"} <= set(server.tables)
     assert {"picture", "lane", "timeline"} <= set(client.tables)
-    expected = said_twice if fidelity == "pixels" else set()
-    assert said_twice & set(server.tables) == said_twice & set(client.tables) == expected
+    expected = redundant if fidelity == "pixels" else set()
+    assert redundant & set(server.tables) == redundant & set(client.tables) == expected
 
 
-def test_lost_frames_are_survived_and_counted(tmp_path: Path) -> None:
-    """Packets that get lost are lost pictures at fidelity geometry as well, and no other picture suffers."""
+def test_lost_packets_are_lost_frames_at_geometry(tmp_path: Path) -> None:
+    """Lost packets are lost pictures at fidelity geometry, too; they are counted and affect no other picture."""
     loop = build_loop(planned("fidelity=geometry"), tmp_path / "run")
     link = loop.runtime.links["rtp"]
     for at_ns, opened in ((1_500_000_000, False), (1_560_000_000, True)):
@@ -106,13 +106,13 @@ def test_lost_frames_are_survived_and_counted(tmp_path: Path) -> None:
     assert loop.server.camera.counts["frames_sent"] - loop.client.driver.counts["frames_decoded"] <= 4
 
 
-def test_every_fidelity_is_named_in_the_report() -> None:
-    """The report can say of each fidelity what was modelled."""
+def test_the_report_describes_every_fidelity() -> None:
+    """The report has a description of every fidelity."""
     assert set(FIDELITY_SAYS) == set(FIDELITIES)
 
 
 def test_geometry_needs_a_known_road(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle that does not tell its road is refused in a sentence at fidelity geometry."""
+    """A vehicle that does not provide its road is rejected at fidelity geometry."""
     monkeypatch.setattr("lavt.assembly.vehicles.VEHICLES", {"simulator": None, "boat": None})
     with pytest.raises(UserError, match=r"choose vehicle.kind simulator instead of 'boat'"):
         build_loop(planned("vehicle.kind=boat", "fidelity=geometry"), tmp_path / "run")
@@ -122,7 +122,7 @@ ORDERED = ("L0", "L1", "L2", "L3", "L4", "L5")
 
 
 def badness(fidelity: str, condition: str) -> tuple[bool, float]:
-    """How badly a drive went: one that was not completed is worse the earlier it ended, else its P95 decides."""
+    """Return an order of drives: incomplete ones are worse the earlier they ended, complete ones by their P95."""
     with TemporaryDirectory() as folder:
         changes = (f"fidelity={fidelity}", f"network.condition={condition}", "network.inherent=paper_wifi5", "seed=3")
         entry = run_once(planned(*changes), Path(folder) / "run")
@@ -131,12 +131,17 @@ def badness(fidelity: str, condition: str) -> tuple[bool, float]:
 
 @pytest.mark.full
 def test_pixels_and_geometry_order_the_conditions_alike() -> None:
-    """From L0 to L5 drives get worse with total delay, with pixels as without them; L3 and L4, of equal delay, tie."""
+    """From L0 to L5 drives get worse with total delay at both fidelities; L3 and L4, of equal delay, tie."""
     orders = {}
     for fidelity in ("pixels", "geometry"):
-        bad = {name: badness(fidelity, name) for name in ORDERED}
-        assert bad["L0"] < bad["L1"] < bad["L2"] < min(bad["L3"], bad["L4"]) <= max(bad["L3"], bad["L4"]) < bad["L5"], (
-            bad
-        )
-        orders[fidelity] = {name: failed for name, (failed, _) in bad.items()}
+        order = {name: badness(fidelity, name) for name in ORDERED}
+        assert (
+            order["L0"]
+            < order["L1"]
+            < order["L2"]
+            < min(order["L3"], order["L4"])
+            <= max(order["L3"], order["L4"])
+            < order["L5"]
+        ), order
+        orders[fidelity] = {name: failed for name, (failed, _) in order.items()}
     assert orders["pixels"] == orders["geometry"]

@@ -12,7 +12,7 @@ from lavt.config import ClientConfig, RunConfig, ServerConfig
 from lavt.config_file import load_config, parse_config
 from lavt.domain import Now
 from lavt.errors import UserError
-from lavt.experiment.runs.join import join
+from lavt.experiment.runs.join import join_sides
 from lavt.experiment.runs.run import compute_result
 from lavt.recording.record import RecordWriter, read_record
 
@@ -20,7 +20,7 @@ MakeRun = Callable[..., Path]
 
 
 def sides(make_run: MakeRun, where: Path, **settings: Any) -> tuple[Path, Path]:
-    """Leave what `lavt server --out` and `lavt client --out` leave of a drive."""
+    """Write the directories that `lavt server --out` and `lavt client --out` leave of a drive."""
     records = make_run(where / "records", **settings)
     controller, client_video = {"preset": "paper_calibrated"}, {"reorder_hold_ms": 25.0}
     server_video = {"bit_rate_bps": 2_000_000, "reorder_hold_ms": 40.0}
@@ -34,13 +34,12 @@ def sides(make_run: MakeRun, where: Path, **settings: Any) -> tuple[Path, Path]:
 
 
 def test_two_directories_become_one_run(make_run: MakeRun, tmp_path: Path) -> None:
-    """The run has both records, a config that can be read again, and a result with what both sides were."""
+    """The joined run has both records, a readable config, and a result with the settings of both sides."""
     server, client = sides(make_run, tmp_path)
-    result = join(server, client, tmp_path / "run")
+    result = join_sides(server, client, tmp_path / "run")
     assert (result["route"], result["preset"], result["ending"]) == ("b_key", "paper_calibrated", "completed")
-    assert (result["time"], result["injection"], result["inherent"], result["condition"]) == (
-        "real", "none", "network", "none",
-    )  # fmt: skip
+    identity = [result[key] for key in ("time", "injection", "inherent", "condition")]
+    assert identity == ["real", "none", "network", "none"]
     assert (result["valid"], result["invalid_reasons"]) == (True, [])
     config = load_config(RunConfig, tmp_path / "run" / "config.yaml")
     assert (config.vehicle.route, config.video.bit_rate_bps, config.time) == ("b_key", 2_000_000, "real")
@@ -49,38 +48,38 @@ def test_two_directories_become_one_run(make_run: MakeRun, tmp_path: Path) -> No
 
 
 def test_records_of_two_drives_are_rejected(make_run: MakeRun, tmp_path: Path) -> None:
-    """Directories in which the client has not seen what the server sent are refused, and nothing is left."""
+    """Directories of different drives are rejected, and no run directory is created."""
     server, _ = sides(make_run, tmp_path / "one")
     _, client = sides(make_run, tmp_path / "two", began_s=100.0)
     with pytest.raises(UserError, match="same drive"):
-        join(server, client, tmp_path / "run")
+        join_sides(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_the_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
-    """For how long packets waited for earlier ones is what the client's config says, not what the server's does."""
+def test_the_jitter_buffer_hold_is_the_clients(make_run: MakeRun, tmp_path: Path) -> None:
+    """The joined config has the client's hold of the jitter buffer, not the server's."""
     server, client = sides(make_run, tmp_path)
-    join(server, client, tmp_path / "run")
+    join_sides(server, client, tmp_path / "run")
     assert load_config(RunConfig, tmp_path / "run" / "config.yaml").video.reorder_hold_ms == 25.0
 
 
 def test_a_client_of_a_later_drive_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
-    """A client that has only seen what the server sent after its first drive is refused: that drive was not its own."""
+    """A client that received only frames after the server's first drive is rejected."""
     server, client = sides(make_run, tmp_path)
-    seen = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
+    received = read_record(client / "client.mcap").table("picture").ints("stamp_ns").tolist()
     writer = RecordWriter(server / "server.mcap", "server")
     for mono_ns, kind in ((100, "drive_began"), (200, "ending"), (300, "drive_began")):
         writer.write("event", {"mono_ns": mono_ns, "kind": kind, "detail": ""}, Now(mono_ns, mono_ns))
-    for mono_ns, stamp_ns in ((50, seen[0]), (150, seen[0] - 1), (350, seen[1])):
+    for mono_ns, stamp_ns in ((50, received[0]), (150, received[0] - 1), (350, received[1])):
         writer.write("frame", {"number": 0, "stamp_ns": stamp_ns, "stamped_mono_ns": mono_ns}, Now(mono_ns, mono_ns))
     writer.close()
-    with pytest.raises(UserError, match="only the first drive"):
-        join(server, client, tmp_path / "run")
+    with pytest.raises(UserError, match="only the first"):
+        join_sides(server, client, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_what_is_not_the_directory_of_a_side_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
-    """A directory without the record or the config of its side is refused with what to name instead."""
+def test_a_directory_of_the_other_side_is_rejected(make_run: MakeRun, tmp_path: Path) -> None:
+    """A directory without the record or the config of its side is rejected, with the directory to name instead."""
     server, client = sides(make_run, tmp_path)
     with pytest.raises(UserError, match="--out of `lavt server`"):
-        join(client, server, tmp_path / "run")
+        join_sides(client, server, tmp_path / "run")

@@ -17,21 +17,21 @@ from lavt.experiment.runs.plan import plan_run
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment
 from lavt.transport.netem.netem import NetemInterface
 from lavt.transport.netem.probe import ProbeResult, probes
-from lavt.transport.netem.state import AppliedState, StateFiles, boot, namespace, started
+from lavt.transport.netem.state import AppliedState, StateFiles, boot_id, network_namespace, start_ticks
 from lavt.transport.netem.tc import Command
 
 
 class Kernel(NetemInterface):
-    """A netem whose tc notes what it is told, and that measures what is asked and `more_ms`."""
+    """A netem interface that records the commands of tc, and measures the requested delay plus `added_ms`."""
 
     def __init__(self, directory: Path) -> None:
-        super().__init__("lo", directory=directory, run=self.told)
+        super().__init__("lo", directory=directory, run=self.record)
         self.commands: list[str] = []
-        self.more_ms = 0.0
+        self.added_ms = 0.0
         self.stopped: list[str] = []
 
-    def told(self, command: Command) -> str:
-        """Take a command: the interface has nothing of ours until the root is added."""
+    def record(self, command: Command) -> str:
+        """Record a command; the interface has no root queue of ours until one is added."""
         if "show" in command:
             ours = any("add dev lo root" in each for each in self.commands)
             root = {"kind": "prio" if ours else "noqueue", "handle": "4c56:" if ours else "0:", "root": True}
@@ -40,20 +40,20 @@ class Kernel(NetemInterface):
         return ""
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
-        """Measure nothing."""
+        """Return results as requested, plus `added_ms`."""
         return {
-            each.name: ProbeResult(count, 0, 0, 0, *[each.law.delay_ms + self.more_ms] * 3)
-            for each in probes(flows, never)
+            each.name: ProbeResult(count, 0, 0, 0, *[each.impairment.delay_ms + self.added_ms] * 3)
+            for each in probes(flows, exempt)
         }
 
-    def doubts(self) -> list[str]:
-        """Doubt what is said to have stopped."""
+    def problems(self) -> list[str]:
+        """Return the parts that have stopped."""
         return self.stopped
 
     def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
-        """Read nothing back."""
+        """Return no differences."""
         del flows
         return []
 
@@ -63,23 +63,23 @@ def run_by(kernel: NetemInterface, condition: str) -> NetemRun:
     return NetemRun(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), kernel)
 
 
-def test_a_run_holds_its_own_ports_and_leaves_nothing(tmp_path: Path) -> None:
-    """The flows of L4 are held at the ports of the run, measured before and after, and deleted at the end."""
+def test_a_run_delays_its_own_ports_and_cleans_up(tmp_path: Path) -> None:
+    """The flows of L4 are delayed at the ports of the run, measured before and after, and deleted at the end."""
     kernel = Kernel(tmp_path)
     with run_by(kernel, "L4") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
         report = json.loads(json.dumps(netem.report()))
 
-    told = "\n".join(kernel.commands)
-    assert "match ip sport 40001 0xffff match u8 0x80 0xc0 at 28" in told
-    assert "match ip dport 40002 0xffff" in told
+    commands = "\n".join(kernel.commands)
+    assert "match ip sport 40001 0xffff match u8 0x80 0xc0 at 28" in commands
+    assert "match ip dport 40002 0xffff" in commands
     assert kernel.commands[-1] == "tc qdisc del dev lo root"
     assert (report["before"]["video"]["median_ms"], report["after"]["control"]["median_ms"]) == (150, 75)
     assert netem_reasons(report) == []
 
 
-def test_a_run_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    """Whatever ends a run, its queue is deleted."""
+def test_a_failed_run_cleans_up(tmp_path: Path) -> None:
+    """The queue of a run is deleted, however the run ends."""
     kernel = Kernel(tmp_path)
 
     def stopped() -> None:
@@ -92,43 +92,41 @@ def test_a_run_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert kernel.commands[-1] == "tc qdisc del dev lo root"
 
 
-def test_a_run_that_is_rejected_leaves_what_another_holds(tmp_path: Path) -> None:
-    """Where another program holds the loopback a run is refused, and that program's queue stays."""
+def test_a_rejected_run_keeps_the_queue_of_another_program(tmp_path: Path) -> None:
+    """If another program uses the loopback, the run is rejected, and that program's queue remains."""
     kernel = Kernel(tmp_path)
     kernel.commands = ["tc qdisc add dev lo root"]
-    owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(AppliedState("lo", namespace(), boot(), owner, "L3", ()))
-    with pytest.raises(UserError, match="there is L3 on lo"), kernel, run_by(kernel, "L1"):
+    owner = os.getppid(), start_ticks(os.getppid())
+    StateFiles(tmp_path).write(AppliedState("lo", network_namespace(), boot_id(), owner, "L3", ()))
+    with pytest.raises(UserError, match="L3 on lo"), kernel, run_by(kernel, "L1"):
         pass
     assert kernel.commands == ["tc qdisc add dev lo root"]
 
 
-def test_what_was_not_done_as_requested_makes_a_run_invalid(tmp_path: Path) -> None:
-    """A delay that is 3 ms longer after the drive is said for each flow, held or not, with when it was measured."""
+def test_a_delay_that_differs_from_the_request_is_a_reason(tmp_path: Path) -> None:
+    """A delay that is 3 ms longer after the drive is a reason for each flow, with the time of measurement."""
     kernel = Kernel(tmp_path)
     with run_by(kernel, "L1") as netem:
         netem.apply(video_port=40_001, control_port=40_002)
-        kernel.more_ms = 3.0
+        kernel.added_ms = 3.0
         report = netem.report()
 
-    assert "after the drive: video was delayed by 78.00 ms where 75 ms was asked" in netem_reasons(report)
     assert all(reason.startswith("after the drive: ") for reason in netem_reasons(report))
+    assert any("video was delayed by 78.00 ms" in reason for reason in netem_reasons(report))
     kernel.stopped = ["video: its correlated jitter has stopped"]
     assert netem_reasons(netem.report())[0].startswith("video: ")
     assert netem_reasons({**report, "read_back": ["lo has no queue of ours"]})[0] == "lo has no queue of ours"
 
 
 @pytest.mark.parametrize("report", [{}, {"flows": 3}, {"flows": [], "read_back": [], "before": {"video": {}}}])
-def test_a_broken_report_of_netem_is_no_measurement(report: dict[str, Any]) -> None:
-    """Where `netem.json` does not tell what was asked and measured, nobody has measured."""
-    assert netem_reasons(report) == [
-        "nobody measured the injected delay of video",
-        "nobody measured the injected delay of control",
-    ]
+def test_an_invalid_netem_report_counts_as_unmeasured(report: dict[str, Any]) -> None:
+    """With an invalid `netem.json`, the injected delay of each flow counts as not measured."""
+    for reason, flow in zip(netem_reasons(report), ("video", "control"), strict=True):
+        assert f"{flow} was not measured" in reason
 
 
-def test_a_flow_that_was_not_measured_is_said() -> None:
-    """A flow of the report without a measurement is a reason of its own."""
+def test_a_flow_without_a_measurement_is_a_reason() -> None:
+    """A flow of the report without a measurement is a reason."""
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75))
     report = {"flows": [asdict(flow)], "read_back": [], "before": {}, "after": {}}
     assert "before the drive: video: no packet came through" in netem_reasons(report)

@@ -20,13 +20,13 @@ def planned(**keys: Any) -> list[PlannedRun]:
 
 @pytest.fixture
 def any_route(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let tests name routes that do not exist."""
+    """Let tests use routes that do not exist."""
     monkeypatch.setattr(plan, "check_names", lambda *_: None)
 
 
 @pytest.mark.usefixtures("any_route")
 def test_every_combination() -> None:
-    """A sweep is every route under every condition, repeated, each combination once."""
+    """A sweep has every combination of route, condition and repetition once."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4)
     combinations = {(run.identity["route"], run.identity["condition"], run.identity["repetition"]) for run in runs}
     assert len(runs) == len(combinations) == 2 * 3 * 4
@@ -34,7 +34,7 @@ def test_every_combination() -> None:
 
 @pytest.mark.usefixtures("any_route")
 def test_seeds_are_paired() -> None:
-    """One repetition on a route has the same seed under every condition; repetitions and routes have others."""
+    """A repetition on a route has the same seed under every condition; other repetitions and routes have others."""
     runs = planned(routes=["a_key", "b_key"], conditions=["L0", "L3", "L5"], repetitions=4, seed=9)
     seeds: dict[tuple[str, int], set[int]] = {}
     for run in runs:
@@ -45,14 +45,14 @@ def test_seeds_are_paired() -> None:
 
 
 def test_seeds_are_paired_over_axes() -> None:
-    """The values of a further axis are driven with the same seeds: they differ in nothing but the axis."""
+    """Runs that differ only in a further axis have the same seed."""
     runs = planned(conditions=["L0"], repetitions=3, axes={"controller.preset": ["designed", "paper_calibrated"]})
     assert [run.seed for run in runs[:3]] == [run.seed for run in runs[3:]]
     assert len({run.seed for run in runs}) == 3
 
 
 def test_seed_of_a_single_run() -> None:
-    """A run driven alone has the seed of the first repetition in a sweep, and another base seed gives another."""
+    """A single run has the seed of the first repetition in a sweep, and another base seed changes it."""
     alone = plan_run(RunConfig(seed=5))
     assert alone.seed == planned(conditions=["L0"], seed=5)[0].seed
     assert alone.seed != plan_run(RunConfig(seed=6)).seed
@@ -66,8 +66,8 @@ AXES = {
 }
 
 
-def test_names() -> None:
-    """Every run has a name of its own that is safe as the name of a directory."""
+def test_run_names_are_unique_and_safe() -> None:
+    """Every run has a unique name that is safe as the name of a directory."""
     names = [run.name for run in planned(conditions=["L0", "L1"], repetitions=2, axes=AXES)]
     assert len(set(names)) == len(names) == 2 * 2 * 2 * 2 * 2 * 4
     for name in names:
@@ -77,26 +77,25 @@ def test_names() -> None:
 
 
 def test_axes_change_nested_values() -> None:
-    """A further axis changes exactly the value that it names, and the run's identity tells its value."""
+    """A further axis changes exactly the value that it names, and the run's identity has this value."""
     runs = planned(conditions=["L2"], video={"gop_frames": 15}, axes={"video.bit_rate_bps": [1_000_000, 2_000_000]})
     assert [run.config.video.bit_rate_bps for run in runs] == [1_000_000, 2_000_000]
-    assert [run.identity["axes"] for run in runs] == [
-        {"video.bit_rate_bps": 1_000_000}, {"video.bit_rate_bps": 2_000_000},
-    ]  # fmt: skip
+    axes = [run.identity["axes"] for run in runs]
+    assert axes == [{"video.bit_rate_bps": 1_000_000}, {"video.bit_rate_bps": 2_000_000}]
     video = runs[0].config.video.model_copy(update={"bit_rate_bps": 2_000_000})
     assert runs[0].config.model_copy(update={"video": video}) == runs[1].config
     assert runs[0].config.video.gop_frames == 15
 
 
 def test_several_axes() -> None:
-    """Further axes are combined, each value of one with each of the other."""
+    """Further axes are combined: each value of one with each value of the other."""
     runs = planned(conditions=["L0"], axes={"video.gop_frames": [15, 30], "camera.rate_hz": [20.0, 30.0]})
     values = {(run.config.video.gop_frames, run.config.camera.rate_hz) for run in runs}
     assert values == {(15, 20.0), (15, 30.0), (30, 20.0), (30, 30.0)}
 
 
 def test_a_sweep_without_axes() -> None:
-    """Without further axes a run's identity says nothing of them."""
+    """Without further axes, a run's identity has no axes."""
     assert all("axes" not in run.identity for run in planned())
 
 
@@ -112,11 +111,11 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
     ({"axes": {"repetition": [0, 1]}}, "use 'repetitions' for 'repetition'"),
     ({"axes": {"network": [{"inherent": "loopback"}]}}, "use 'conditions' for 'network.condition'"),
     ({"axes": {"vehicle": [{"route": "a_key"}]}}, "use 'routes' for 'vehicle.route'"),
-    ({"axes": {"video.gop_frames": []}}, "asks for no run"),
-    ({"routes": []}, "asks for no run"),
-    ({"conditions": []}, "asks for no run"),
-    ({"conditions": ["L0", "L0"]}, "a_key_L0_00 more than once"),
-    ({"axes": {"study.participant": ["a b", "a/b"]}}, "more than once"),
+    ({"axes": {"video.gop_frames": []}}, "has no run"),
+    ({"routes": []}, "has no run"),
+    ({"conditions": []}, "has no run"),
+    ({"conditions": ["L0", "L0"]}, "a_key_L0_00 twice"),
+    ({"axes": {"study.participant": ["a b", "a/b"]}}, "twice"),
     ({"conditions": ["L0", "L9"]}, "'L9': the known ones are L0"),
     ({"routes": ["a_key", "nowhere"]}, "'nowhere': name one"),
     ({"controller": {"preset": "magic"}}, "'magic'; choose one of"),
@@ -126,16 +125,16 @@ BAD_SWEEPS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("keys", "said"), BAD_SWEEPS, ids=[str(keys) for keys, _ in BAD_SWEEPS])
-def test_bad_sweeps(keys: dict[str, Any], said: str) -> None:
-    """A sweep with a run that cannot be driven, with no run or with one twice is refused before any is driven."""
-    with pytest.raises(UserError, match=re.escape(said)):
+@pytest.mark.parametrize(("keys", "expected"), BAD_SWEEPS, ids=[str(keys) for keys, _ in BAD_SWEEPS])
+def test_invalid_sweeps_are_rejected(keys: dict[str, Any], expected: str) -> None:
+    """A sweep with an invalid run, with duplicate runs or without runs is rejected before any run is driven."""
+    with pytest.raises(UserError, match=re.escape(expected)):
         planned(**keys)
 
 
 @pytest.mark.parametrize("time", ["real", "virtual"])
-def test_identity(time: str) -> None:
-    """A run's identity has every key by which it is told from others, known before it is driven."""
+def test_identity_has_every_key(time: str) -> None:
+    """A run's identity has every identifying key before the run is driven."""
     config = parse_config(
         RunConfig,
         {
@@ -169,6 +168,6 @@ def test_identity(time: str) -> None:
 
 
 def test_identity_without_a_study() -> None:
-    """Outside of a study its keys are there and null."""
+    """Without a study, the keys of the study are null."""
     identity = plan_run(RunConfig(study=StudyConfig())).identity
     assert (identity["participant"], identity["block"], identity["order"]) == (None, None, None)

@@ -16,14 +16,14 @@ pytestmark = pytest.mark.full
 
 ROUTES = {"a", "a_key", "b", "b_key", "c", "c_key"}
 EACH_P95_M, MEAN_P95_M = 0.22, 0.15
-"""Without delay the car's own 0.8 m to either line are never in question: what is left to see is the delay."""
+"""Without delay the car stays far from the lines, 0.8 m to either side, so that any departure is an effect of delay."""
 
 
 def at_l0(out: Path, *changes: str) -> list[Mapping[str, Any]]:
-    """Drive the paper's sweep without any delay."""
+    """Drive the paper's sweep without delay, and return its results."""
     sweep = ["conditions=[L0]", "network.inherent=loopback", "record.video=false", *changes]
     planned = plan_sweep(load_config(SweepConfig, shipped("configs/paper.yaml"), sweep))
-    driven, _ = run_all(planned, out, jobs=None, tell=lambda _: None)
+    driven, _ = run_all(planned, out, jobs=None, on_progress=lambda _: None)
     assert not driven.failed
     return list(driven.results)
 
@@ -38,22 +38,20 @@ def check(results: list[Mapping[str, Any]], repetitions: int) -> None:
 
 @pytest.mark.parametrize("preset", ["designed", "paper_calibrated"])
 def test_without_delay_every_route_is_driven_in_its_lane(tmp_path: Path, preset: str) -> None:
-    """At L0 both presets keep the lane on all six routes: by rendered pictures, H.264 and the detector."""
+    """At L0 both presets keep the lane on all six routes at fidelity video."""
     check(at_l0(tmp_path, f"controller.preset={preset}", "repetitions=1"), 1)
 
 
 @pytest.mark.parametrize("preset", ["designed", "paper_calibrated"])
 def test_without_delay_every_start_is_driven_in_its_lane(tmp_path: Path, preset: str) -> None:
-    """At L0 both presets keep the lane on all six routes from five starts, by the lane's geometry."""
+    """At L0 both presets keep the lane on all six routes from five starts at fidelity geometry."""
     check(at_l0(tmp_path, f"controller.preset={preset}", "repetitions=5", "fidelity=geometry"), 5)
 
 
 @pytest.mark.parametrize("light", ["low_sun", "overcast"])
 def test_the_key_parts_are_driven_in_every_light(tmp_path: Path, light: str) -> None:
-    """At L0 the key parts are completed without leaving the lane in the evening and under clouds, too."""
-    for result in at_l0(
-        tmp_path, f"vehicle.light={light}", "routes=[a_key, b_key, c_key]", "repetitions=1",
-        "controller.preset=designed",
-    ):  # fmt: skip
+    """At L0 the key parts are completed without leaving the lane in low sun and under clouds, too."""
+    changes = (f"vehicle.light={light}", "routes=[a_key, b_key, c_key]", "repetitions=1", "controller.preset=designed")
+    for result in at_l0(tmp_path, *changes):
         assert (result["ending"], result["lane_invasions"]) == ("completed", 0), result
         assert result["p95_m"] <= EACH_P95_M

@@ -1,4 +1,4 @@
-"""Delta of drives in virtual time, where the truth about both hosts' clocks is known to the nanosecond."""
+"""Tests of Delta in virtual time, where the true times of both hosts' clocks are known to the nanosecond."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ APART = ("clocks.offset_ms=250.0", "clocks.drift_ppm=30.0")
 def drive_with(
     out: Path, *changes: str, change: Change = lambda _: None
 ) -> tuple[RunMeasurement, dict[str, Any], HostClock]:
-    """Drive without pictures; give what was measured, `result.json`, and the server's clock (the client's is true)."""
+    """Drive without pixels; return the measurement, `result.json`, and the server's clock (the client's is true)."""
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), ("fidelity=geometry", *APART, *changes)))
     loop = build_loop(planned, out)
     change(loop)
@@ -39,7 +39,7 @@ def drive_with(
 
 
 def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: HostClock) -> tuple[Any, Any]:
-    """Give how wrong Delta is at every 10 ms of the drive, and how wrong it says it can be."""
+    """Return the absolute error of Delta every 10 ms of the drive, and its bound."""
     assert offset is not None
     began_ns, ended_ns = measured.clocks.client_wall_ns.tolist()
     client_wall_ns = np.arange(began_ns, ended_ns, 10 * NS_PER_MS)
@@ -49,7 +49,7 @@ def errors_ms(measured: RunMeasurement, offset: ClockOffset | None, server: Host
     return wrong_ns / NS_PER_MS, offset.bound_at(client_wall_ns) / NS_PER_MS
 
 
-def without_a_source(loop: VirtualLoop) -> None:
+def remove_time_sources(loop: VirtualLoop) -> None:
     def install(host: VirtualHost) -> None:
         def unknown(true_ns: int) -> ClockReport:
             return unknown_clock(host.clock.at(true_ns), host.side, "chrony", "chrony is not installed")
@@ -60,8 +60,8 @@ def without_a_source(loop: VirtualLoop) -> None:
         install(host)
 
 
-def test_both_opinions_hold_the_truth(tmp_path: Path) -> None:
-    """With the server 250 ms ahead and drifting by 30 ppm the truth is inside both bounds all through the drive."""
+def test_both_estimates_are_within_their_bounds(tmp_path: Path) -> None:
+    """With a server clock 250 ms ahead that drifts by 30 ppm, both clock estimates are within their bounds."""
     measured, result, server = drive_with(tmp_path / "run")
     for offset in (measured.clocks.offset, measured.clocks.probe):
         wrong_ms, bound_ms = errors_ms(measured, offset, server)
@@ -76,10 +76,10 @@ def test_both_opinions_hold_the_truth(tmp_path: Path) -> None:
     assert result["valid"], result["invalid_reasons"]
 
 
-def test_the_probe_alone_under_delayed_control(tmp_path: Path) -> None:
-    """Without a source of time and with 100 ms on control the truth is inside the probe's bound, and tau is right."""
+def test_the_probe_alone_with_injected_delay(tmp_path: Path) -> None:
+    """Without time sources and with 100 ms on control, the probe's Delta is within its bound, and tau is correct."""
     _, with_sources, _ = drive_with(tmp_path / "sources", "network.condition=L5")
-    measured, result, server = drive_with(tmp_path / "probe", "network.condition=L5", change=without_a_source)
+    measured, result, server = drive_with(tmp_path / "probe", "network.condition=L5", change=remove_time_sources)
     wrong_ms, bound_ms = errors_ms(measured, measured.clocks.offset, server)
     assert (wrong_ms <= bound_ms).all()
     assert bound_ms.max() <= 2.0
@@ -89,21 +89,21 @@ def test_the_probe_alone_under_delayed_control(tmp_path: Path) -> None:
         assert result[name]["p50"] == pytest.approx(with_sources[name]["p50"], abs=result[name]["bound"])
 
 
-def test_a_misled_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
-    """A chrony behind 75 ms on one way is wrong by half of that: it and the probe disagree, and the run is invalid."""
+def test_a_wrong_time_source_is_contradicted_by_the_probe(tmp_path: Path) -> None:
+    """A chrony behind 75 ms in one direction is wrong by half of it and contradicts the probe: the run is invalid."""
 
-    def mislead(loop: VirtualLoop) -> None:
+    def use_wrong_source(loop: VirtualLoop) -> None:
         host = loop.runtime.hosts["client"]
         host.clock_source = modelled_clock_source(host.clock, "virtual-client", 0.0375, 0.0001)
 
-    _, result, _ = drive_with(tmp_path / "run", change=mislead)
+    _, result, _ = drive_with(tmp_path / "run", change=use_wrong_source)
     (reason,) = result["invalid_reasons"]
     assert "model and the probe disagree" in reason
     assert ": 287." in reason
 
 
-def test_a_probe_without_answers(tmp_path: Path) -> None:
-    """A firewall that lets no probe through leaves Delta unchecked, and the run is invalid."""
+def test_a_probe_without_answers_makes_the_run_invalid(tmp_path: Path) -> None:
+    """If a firewall blocks the probe, Delta is unchecked, and the run is invalid."""
 
     def block(loop: VirtualLoop) -> None:
         loop.runtime.links["probe_reply"].open = False
@@ -116,12 +116,12 @@ def test_a_probe_without_answers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("side", ["client", "server"])
-def test_a_step_is_one_reason(tmp_path: Path, side: str, known: bool) -> None:
-    """A wall clock set by a second in the middle of the drive is the one reason against it, with sources or without."""
+def test_a_clock_step_has_one_reason(tmp_path: Path, side: str, known: bool) -> None:
+    """A wall clock set by 1 s during the drive is the only reason against the run, with and without time sources."""
 
     def step(loop: VirtualLoop) -> None:
         if not known:
-            without_a_source(loop)
+            remove_time_sources(loop)
         loop.runtime.hosts[side].clock.steps = [(10 * NS_PER_S, NS_PER_S)]
 
     _, result, _ = drive_with(tmp_path / "run", change=step)

@@ -1,4 +1,4 @@
-"""Drives in virtual time under what is more than a constant delay."""
+"""Tests of drives in virtual time under conditions with more than a constant delay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def driven(out: Path, *changes: str) -> dict[str, Any]:
 
 
 def link_counts(side: Path) -> dict[str, dict[str, int]]:
-    """What a record says of its side's links: name to counters."""
+    """Return the recorded counters of a side's links, by name."""
     table = read_record(side).table("counts")
     names = ("packets", "lost", "dropped", "overtook")
     columns = {name: table.ints(f"link_{name}") for name in names}
@@ -43,15 +43,15 @@ def link_counts(side: Path) -> dict[str, dict[str, int]]:
     }
 
 
-def test_a_constant_delay_counts_nothing(tmp_path: Path) -> None:
-    """Where nothing but a constant delay is injected, the record says nothing of links."""
+def test_a_constant_delay_has_no_link_counters(tmp_path: Path) -> None:
+    """With a constant delay only, the record has no counters of links."""
     driven(tmp_path / "run", "fidelity=geometry", "network.condition=L4", "vehicle.time_limit_s=2")
     assert link_counts(tmp_path / "run/server.mcap") == link_counts(tmp_path / "run/client.mcap") == {}
 
 
 @pytest.mark.parametrize("name", all_but_one_full(MORE, "loss_burst"))
-def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> None:
-    """Without pixels every condition is driven to the goal, validly, and with equal digests when driven again."""
+def test_every_condition_is_driven_reproducibly(name: str, tmp_path: Path) -> None:
+    """Without pixels, every condition is completed in a valid run, with a reproducible digest."""
     changes = ("fidelity=geometry", f"network.condition={name}")
     result, again = driven(tmp_path / "run", *changes), driven(tmp_path / "again", *changes)
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("completed", True, [])
@@ -60,8 +60,8 @@ def test_every_condition_is_driven_and_repeats(name: str, tmp_path: Path) -> Non
     assert other["digest"] != result["digest"]
 
 
-def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
-    """The record of who sends says how many packets were lost, and so many less have come; pixels record all."""
+def test_lost_packets_are_counted_and_missing(tmp_path: Path) -> None:
+    """The sender's record has the number of lost packets, and the receiver's record lacks as many."""
     driven(tmp_path / "run", "fidelity=pixels", "vehicle.time_limit_s=10", "network.condition=loss")
     server, client = (read_record(tmp_path / f"run/{side}.mcap") for side in ("server", "client"))
     video = link_counts(tmp_path / "run/server.mcap")["link rtp"]
@@ -71,12 +71,12 @@ def test_losses_are_counted_and_missing(tmp_path: Path) -> None:
     for sender, receiver, topic, counts in ((server, client, "rtp", video), (client, server, "control", control)):
         sent, received = len(sender.table(topic)), len(receiver.table(topic))
         assert sent == counts["packets"]
-        assert 0 <= sent - counts["lost"] - received <= 10  # the rest was under way at the end
+        assert 0 <= sent - counts["lost"] - received <= 10  # the others were in transit at the end
 
 
 @pytest.mark.parametrize("name", all_but_one_full(MORE, "reorder"))
 def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
-    """With real video the first seconds under every condition go by, and the link does what it is for."""
+    """Real video passes a link under every condition, and the link's counters show its impairment."""
     given = ("vehicle.scenery=none", "record.video=false", f"network.condition={name}")
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), given))
     loop = build_loop(planned, tmp_path / "run")
@@ -88,8 +88,8 @@ def test_video_under_every_condition(name: str, tmp_path: Path) -> None:
     assert (counts["overtook"] > 0) == (name == "reorder")
 
 
-def test_a_trace_is_no_constant_and_is_told_by_its_content(tmp_path: Path) -> None:
-    """What a trace of delay injects is not said to be a number; the record has the digest of every trace."""
+def test_a_trace_has_no_constant_delay_and_a_recorded_digest(tmp_path: Path) -> None:
+    """The injected delay of a trace is null, and the record has the digest of every trace."""
     (tmp_path / "mine.csv").write_text("time_s,delay_ms\n0,20\n60,80\n")
     given = (f"network.video.trace={tmp_path / 'mine.csv'}", "network.control.trace=fading.mahimahi")
     planned = plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), (*given, "fidelity=geometry")))
@@ -104,8 +104,8 @@ def test_a_trace_is_no_constant_and_is_told_by_its_content(tmp_path: Path) -> No
     }
 
 
-def test_a_slow_link_is_a_late_picture_and_no_doubt(tmp_path: Path) -> None:
-    """A queue that grows to seconds ends the drive by the age of the pictures, and says nothing against the run."""
+def test_a_slow_link_ends_the_drive_in_a_valid_run(tmp_path: Path) -> None:
+    """A queue of several seconds ends the drive by its frame age, and the run is valid."""
     result = driven(tmp_path / "run", "network.condition=rate")
     assert (result["ending"], result["valid"], result["invalid_reasons"]) == ("safe_stop", True, [])
     assert result["loop_ms"]["p50"] > 1000
@@ -132,8 +132,8 @@ AXES: list[tuple[str, list[Any], str]] = [
     ("key", "values", "fidelity"),
     [pytest.param(*axis, id=axis[0], marks=() if axis[2] == "geometry" else pytest.mark.full) for axis in AXES],
 )
-def test_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> None:
-    """Each of these config values is an axis: its runs share their seed, say its value, and go differently."""
+def test_config_values_as_axes(key: str, values: list[Any], fidelity: str, tmp_path: Path) -> None:
+    """Each of these config values works as an axis: its runs share their seed, have its value, and differ."""
     sweep = {
         "fidelity": fidelity,
         "conditions": ["L1"],

@@ -1,4 +1,4 @@
-"""The whole loop in virtual time: real pixels, codec and packets."""
+"""Tests of the whole loop in virtual time, with real pixels, codec and packets."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ def with_pictures(change: Callable[[int, Picture], Picture]) -> Change:
 
 @pytest.fixture(scope="module")
 def l0(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One whole drive at L0, with scenery, on hosts whose clocks are 250 ms and 20 ppm apart."""
+    """Drive at L0 with scenery, on hosts whose clocks are 250 ms and 20 ppm apart, and return the run directory."""
     out = tmp_path_factory.mktemp("virtual") / "l0"
     run(out, planned())
     return out
 
 
 def test_the_car_keeps_its_lane_without_delay(l0: Path) -> None:
-    """At L0 the lane keeper completes the route by what it sees, with a cross-track P95 under 0.3 m, and validly."""
+    """At L0 the lane keeper completes the route with a cross-track P95 under 0.3 m, in a valid run."""
     result = run_result(planned().identity, *records(l0))
     assert result["ending"] == "completed"
     assert result["p95_m"] < 0.3
@@ -86,7 +86,7 @@ def test_the_car_keeps_its_lane_without_delay(l0: Path) -> None:
 
 
 def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
-    """What the model delays video and control by: the costs of the hops and the laws of the links."""
+    """Return the modelled latencies of video and control: the costs of the stages plus the link delays."""
     costs = read_costs()
     requested = injected_network(
         run.config.network.inherent, condition(run.config.network.condition), costs, run.seed, state_delay="none"
@@ -97,8 +97,8 @@ def true_latencies_ms(run: PlannedRun) -> tuple[float, float]:
     return network.video.constant_ms + stages_us / 1000, network.control.constant_ms + sending_us / 1000
 
 
-def test_latencies_are_true_within_the_printed_bound(l0: Path) -> None:
-    """With hosts' clocks 250 ms and 20 ppm apart, the median tau_v and tau_c are the truth within the printed bound."""
+def test_latencies_are_correct_within_their_bound(l0: Path) -> None:
+    """With clocks 250 ms and 20 ppm apart, the median tau_v and tau_c are correct within their bound."""
     entry = measure(*records(l0)).entry
     video_ms, control_ms = true_latencies_ms(planned())
     for name, truth_ms in (("tau_v_ms", video_ms), ("tau_c_ms", control_ms)):
@@ -106,30 +106,30 @@ def test_latencies_are_true_within_the_printed_bound(l0: Path) -> None:
         assert abs(entry[name]["p50"] - truth_ms) <= entry[name]["bound"], name
 
 
-def test_forgetting_the_clock_offset_is_noticed(tmp_path: Path) -> None:
-    """A source of time that forgets the offset makes tau_v and tau_c wrong by it: the test above can fail."""
+def test_ignoring_the_clock_offset_makes_latencies_wrong(tmp_path: Path) -> None:
+    """Time sources that ignore the offset make tau_v and tau_c wrong by it: the test above can fail."""
 
-    def forget(loop: VirtualLoop) -> None:
+    def ignore_offset(loop: VirtualLoop) -> None:
         for side, host in loop.runtime.hosts.items():
             host.clock_source = partial(
                 lambda name, clock, true_ns: ClockReport(
-                    clock.at(true_ns).mono_ns, clock.at(true_ns).wall_ns, name, "forgetful", 0.0, 0.0001
+                    clock.at(true_ns).mono_ns, clock.at(true_ns).wall_ns, name, "wrong", 0.0, 0.0001
                 ),
                 side,
                 host.clock,
             )
 
     out = tmp_path / "run"
-    run(out, planned(BARE), change=forget, seconds=5)
+    run(out, planned(BARE), change=ignore_offset, seconds=5)
     entry = measure(*records(out)).entry
     video_ms, control_ms = true_latencies_ms(planned(BARE))
     assert entry["tau_v_ms"]["p50"] == pytest.approx(video_ms - 250, abs=1)
     assert entry["tau_c_ms"]["p50"] == pytest.approx(control_ms + 250, abs=1)
-    assert entry["loop_ms"]["p50"] == pytest.approx(video_ms + control_ms, abs=20)  # needs no clock at all
+    assert entry["loop_ms"]["p50"] == pytest.approx(video_ms + control_ms, abs=20)  # independent of the clock offset
 
 
-def test_injected_delay_is_what_is_measured(l0: Path, tmp_path: Path) -> None:
-    """The medians of tau_v and tau_c at L5 are those at L0 plus what was injected, and so is the loop latency."""
+def test_the_injected_delay_is_measured(l0: Path, tmp_path: Path) -> None:
+    """The medians of tau_v, tau_c and the loop latency at L5 are those at L0 plus the injected delay."""
     out = tmp_path / "l5"
     run(out, planned(BARE, "network.condition=L5"), seconds=8)
     before, after = measure(*records(l0)).entry, measure(*records(out)).entry
@@ -139,7 +139,7 @@ def test_injected_delay_is_what_is_measured(l0: Path, tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> None:
-    """With `paper_wifi5` tau_v has the paper's median of 62 and P95 of 86 ms, and tau_c is 9 ms."""
+    """With `paper_wifi5`, tau_v has the paper's median of 62 and P95 of 86 ms, and tau_c is 9 ms."""
     out = tmp_path / "run"
     run(out, planned(BARE, "network.inherent=paper_wifi5"), seconds=30)
     entry = measure(*records(out)).entry
@@ -148,7 +148,7 @@ def test_the_inherent_profile_has_the_papers_median_and_p95(tmp_path: Path) -> N
     assert entry["tau_c_ms"]["p50"] == pytest.approx(9, abs=0.5)
 
 
-# The same again: digests.
+# Reproducibility: digests.
 
 DIGEST = """
 import sys
@@ -189,8 +189,8 @@ def flip_a_bit_of_a_command(loop: VirtualLoop) -> None:
     line.push = flip  # type: ignore[method-assign]
 
 
-def test_the_digest_repeats_and_sees_everything(tmp_path: Path) -> None:
-    """Equal runs have equal digests; another seed, one flipped pixel or one flipped bit of a command changes them."""
+def test_the_digest_is_reproducible_and_sensitive(tmp_path: Path) -> None:
+    """Equal runs have equal digests; another seed, one changed pixel or one changed bit of a command changes them."""
     digests = [
         digest(tmp_path / "first"),
         digest(tmp_path / "seed", "seed=2"),
@@ -203,19 +203,22 @@ def test_the_digest_repeats_and_sees_everything(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_the_digest_does_not_depend_on_the_hash_seed(tmp_path: Path) -> None:
-    """Processes with other PYTHONHASHSEEDs give the same digest."""
-    said = set()
+    """Processes with different PYTHONHASHSEEDs compute the same digest."""
+    digests = set()
     for hash_seed in ("1", "2"):
         (tmp_path / hash_seed).mkdir()
         done = subprocess.run(
             [sys.executable, "-c", DIGEST, str(tmp_path / hash_seed)],
-            env={**os.environ, "PYTHONHASHSEED": hash_seed}, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        said.add(done.stdout.strip())
-    assert len(said) == 1
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        digests.add(done.stdout.strip())
+    assert len(digests) == 1
 
 
-# It drives by what it sees.
+# Dependence on the pictures.
 
 
 def noisy_grey(number: int, picture: Picture) -> Picture:
@@ -234,7 +237,7 @@ def mirrored(_number: int, picture: Picture) -> Picture:
 
 @pytest.mark.parametrize("change", [pytest.param(noisy_grey, marks=pytest.mark.full), grey])
 def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Picture], Picture]) -> None:
-    """Grey pictures, with noise or frozen, lead to a safe stop within 3 s."""
+    """Grey pictures, noisy or constant, lead to a safe stop within 3 s."""
     out = tmp_path / "run"
     run(out, planned(BARE), change=with_pictures(change), seconds=60)
     server, _ = records(out)
@@ -251,8 +254,8 @@ def test_grey_pictures_stop_the_car(tmp_path: Path, change: Callable[[int, Pictu
     assert driving_interval(server)[2] == "safe_stop"
 
 
-def test_mirrored_pictures_lead_off_the_lane(tmp_path: Path) -> None:
-    """Pictures mirrored left to right make the car leave its lane: it really drives by what it sees."""
+def test_mirrored_pictures_make_the_car_leave_its_lane(tmp_path: Path) -> None:
+    """Mirrored pictures make the car leave its lane: the controller depends on the pictures."""
     out = tmp_path / "run"
     run(out, planned(BARE), change=with_pictures(mirrored), seconds=60)
     entry = measure(*records(out)).entry
@@ -260,8 +263,8 @@ def test_mirrored_pictures_lead_off_the_lane(tmp_path: Path) -> None:
     assert entry["lane_invasions"] > 0
 
 
-def test_a_car_whose_state_is_not_heard_is_stopped(tmp_path: Path) -> None:
-    """When the vehicle's state no longer arrives, the client does not drive on by an old speed: it brakes and stops."""
+def test_a_lost_vehicle_state_stops_the_car(tmp_path: Path) -> None:
+    """If the vehicle's state no longer arrives, the client does not use its old speed: it brakes and stops."""
 
     def lose_the_state(loop: VirtualLoop) -> None:
         loop.runtime.at(8 * NS_PER_S, lambda: setattr(loop.runtime.links["state"], "open", False))
@@ -273,13 +276,13 @@ def test_a_car_whose_state_is_not_heard_is_stopped(tmp_path: Path) -> None:
     assert entry["duration_s"] < 11
 
 
-# Clocks may do what they like.
+# Clock steps.
 
 
 @pytest.mark.parametrize("step_s", [1, -1])
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_step_of_the_wall_clock_changes_no_safety_state(tmp_path: Path, side: int, step_s: int) -> None:
-    """A wall clock that steps by a second, either way, on either host, changes no safety state; the run is invalid."""
+    """A wall clock step of a second, either way, on either host, changes no safety state; the run is invalid."""
     config = planned("fidelity=geometry")
     clocks = host_clocks(config.config)
     clocks[side].steps = [(8 * NS_PER_S, step_s * NS_PER_S)]

@@ -9,8 +9,8 @@ from lavt.experiment.statistics.paper_results import paper
 
 
 def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
-    """Give a run for each letter: c completed, x collision."""
-    words = {"c": "completed", "x": "collision"}
+    """Return a run for each letter: c completed, x collision."""
+    endings_of = {"c": "completed", "x": "collision"}
     return [
         {
             "condition": condition,
@@ -18,34 +18,34 @@ def runs(condition: str, endings: str, **changes: Any) -> list[dict[str, Any]]:
             "repetition": index,
             "seed": 100 + index,
             "valid": True,
-            "ending": words[each],
+            "ending": endings_of[each],
             **changes,
         }
         for index, each in enumerate(endings)
     ]
 
 
-def test_mcnemar_by_hand() -> None:
-    """Five pairs that differ one way are p = 2 / 2^5, three against one 10 / 16, and none 1."""
+def test_mcnemars_p_value() -> None:
+    """Five pairs that differ one way give p = 2 / 2^5, three against one 10 / 16, and none 1."""
     assert mcnemar(5, 0) == pytest.approx(0.0625)
     assert mcnemar(3, 1) == pytest.approx(0.625)
     assert mcnemar(0, 0) == 1.0
 
 
-def test_fisher_by_hand() -> None:
-    """All of two against none of two: of six ways to choose two of four, two are as far apart, p = 1 / 3."""
+def test_fishers_p_value() -> None:
+    """Two of two against none of two gives p = 1 / 3."""
     assert fisher(2, 2, 0, 2) == pytest.approx(1 / 3)
 
 
 def test_a_contrast_pairs_runs_of_one_route_repetition_and_seed() -> None:
-    """Pairs that differ are counted by the condition that was completed, whatever order the runs come in."""
+    """Runs of one route, repetition and seed are paired in any order, and differing pairs are counted by condition."""
     contrasts = paired_contrasts([*runs("L0", "ccccccx"), *reversed(runs("L1", "cxxxxxc"))])
     assert contrasts == [
         {"a": "L0", "b": "L1", "pairs": 7, "only_a": 5, "only_b": 1, "p": pytest.approx(14 / 64), "p_holm": 14 / 64}
     ]
 
 
-def test_holm_is_over_all_contrasts_that_could_be_made() -> None:
+def test_holms_correction_is_over_all_contrasts() -> None:
     """Of two contrasts with p = 0.0625 and 1 the first is doubled; a condition that was not driven has none."""
     contrasts = paired_contrasts([*runs("L0", "ccccc"), *runs("L1", "ccccc"), *runs("L2", "xxxxx")])
     assert [(each["a"], each["b"], each["p_holm"]) for each in contrasts] == [
@@ -54,8 +54,8 @@ def test_holm_is_over_all_contrasts_that_could_be_made() -> None:
     ]
 
 
-def test_what_is_no_pair_does_not_count() -> None:
-    """Invalid runs, other seeds, and runs that nothing tells apart make no pair; without any, p is null."""
+def test_runs_without_a_partner_are_ignored() -> None:
+    """Invalid runs, other seeds, and runs with equal keys form no pairs; without pairs, p is null."""
     invalid = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", valid=False)])
     seeds = paired_contrasts([*runs("L0", "cc"), *runs("L1", "xx", seed=1)])
     alike = paired_contrasts([*runs("L0", "cc"), *runs("L0", "xx"), *runs("L1", "xx")])
@@ -64,8 +64,8 @@ def test_what_is_no_pair_does_not_count() -> None:
     assert paired_contrasts([]) == []
 
 
-def test_the_papers_counts_say_less_than_its_text() -> None:
-    """By Fisher's test L1 and L2 differ; L3 and L4, of equal total delay, do not, nor do L2 and L3."""
+def test_contrasts_of_the_papers_counts() -> None:
+    """By Fisher's test, L1 and L2 differ; L3 and L4, of equal total delay, do not, nor do L2 and L3."""
     contrasts = {(each["a"], each["b"]): each for each in paper()["contrasts"]}
     assert len(contrasts) == 6
     assert contrasts["L1", "L2"]["p"] == pytest.approx(0.00037, abs=5e-6)

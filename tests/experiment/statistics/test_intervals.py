@@ -14,15 +14,15 @@ from lavt.experiment.statistics.intervals import bootstrap_interval, exact_inter
     ("successes", "low", "high"), [(30, 0.025 ** (1 / 30), 1.0), (15, 0.3130, 0.6870), (0, 0.0, 1 - 0.025 ** (1 / 30))]
 )
 def test_the_interval_of_thirty_runs_is_exact(successes: int, low: float, high: float) -> None:
-    """The interval of 30 and 0 in 30 is the closed form of Clopper and Pearson, that of 15 the published one."""
+    """The interval of 30 and 0 of 30 is the closed form of Clopper and Pearson, that of 15 the published one."""
     assert exact_interval(successes, 30) == pytest.approx([low, high], abs=5e-5)
 
 
 def completed(probabilities: Sequence[float], runs: Sequence[int]) -> np.ndarray:
-    """Give the chance of each number of completed runs, over routes with these probabilities."""
+    """Return the probability of each number of completed runs, over routes with these probabilities."""
     chances = np.ones(1)
-    for probability, many in zip(probabilities, runs, strict=True):
-        chances = np.convolve(chances, binom.pmf(np.arange(many + 1), many, probability))
+    for probability, count in zip(probabilities, runs, strict=True):
+        chances = np.convolve(chances, binom.pmf(np.arange(count + 1), count, probability))
     return chances
 
 
@@ -40,7 +40,7 @@ ROUTES = [
 @pytest.mark.parametrize("probabilities", ROUTES)
 @pytest.mark.parametrize("runs", [(5,) * 6, (1,) * 6, (5, 5, 4, 5, 3, 5), (2, 20, 1, 1, 1, 5)])
 def test_the_pooled_interval_covers_the_mean_over_routes(probabilities: Sequence[float], runs: Sequence[int]) -> None:
-    """However the routes differ, at least 95 % of experiments have their runs' mean probability in the interval."""
+    """For any routes, the interval includes the runs' mean probability in at least 95 % of experiments."""
     mean = float(np.dot(probabilities, runs)) / sum(runs)
     covered = 0.0
     for count, chance in enumerate(completed(probabilities, runs)):
@@ -49,8 +49,8 @@ def test_the_pooled_interval_covers_the_mean_over_routes(probabilities: Sequence
     assert covered >= 0.95
 
 
-def test_the_pooled_interval_covers_wherever_three_routes_lie() -> None:
-    """On a grid of all probabilities of three routes with five runs each, coverage is nowhere below 95 %."""
+def test_the_pooled_interval_covers_any_three_routes() -> None:
+    """For all probabilities of three routes on a grid, with five runs each, the coverage is at least 95 %."""
     grid = np.linspace(0, 1, 21)
     intervals = [exact_interval(count, 15) or [1.0, 0.0] for count in range(16)]
     for probabilities in itertools.combinations_with_replacement(grid.tolist(), 3):
@@ -64,15 +64,15 @@ def test_the_pooled_interval_covers_wherever_three_routes_lie() -> None:
         assert covered >= 0.95, probabilities
 
 
-def test_intervals_of_too_little_are_null() -> None:
-    """No runs give no exact interval, and fewer than two values no bootstrap interval."""
+def test_intervals_of_too_few_values_are_null() -> None:
+    """Without runs there is no exact interval, and with fewer than two values no bootstrap interval."""
     assert exact_interval(0, 0) is None
     assert bootstrap_interval([]) is None
     assert bootstrap_interval([1.0]) is None
 
 
-def test_bootstrap_is_repeatable_and_about_right() -> None:
-    """The same runs give the same interval, and that of 100 equal steps is 1.96 standard errors wide to a tenth."""
+def test_the_bootstrap_is_reproducible_and_accurate() -> None:
+    """The bootstrap interval is reproducible, and for 100 equal steps it is 1.96 standard errors to a tenth."""
     values = [index / 99 for index in range(100)]
     interval = bootstrap_interval(values)
     assert interval == bootstrap_interval(values)
@@ -82,17 +82,17 @@ def test_bootstrap_is_repeatable_and_about_right() -> None:
 
 
 def test_the_bootstrap_of_three_is_their_range() -> None:
-    """Every 27th resample of three values is three times the least: at 95 % the interval is from least to most."""
+    """One in 27 resamples of three values is three times the smallest: the 95 % interval is their range."""
     assert bootstrap_interval([0.2, 1.0, 0.6]) == pytest.approx([0.2, 1.0])
     assert bootstrap_interval([1.0, 1.0, 1.0]) == [1.0, 1.0]
 
 
-def test_holm_by_hand() -> None:
-    """0.01, 0.04, 0.03 become 0.03, 0.06, 0.06: the least by 3, the next by 2, none below the one before it."""
+def test_holms_correction() -> None:
+    """0.01, 0.04, 0.03 become 0.03, 0.06, 0.06: the smallest times 3, the next times 2, none below the one before."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
 
 
-def test_holm_leaves_out_what_was_not_tested() -> None:
-    """A test that could not be made stays null and does not count; no p value exceeds 1."""
+def test_holms_correction_ignores_missing_tests() -> None:
+    """A missing p value remains null and is not counted; no p value exceeds 1."""
     assert holm([None, 0.6, 0.9]) == [None, 1.0, 1.0]
     assert holm([]) == []

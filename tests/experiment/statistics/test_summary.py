@@ -36,8 +36,8 @@ def run(**changes: Any) -> dict[str, Any]:
     }
 
 
-def test_a_condition_is_counted() -> None:
-    """Completion, events and p95 of a condition: p95 over completed runs, the rest over all valid ones."""
+def test_summary_of_a_condition() -> None:
+    """P95 is over completed runs, completion and events are over all valid runs."""
     runs = [run(), run(p95_m=3.0), run(ending="collision", p95_m=50.0, collisions=1), run(valid=False, p95_m=99.0)]
     condition = summarize(runs, SPEED)["conditions"]["L0"]
     assert (condition["runs"], condition["completed"]) == (3, 2)
@@ -50,7 +50,7 @@ def test_a_condition_is_counted() -> None:
 
 
 def test_a_condition_without_valid_runs_is_null() -> None:
-    """A condition whose runs are all invalid is there, with no runs and nothing claimed."""
+    """A condition whose runs are all invalid is present, with 0 runs and null measures."""
     condition = summarize([run(valid=False)], SPEED)["conditions"]["L0"]
     assert condition["runs"] == 0
     assert condition["completion_rate"] is None
@@ -61,16 +61,14 @@ def test_a_condition_without_valid_runs_is_null() -> None:
 def test_real_and_virtual_runs_are_never_mixed() -> None:
     """Runs in real time are under `real`, runs in virtual time under `conditions`, and all under `runs`."""
     summary = summarize([run(), run(time="real", condition="L5")], SPEED)
-    assert set(summary) == {
-        "schema", "speed", "runs", "failed", "conditions", "contrasts", "real", "groups", "paper"
-    }  # fmt: skip
+    assert set(summary) == {"schema", "speed", "runs", "failed", "conditions", "contrasts", "real", "groups", "paper"}
     assert set(summary["conditions"]) == {"L0"}
     assert set(summary["real"]) == {"L5"}
     assert len(summary["runs"]) == 2
 
 
 def test_conditions_are_of_the_base_config_and_groups_of_every_combination() -> None:
-    """Further axes make groups; `conditions` holds only the runs of the base config."""
+    """Further axes make groups; `conditions` includes only the runs of the base config."""
     runs = [run(preset=preset, axes={"speed": speed}) for preset in ("designed", "bold") for speed in (20, 30)]
     summary = summarize(runs, SPEED, base={"preset": "designed", "speed": 30})
     assert summary["conditions"]["L0"]["runs"] == 1
@@ -84,7 +82,7 @@ def test_conditions_are_of_the_base_config_and_groups_of_every_combination() -> 
 
 
 def grid(*, condition: str = "L0", bad_route: str | None = None, **changes: Any) -> list[dict[str, Any]]:
-    """Give six routes with five repetitions each, of which those on one route ended early."""
+    """Return six routes with five repetitions each, whose runs on `bad_route` ended early."""
     return [
         run(condition=condition, route=route, repetition=repetition, seed=f"{route}{repetition}", **changes)
         | ({"ending": "safe_stop", "distance_m": 100.0 + repetition} if route == bad_route else {})
@@ -93,15 +91,20 @@ def grid(*, condition: str = "L0", bad_route: str | None = None, **changes: Any)
     ]
 
 
-def test_completion_is_told_by_route_for_these_and_for_such_roads() -> None:
-    """One route of six never completed: 25 of 30, exactly 0 to 52 % there, and such roads from 50 % to all."""
+def test_completion_by_route_and_for_such_roads() -> None:
+    """With one of six routes never completed, it is 25 of 30, 0 to 52 % on that one, and 50 to 100 % for such roads."""
     condition = summarize(grid(bad_route="b"), SPEED)["conditions"]["L0"]
     assert condition["endings"] == {"completed": 25, "safe_stop": 5}
     assert condition["completion_interval"] == exact_interval(25, 30)
     assert condition["completion_such_roads"] == [0.5, 1.0]
     assert {name: route["completed"] for name, route in condition["routes"].items()} == {
-        "a": 5, "a_key": 5, "b": 0, "b_key": 5, "c": 5, "c_key": 5
-    }  # fmt: skip
+        "a": 5,
+        "a_key": 5,
+        "b": 0,
+        "b_key": 5,
+        "c": 5,
+        "c_key": 5,
+    }
     assert condition["routes"]["b"]["completion_interval"] == pytest.approx([0.0, 1 - 0.025**0.2])
     assert condition["routes"]["b"]["p95_m"] is None
     assert condition["survival"]["b"]["surviving"][-1] == 0.0
@@ -109,25 +112,25 @@ def test_completion_is_told_by_route_for_these_and_for_such_roads() -> None:
 
 @pytest.mark.parametrize("suffix", ["", ".yaml", ".yml"])
 def test_a_road_and_its_key_part_are_one(suffix: str) -> None:
-    """By name and by path: a route and the one that has its name with _key are one road."""
+    """A route and the one with the suffix _key are one road, by name and by path."""
     runs = [run(route=f"roads/my{suffix}"), run(route=f"roads/my_key{suffix}", ending="collision"), run(route="b")]
     assert road_rates(runs) == [1.0, 0.5]
 
 
-def test_one_road_says_nothing_of_such_roads() -> None:
-    """A route and its key part are one road, of which nothing follows for others."""
+def test_one_road_has_no_interval_for_such_roads() -> None:
+    """A route and its key part are one road, from which nothing follows for others."""
     runs = [each for each in grid() if each["route"] in {"a", "a_key"}]
     assert summarize(runs, SPEED)["conditions"]["L0"]["completion_such_roads"] is None
 
 
 def test_rates_by_distance_are_of_all_kilometres() -> None:
-    """One collision in 0.1 km and none in 0.9 km are 1 a kilometre, not the mean of 10 and 0."""
+    """One collision in 0.1 km and none in 0.9 km are 1 per kilometre, not the mean of 10 and 0."""
     runs = [run(distance_m=100.0, collisions=1, ending="collision"), run(distance_m=900.0)]
     assert summarize(runs, SPEED)["conditions"]["L0"]["collisions_per_km"] == pytest.approx(1.0)
 
 
-def test_means_and_latencies_are_over_the_runs_that_know_them() -> None:
-    """Means are over valid runs, latencies and hops medians over runs; what no run knows is null."""
+def test_missing_values_are_left_out() -> None:
+    """Means are over valid runs, and latencies are medians over runs; runs without a value are left out."""
     stages = [{"node": "camera", "stage": "encode", "p50": 2.0, "p95": 3.0, "n": 9}]
     ages = {"p5": 1.0, "p50": 2.0, "p95": 3.0, "n": 10}
     runs = [
@@ -154,8 +157,8 @@ def test_means_and_latencies_are_over_the_runs_that_know_them() -> None:
     assert condition["picture_age_ms"] == {"mean": 90.0, "p95": 99.0}
 
 
-def test_the_error_is_told_three_ways() -> None:
-    """Over completed runs, up to where both conditions came, and with those not completed ranking last."""
+def test_the_three_tracking_errors() -> None:
+    """P95 is given over completed runs, over the common distance, and with incomplete runs ranking last."""
     runs = [
         *grid(p95_m=2.0, p95_by_10m=[0.1, 0.2, 0.3]),
         *grid(condition="L1", bad_route="b", p95_m=4.0, p95_by_10m=[0.5, 0.6]),
@@ -169,7 +172,7 @@ def test_the_error_is_told_three_ways() -> None:
 
 
 def test_groups_have_contrasts_of_their_own() -> None:
-    """Runs are paired within a group, never across groups; the base config's contrasts are those of its group."""
+    """Runs are paired within a group only; the base config's contrasts are those of its group."""
     runs = [
         each
         for speed, bad in ((20, None), (30, "b"))
@@ -182,7 +185,7 @@ def test_groups_have_contrasts_of_their_own() -> None:
 
 
 def test_results_of_an_older_version_are_summarised() -> None:
-    """What an older result does not say is null or empty, and what it says is there."""
+    """Keys that an older result lacks are null or empty, and its others are summarized."""
     condition = summarize([run()], SPEED)["conditions"]["L0"]
     assert condition["completion_rate"] == 1.0
     assert (condition["p95_common_m"], condition["mae_m"], condition["stages_ms"]) == (None, None, [])
@@ -190,15 +193,15 @@ def test_results_of_an_older_version_are_summarised() -> None:
     assert condition["survival"]["A"]["distance_m"] == [0.0, 500.0]
 
 
-def test_a_summary_of_nothing() -> None:
-    """Without runs there are no conditions and no contrasts, and the paper's figures all the same."""
+def test_a_summary_without_runs() -> None:
+    """Without runs, the summary has no conditions and no contrasts, but the paper's results."""
     summary = summarize([], None)
     assert (summary["conditions"], summary["contrasts"], summary["groups"]) == ({}, [], [])
     assert list(summary["paper"]["conditions"]) == ["L0", "L1", "L2", "L3", "L4", "L5"]
 
 
 def test_the_bound_of_a_condition_is_the_largest() -> None:
-    """Latencies of a condition have the largest bound of its runs, and none where a run has none."""
+    """The bound of a condition's latency is the largest of its runs, and null if one run has none."""
     other = run()["tau_v_ms"]
     runs = [run(), run(tau_v_ms={**other, "bound": 0.8}), run(tau_c_ms={**other, "bound": None})]
     condition = summarize(runs, SPEED)["conditions"]["L0"]

@@ -12,8 +12,8 @@ def run(distance_m: float | None, ending: str, length_m: float | None = 100.0) -
     return {"distance_m": distance_m, "ending": ending, "route_length_m": length_m}
 
 
-def test_survival_by_hand() -> None:
-    """Of five runs two end at 30 and 60 m in two ways: 1, 4/5, 3/5 still drive, with exact intervals."""
+def test_survival_of_five_runs() -> None:
+    """With two of five runs ending at 30 and 60 m, the shares 1, 4/5, 3/5 survive, with exact intervals."""
     curve = survival(
         [run(60.0, "safe_stop"), run(99.6, "completed"), run(30.0, "collision"), *[run(99.0, "completed")] * 2]
     )
@@ -26,7 +26,7 @@ def test_survival_by_hand() -> None:
 
 
 def test_survival_and_incidence_add_up_to_all_runs() -> None:
-    """At every distance the runs that drive and those that ended, in whichever way, are all runs."""
+    """At every distance, the shares of driving and ended runs add up to 1."""
     curve = survival([run(10.0, "collision"), run(10.0, "off_road"), run(20.0, "timeout"), run(100.0, "completed")])
     assert curve is not None
     for index, share in enumerate(curve["surviving"]):
@@ -34,26 +34,26 @@ def test_survival_and_incidence_add_up_to_all_runs() -> None:
 
 
 def test_all_completed_and_none_completed() -> None:
-    """Where all were completed the curve stays 1 and nothing ended; where none was it falls to 0."""
-    all_of_them = survival([run(100.0, "completed")] * 3)
-    assert all_of_them is not None
-    assert (all_of_them["distance_m"], all_of_them["surviving"]) == ([0.0, 100.0], [1.0, 1.0])
-    assert all_of_them["incidence"] == {}
-    assert all_of_them["low"] == pytest.approx([0.025 ** (1 / 3)] * 2)
-    none_of_them = survival([run(40.0, "timeout")])
-    assert none_of_them is not None
-    assert (none_of_them["distance_m"], none_of_them["surviving"]) == ([0.0, 40.0, 100.0], [1.0, 0.0, 0.0])
+    """If all runs were completed, survival remains 1; if none was, it falls to 0."""
+    all_completed = survival([run(100.0, "completed")] * 3)
+    assert all_completed is not None
+    assert (all_completed["distance_m"], all_completed["surviving"]) == ([0.0, 100.0], [1.0, 1.0])
+    assert all_completed["incidence"] == {}
+    assert all_completed["low"] == pytest.approx([0.025 ** (1 / 3)] * 2)
+    none_completed = survival([run(40.0, "timeout")])
+    assert none_completed is not None
+    assert (none_completed["distance_m"], none_completed["surviving"]) == ([0.0, 40.0, 100.0], [1.0, 0.0, 0.0])
 
 
 def test_an_end_at_the_start_is_an_event() -> None:
-    """A run that ended where it began is none of those that still drive at 0 m."""
+    """A run that ended at its start does not survive at 0 m."""
     curve = survival([run(0.0, "collision"), run(100.0, "completed")])
     assert curve is not None
     assert (curve["distance_m"], curve["surviving"]) == ([0.0, 100.0], [0.5, 0.5])
 
 
-def test_survival_of_what_is_not_known() -> None:
-    """Runs without truth are left out; where no run knows the route's length, it is as far as any came."""
+def test_survival_with_missing_data() -> None:
+    """Runs without truth are left out; without a known length, the route ends at the longest distance."""
     assert survival([]) is None
     assert survival([run(None, "completed")]) is None
     curve = survival([run(None, "collision"), run(50.0, "collision", None), run(99.0, "completed", None)])

@@ -1,4 +1,4 @@
-"""The summary of a small sweep as it is driven: every key that the report and others rely on, and that they agree."""
+"""Tests of the summary of a small driven sweep: the keys on which the report and others rely, and their consistency."""
 
 from __future__ import annotations
 
@@ -11,37 +11,73 @@ import pytest
 from lavt.config import SweepConfig
 from lavt.config_file import load_config, shipped
 from lavt.experiment.runs.plan import plan_sweep
-from lavt.experiment.sweep.sweep import open_sweep, sweep
+from lavt.experiment.sweep.sweep import drive_sweep, open_sweep
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L1]", "routes=[a_key, b_key]", "repetitions=1")
 
 RUN_KEYS = {
-    "route_length_m", "heading_mae_rad", "heading_rms_rad", "heading_p95_rad", "steering_rms_rad",
-    "steering_rate_rms_radps", "steering_reversals_per_s", "steering_reversals_per_km", "oscillation_hz",
-    "collisions_per_km", "lane_invasions_per_km", "p95_by_10m", "age_at_actuation_ms", "stages_ms",
-}  # fmt: skip
+    "route_length_m",
+    "heading_mae_rad",
+    "heading_rms_rad",
+    "heading_p95_rad",
+    "steering_rms_rad",
+    "steering_rate_rms_radps",
+    "steering_reversals_per_s",
+    "steering_reversals_per_km",
+    "oscillation_hz",
+    "collisions_per_km",
+    "lane_invasions_per_km",
+    "p95_by_10m",
+    "age_at_actuation_ms",
+    "stages_ms",
+}
 CONDITION_KEYS = {
-    "runs", "completed", "completion_rate", "completion_interval", "completion_such_roads", "endings", "routes",
-    "collisions_per_run", "lane_invasions_per_run", "collisions_per_km", "lane_invasions_per_km", "p95_m",
-    "p95_interval", "p95_common_m", "p95_common_interval", "p95_worst_rank_m", "mae_m", "rms_m", "max_m",
-    "heading_rms_rad", "steering_reversals_per_s", "oscillation_hz", "injected_ms", "tau_v_ms", "tau_c_ms", "loop_ms",
-    "picture_age_ms", "age_at_actuation_ms", "stages_ms", "survival",
-}  # fmt: skip
+    "runs",
+    "completed",
+    "completion_rate",
+    "completion_interval",
+    "completion_such_roads",
+    "endings",
+    "routes",
+    "collisions_per_run",
+    "lane_invasions_per_run",
+    "collisions_per_km",
+    "lane_invasions_per_km",
+    "p95_m",
+    "p95_interval",
+    "p95_common_m",
+    "p95_common_interval",
+    "p95_worst_rank_m",
+    "mae_m",
+    "rms_m",
+    "max_m",
+    "heading_rms_rad",
+    "steering_reversals_per_s",
+    "oscillation_hz",
+    "injected_ms",
+    "tau_v_ms",
+    "tau_c_ms",
+    "loop_ms",
+    "picture_age_ms",
+    "age_at_actuation_ms",
+    "stages_ms",
+    "survival",
+}
 ROUTE_KEYS = {"runs", "completed", "completion_rate", "completion_interval", "p95_m", "p95_common_m"}
 
 
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Drive four runs without pictures, and read the summary of them."""
+    """Return the summary of four driven runs without pixels."""
     config = load_config(SweepConfig, shipped("configs/paper.yaml"), CHANGES)
     out: Path = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(config, plan_sweep(config), out, jobs=2, tell=lambda _: None)
+    drive_sweep(config, plan_sweep(config), out, jobs=2, on_progress=lambda _: None)
     return json.loads((out / "summary.json").read_text())
 
 
-def test_every_key_is_there(summary: Any) -> None:
-    """Runs, conditions, routes, groups, contrasts and the paper have the keys that others rely on."""
+def test_every_key_is_present(summary: Any) -> None:
+    """Runs, conditions, routes, groups, contrasts and the paper have the keys on which others rely."""
     assert all(run.keys() >= RUN_KEYS and run["valid"] for run in summary["runs"])
     for conditions in (summary["conditions"], *(group["conditions"] for group in summary["groups"])):
         assert list(conditions) == ["L0", "L1"]
@@ -54,16 +90,16 @@ def test_every_key_is_there(summary: Any) -> None:
     assert summary["paper"]["conditions"]["L1"]["completed"] == 28
 
 
-def test_the_stages_of_a_driven_run_make_its_loop(summary: Any) -> None:
-    """In virtual time, where a hop takes what was asked, medians from stamp to actuator add up to the loop to 3 ms."""
+def test_stage_latencies_add_up_to_the_loop_latency(summary: Any) -> None:
+    """In virtual time, median stage latencies from stamp to actuator add up to the loop latency within 3 ms."""
     for run in summary["runs"]:
-        made_ms = sum(stage["p50"] for stage in run["stages_ms"])
-        assert made_ms == pytest.approx(run["loop_ms"]["p50"], abs=3.0)
+        sum_ms = sum(stage["p50"] for stage in run["stages_ms"])
+        assert sum_ms == pytest.approx(run["loop_ms"]["p50"], abs=3.0)
         assert run["age_at_actuation_ms"]["p50"] >= run["loop_ms"]["p50"]
 
 
-def test_a_driven_run_was_compared_to_its_end(summary: Any) -> None:
-    """A completed run has a P95 for every whole 10 m of its route, less the few metres before the first row."""
+def test_a_completed_run_has_all_partial_errors(summary: Any) -> None:
+    """A completed run has a P95 for every full 10 m of its route, except the few metres before the first row."""
     for run in summary["runs"]:
         assert run["ending"] == "completed"
         assert len(run["p95_by_10m"]) == int(run["distance_m"] // 10)

@@ -26,35 +26,35 @@ from lavt.errors import UserError
 from lavt.experiment.analysis.results import read_json
 from lavt.experiment.runs.plan import PlannedRun, plan_run, plan_sweep
 from lavt.experiment.runs.run import RESULT, run_once
-from lavt.experiment.sweep.sweep import base_of, open_sweep, recorded_base, run_all, sweep
-from lavt.experiment.sweep.workers import Workers, processes
+from lavt.experiment.sweep.sweep import base_of, drive_sweep, open_sweep, recorded_base, run_all
+from lavt.experiment.sweep.workers import Workers, process_workers
 
 CHANGES = ("fidelity=geometry", "conditions=[L0, L3]", "repetitions=1", "network.inherent=loopback")
 
 
-def requested(*changes: str) -> SweepConfig:
+def sweep_config(*changes: str) -> SweepConfig:
     return load_config(SweepConfig, shipped("configs/sweep.yaml"), [*CHANGES, *changes])
 
 
 def two_runs() -> list[PlannedRun]:
-    return plan_sweep(requested())
+    return plan_sweep(sweep_config())
 
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of two runs, driven by two processes."""
+    """Drive a sweep of two runs in two processes, and return its directory."""
     out = tmp_path_factory.mktemp("sweep") / "out"
     open_sweep(out, resume=False)
-    sweep(requested(), two_runs(), out, jobs=2, tell=lambda _: None)
+    drive_sweep(sweep_config(), two_runs(), out, jobs=2, on_progress=lambda _: None)
     return out
 
 
-def test_a_sweep_leaves_a_whole_directory(swept: Path) -> None:
-    """A sweep leaves a directory for each run with config, both records and result, a summary, and a report."""
+def test_a_sweep_writes_all_files(swept: Path) -> None:
+    """A sweep writes a directory for each run with config, records and result, a summary, and a report."""
     for run in two_runs():
         names = {path.name for path in (swept / "runs" / run.name).iterdir()}
         assert names == {"config.yaml", "server.mcap", "client.mcap", "result.json"}
-    assert load_config(SweepConfig, swept / "sweep.yaml") == requested()
+    assert load_config(SweepConfig, swept / "sweep.yaml") == sweep_config()
     assert (swept / "report" / "index.html").is_file()
     summary = json.loads((swept / "summary.json").read_text())
     assert list(summary["conditions"]) == ["L0", "L3"]
@@ -65,58 +65,58 @@ def test_a_sweep_leaves_a_whole_directory(swept: Path) -> None:
 
 @pytest.fixture(scope="module")
 def resumed(swept: Path) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """The summaries before and after the first run was lost and driven again; whether the second was left alone."""
+    """Return the summaries before and after the first run was driven again, and whether the second was unchanged."""
     before = read_json(swept / "summary.json")
     first, second = (swept / "runs" / run.name / RESULT for run in two_runs())
-    kept = second.stat().st_mtime_ns
+    before_ns = second.stat().st_mtime_ns
     first.unlink()  # as if it had been killed while driving
-    sweep(requested(), two_runs(), swept, jobs=1, tell=lambda _: None)
-    return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == kept
+    drive_sweep(sweep_config(), two_runs(), swept, jobs=1, on_progress=lambda _: None)
+    return before, read_json(swept / "summary.json"), second.stat().st_mtime_ns == before_ns
 
 
-def test_resuming_drives_only_what_is_missing(resumed: tuple[dict[str, Any], dict[str, Any], bool]) -> None:
-    """A sweep that lost a run drives that run alone again, with the same digest, and gives the same summary."""
-    before, after, is_left_alone = resumed
-    assert is_left_alone
+def test_resuming_drives_only_missing_runs(resumed: tuple[dict[str, Any], dict[str, Any], bool]) -> None:
+    """A sweep that lost a run drives only that run again, with the same digest and the same summary."""
+    before, after, is_unchanged = resumed
+    assert is_unchanged
     assert sorted(after["runs"], key=str) == sorted(before["runs"], key=str)
     assert after["conditions"] == before["conditions"]
 
 
-def test_the_speed_is_that_of_what_was_driven(
+def test_the_speed_is_that_of_the_last_drives(
     swept: Path, resumed: tuple[dict[str, Any], dict[str, Any], bool]
 ) -> None:
-    """Runs that were driven before do not make a resumed sweep faster; where nothing is driven the speed is kept."""
+    """Runs from before do not count in a resumed sweep's speed; if no run is driven, the speed is kept."""
     speed = resumed[1]["speed"]
     assert speed["simulated_s"] == read_json(swept / "runs" / two_runs()[0].name / RESULT)["duration_s"]
-    sweep(requested(), two_runs(), swept, jobs=2, tell=lambda _: None)
+    drive_sweep(sweep_config(), two_runs(), swept, jobs=2, on_progress=lambda _: None)
     assert read_json(swept / "summary.json")["speed"] == speed
 
 
 def test_an_error_of_one_run_does_not_stop_the_others(tmp_path: Path) -> None:
-    """A run that ends with an error that nobody foresaw is told by its kind and text, and the others are driven."""
+    """An unexpected error of one run is reported with its type and text, and the others are driven."""
     good, bad = two_runs()
-    told: list[str] = []
-    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, tell=told.append)
-    ((name, why),) = driven.failed
+    lines: list[str] = []
+    driven, speed = run_all([replace(bad, seed=-1), good], tmp_path, jobs=1, on_progress=lines.append)
+    ((name, reason),) = driven.failed
     assert name == bad.name
-    assert why.startswith("ValidationError: ")
-    assert f"{name} failed: {why}" in told
+    assert reason.startswith("ValidationError: ")
+    assert f"{name} failed: {reason}" in lines
     assert [result["run"] for result in driven.results] == [good.name]
     assert speed is not None
 
 
-def test_a_run_directory_repeats_its_run(swept: Path, tmp_path: Path) -> None:
-    """The config in a run directory, driven by itself, gives the same digest as the run of the sweep."""
+def test_the_config_of_a_run_reproduces_it(swept: Path, tmp_path: Path) -> None:
+    """The config in a run directory, driven by itself, reproduces the digest of the run."""
     directory = swept / "runs" / two_runs()[0].name
     again = run_once(plan_run(load_config(RunConfig, directory / "config.yaml")), tmp_path / "again")
     assert again["digest"] == json.loads((directory / "result.json").read_text())["digest"]
 
 
 def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
-    """A sweep that was driven with another config is not resumed: its runs would not belong together."""
-    changed, before = requested("seed=2"), (swept / "sweep.yaml").read_bytes()
+    """A sweep that was driven with another config is not resumed."""
+    changed, before = sweep_config("seed=2"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match="another config"):
-        sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
+        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
 
 
@@ -124,10 +124,10 @@ def test_resuming_with_another_config_is_rejected(swept: Path) -> None:
     ("key", "value"), [("conditions", "[L1]"), ("repetitions", "2"), ("axes", "{study.block: [1]}")]
 )
 def test_resuming_a_sweep_of_other_runs_is_rejected(swept: Path, key: str, value: str) -> None:
-    """Nor one that asks for other runs, or more: the report would hold those that are there already, too."""
-    changed, before = requested(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
+    """A sweep with other or fewer runs is not resumed."""
+    changed, before = sweep_config(f"{key}={value}"), (swept / "sweep.yaml").read_bytes()
     with pytest.raises(UserError, match=rf"another config \({key}\)"):
-        sweep(changed, plan_sweep(changed), swept, jobs=1, tell=lambda _: None)
+        drive_sweep(changed, plan_sweep(changed), swept, jobs=1, on_progress=lambda _: None)
     assert (swept / "sweep.yaml").read_bytes() == before
 
 
@@ -148,8 +148,8 @@ BASES: list[tuple[tuple[str, ...], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("changes", "base"), BASES, ids=str)
 def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[str, Any], tmp_path: Path) -> None:
-    """The base of a sweep is what its config itself says at each axis, wherever that stands among the axis' values."""
-    config = requested(*changes)
+    """The base of a sweep is the value of its config at each axis, at any position in the axis."""
+    config = sweep_config(*changes)
     assert base_of(config, plan_sweep(config)) == base
     assert recorded_base(tmp_path) is None
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(config.model_dump(mode="json")))
@@ -162,9 +162,9 @@ def test_the_base_config_is_the_sweeps_own(changes: tuple[str, ...], base: dict[
 )
 @pytest.mark.usefixtures("hangup_ends")
 def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str, ...], tmp_path: Path) -> None:
-    """Ctrl-C or a closed terminal ends a sweep with a sentence, exit code 1 and no traceback.
+    """Ctrl-C or a closed terminal ends a sweep with a message, exit code 1 and no traceback.
 
-    The finished runs are kept and, on this machine's processes, those that are under way are finished.
+    The finished runs are kept, and runs in progress in local processes are finished.
     """
     if options:
         pytest.importorskip("distributed")
@@ -175,45 +175,46 @@ def test_a_stopped_sweep_keeps_what_is_finished(number: int, options: tuple[str,
             *(sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--jobs", "2"),
             *("--out", str(out), *options),
         ],
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
-    )  # fmt: skip
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
     for _ in range(3000):
         if list(out.glob("runs/*/result.json")):
             break
         pause(20 * NS_PER_MS)
     os.killpg(started.pid, number)  # as a terminal does: to all processes
-    _, said = started.communicate(timeout=60)
+    _, stderr = started.communicate(timeout=60)
     assert started.returncode == 1
-    assert "what was finished is kept" in said
-    assert "Traceback" not in said
+    assert "what was finished is kept" in stderr
+    assert "Traceback" not in stderr
     assert 0 < len(list(out.glob("runs/*/result.json"))) == len(list(out.glob("runs/*"))) < 60
 
 
-def test_a_sweep_that_is_stopped_while_files_come_in_keeps_no_half_of_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A run whose files come from far is there as a whole, or not at all, when Ctrl-C comes between them."""
+def test_ctrl_c_leaves_no_partial_remote_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If Ctrl-C interrupts writing the files of a remote run, none of them remain."""
 
-    def put_one_and_stop(_files: Mapping[str, bytes], directory: Path) -> None:
+    def write_one_and_stop(_files: Mapping[str, bytes], directory: Path) -> None:
         directory.mkdir()
         (directory / "server.mcap").touch()
         raise KeyboardInterrupt
 
     @contextmanager
-    def far(_address: str, _jobs: int | None) -> Iterator[Workers]:
+    def remote_workers(_address: str, _jobs: int | None) -> Iterator[Workers]:
         with ThreadPoolExecutor(1) as executor:
-            yield Workers(executor, 1, far=True)
+            yield Workers(executor, 1, remote=True)
 
-    monkeypatch.setattr("lavt.experiment.sweep.sweep.cluster", far)
-    monkeypatch.setattr("lavt.experiment.sweep.workers.put_files", put_one_and_stop)
+    monkeypatch.setattr("lavt.experiment.sweep.sweep.cluster_workers", remote_workers)
+    monkeypatch.setattr("lavt.experiment.sweep.workers.write_files", write_one_and_stop)
     (tmp_path / "runs").mkdir()
-    planned = plan_sweep(requested("fidelity=geometry"))[:1]
+    planned = plan_sweep(sweep_config("fidelity=geometry"))[:1]
     with pytest.raises(KeyboardInterrupt):
-        run_all(planned, tmp_path / "runs", jobs=1, tell=lambda _: None, cluster_at="local")
+        run_all(planned, tmp_path / "runs", jobs=1, on_progress=lambda _: None, cluster_address="local")
     assert not list(tmp_path.glob("runs/*"))
 
 
-IMPORT_FOR_LONG = """
+SLOW_IMPORT = """
 import sys, time
 from pathlib import Path
 
@@ -225,29 +226,33 @@ class Finder:
 
 sys.meta_path.insert(0, Finder())
 """
-"""Makes the import of the report a place to interrupt: it executes a string, as the definition of a dataclass does."""
+"""A module that makes the import of the report slow while it executes a string, as a dataclass definition does."""
 
 
 @pytest.mark.full
-def test_a_sweep_that_is_stopped_in_an_import_ends_with_its_own_exit_code(tmp_path: Path) -> None:
-    """`python -m` dies of a signal that finds the main thread executing a string, although it was handled."""
-    (tmp_path / "sitecustomize.py").write_text(IMPORT_FOR_LONG)
+def test_ctrl_c_in_an_import_keeps_the_exit_code(tmp_path: Path) -> None:
+    """Ctrl-C during the import of the report, which executes a string, ends a sweep with its own exit code."""
+    (tmp_path / "sitecustomize.py").write_text(SLOW_IMPORT)
     path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
     started = subprocess.Popen(
         [
             *(sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml").resolve())),
             *("--set", "fidelity=geometry", "--set", "repetitions=10", "--out", "out"),
         ],
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": path},
-        stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
     for _ in range(3000):
         if (tmp_path / "importing").exists():
             break
         pause(20 * NS_PER_MS)
     os.killpg(started.pid, signal.SIGINT)
-    _, said = started.communicate(timeout=60)
-    assert "what was finished is kept" in said
+    _, stderr = started.communicate(timeout=60)
+    assert "what was finished is kept" in stderr
     assert started.returncode == 1
 
 
@@ -261,13 +266,15 @@ def geometry(*changes: str) -> tuple[SweepConfig, list[PlannedRun]]:
 @pytest.mark.full
 @pytest.mark.usefixtures("own_environment")  # distributed sets variables for its workers
 def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
-    """The same runs have the same digests on a repeat, with one process, with two, and on Dask's workers."""
+    """Runs have the same digests when repeated, with one process, with two, and with Dask workers."""
     pytest.importorskip("distributed")
     _, planned = geometry()
-    ways = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
+    workers = {"one": (1, None), "two": (2, None), "again": (2, None), "dask": (2, "local")}
     digests = {}
-    for name, (jobs, cluster_at) in ways.items():
-        driven, _ = run_all(planned, tmp_path / name, jobs=jobs, tell=lambda _: None, cluster_at=cluster_at)
+    for name, (jobs, cluster_address) in workers.items():
+        driven, _ = run_all(
+            planned, tmp_path / name, jobs=jobs, on_progress=lambda _: None, cluster_address=cluster_address
+        )
         assert driven.failed == []
         digests[name] = {result["run"]: result["digest"] for result in driven.results}
     assert len(set(digests["one"].values())) == len(planned)
@@ -276,45 +283,49 @@ def test_digests_are_the_same_on_any_workers(tmp_path: Path) -> None:
     assert files == {path.relative_to(tmp_path / "two") for path in (tmp_path / "two").rglob("*")}
 
 
-class FarAway(Executor):
-    """Drives here, at once, what is driven elsewhere, and knows which of what it gave is still held by somebody."""
+class InlineRemote(Executor):
+    """An executor that drives remote runs inline, and tracks which of its futures are still referenced."""
 
     def __init__(self) -> None:
-        self.held: weakref.WeakSet[Future[Any]] = weakref.WeakSet()
+        self.referenced: weakref.WeakSet[Future[Any]] = weakref.WeakSet()
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Drive, and give the files."""
+        """Drive, and return a future with the files."""
         future: Future[Any] = Future()
         future.set_result(fn(*args, **kwargs))
-        self.held.add(future)
+        self.referenced.add(future)
         return future
 
 
-def test_files_from_far_are_let_go_once_they_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """When a run that came from far is told, the files of those before it are no longer in memory."""
-    away = FarAway()
-    workers = Workers(away, 1, far=True)
-    monkeypatch.setattr(lavt.experiment.sweep.sweep, "cluster", lambda _address, _jobs: nullcontext(workers))
+def test_files_of_remote_runs_are_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When a remote run is reported, the files of the runs before it are no longer in memory."""
+    executor = InlineRemote()
+    workers = Workers(executor, 1, remote=True)
+    monkeypatch.setattr(lavt.experiment.sweep.sweep, "cluster_workers", lambda _address, _jobs: nullcontext(workers))
     _, planned = geometry()
-    held: list[int] = []
-    run_all(planned[:3], tmp_path, jobs=None, tell=lambda _: held.append(len(away.held)), cluster_at="far")
-    assert held == [3, 2, 1]
+    counts: list[int] = []
+
+    def tell(_line: str) -> None:
+        counts.append(len(executor.referenced))
+
+    run_all(planned[:3], tmp_path, jobs=None, on_progress=tell, cluster_address="remote")
+    assert counts == [3, 2, 1]
 
 
 @pytest.mark.full
-def test_without_a_scheduler_there_is_a_sentence(tmp_path: Path) -> None:
-    """An address at which no Dask scheduler answers is an error of the user's, before anything is driven."""
+def test_a_missing_scheduler_is_an_error(tmp_path: Path) -> None:
+    """An address without a Dask scheduler is a user error before anything is driven."""
     pytest.importorskip("distributed")
     _, planned = geometry()
     with pytest.raises(UserError, match="no Dask scheduler answers at"):
-        run_all(planned, tmp_path, jobs=None, tell=lambda _: None, cluster_at="tcp://127.0.0.1:1")
+        run_all(planned, tmp_path, jobs=None, on_progress=lambda _: None, cluster_address="tcp://127.0.0.1:1")
     with pytest.raises(UserError, match="--jobs is for this machine"):
-        run_all(planned, tmp_path, jobs=2, tell=lambda _: None, cluster_at="tcp://127.0.0.1:1")
+        run_all(planned, tmp_path, jobs=2, on_progress=lambda _: None, cluster_address="tcp://127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []
 
 
 def kill_a_worker(left: list[int]) -> None:
-    """Kill the first process of this one's that is left to be killed, `left[0]` times."""
+    """Kill the first child process, `left[0]` times."""
     children = multiprocessing.active_children()
     if left[0] and children:
         left[0] -= 1
@@ -322,9 +333,9 @@ def kill_a_worker(left: list[int]) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_process_that_begins_does_not_hear_the_terminal(number: signal.Signals) -> None:
-    """Ctrl-C and a closed terminal are nothing to a process from its first moment on."""
-    with processes(2) as workers:
+def test_a_new_worker_ignores_terminal_signals(number: signal.Signals) -> None:
+    """A worker process ignores Ctrl-C and a closed terminal from its start on."""
+    with process_workers(2) as workers:
         begun = multiprocessing.active_children()
         for each in begun:
             os.kill(int(each.pid or 0), number)
@@ -334,21 +345,21 @@ def test_a_process_that_begins_does_not_hear_the_terminal(number: signal.Signals
 
 
 @pytest.mark.full
-def test_a_process_that_dies_costs_no_run(tmp_path: Path) -> None:
-    """When a process is killed from outside, what it was at is driven again, and all runs are there in the end."""
+def test_runs_of_a_killed_process_are_repeated(tmp_path: Path) -> None:
+    """The runs of a killed process are driven again, and all runs are finished."""
     _, planned = geometry()
     left = [1]
-    driven, _ = run_all(planned, tmp_path, jobs=2, tell=lambda _: kill_a_worker(left))
+    driven, _ = run_all(planned, tmp_path, jobs=2, on_progress=lambda _: kill_a_worker(left))
     assert left == [0]
     assert driven.failed == []
     assert sorted(result["run"] for result in driven.results) == sorted(each.name for each in planned)
 
 
 class DiesAfterwards(Executor):
-    """Drives here, and says what is said of a process that died before it could tell: a real one hardly ever does."""
+    """An executor that drives inline and then fails like one whose process died after the run, which is rare."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Drive, and break."""
+        """Drive, and return a future with `BrokenExecutor`."""
         fn(*args, **kwargs)
         future: Future[Any] = Future()
         future.set_exception(BrokenExecutor())
@@ -356,11 +367,11 @@ class DiesAfterwards(Executor):
 
 
 def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run that had its result when its process died counts as it is, and is not driven again."""
-    workers = Workers(DiesAfterwards(), 1, far=False)
-    monkeypatch.setattr(lavt.experiment.sweep.sweep, "processes", lambda _jobs: nullcontext(workers))
+    """A run that had a result when its process died is kept and not driven again."""
+    workers = Workers(DiesAfterwards(), 1, remote=False)
+    monkeypatch.setattr(lavt.experiment.sweep.sweep, "process_workers", lambda _jobs: nullcontext(workers))
     _, planned = geometry()
-    driven, _ = run_all(planned[:1], tmp_path, jobs=1, tell=lambda _: None)
+    driven, _ = run_all(planned[:1], tmp_path, jobs=1, on_progress=lambda _: None)
     assert driven.failed == []
     assert (
         [drive.result for drive in driven.drives] == driven.results == [read_json(tmp_path / planned[0].name / RESULT)]
@@ -370,7 +381,7 @@ def test_a_run_whose_process_dies_after_it_is_kept(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.full
 def test_a_killed_sweep_resumes_to_the_same_summary(tmp_path: Path) -> None:
-    """A sweep killed (SIGKILL) in its middle and resumed gives the summary of one that nobody disturbed."""
+    """A sweep that was killed (SIGKILL) and resumed has the summary of an undisturbed one."""
     sets = [part for change in ("fidelity=geometry", "conditions=[L0, L3, L5]") for part in ("--set", change)]
     command = [sys.executable, "-m", "lavt", "sweep", str(shipped("configs/sweep.yaml")), *sets, "--out"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"

@@ -1,4 +1,4 @@
-"""A machine's agent: calls functions of the lane there, for tests that run on the other machine."""
+"""A machine's agent, which calls functions of the lane for tests that run on the other machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PORT = 7700
 
 
 def serve(address: str, key: bytes) -> None:
-    """Answer (function, arguments, keywords) with (what it raised or None, what it returned)."""
+    """Answer (function, arguments, keywords) with (exception text or None, return value)."""
     with Listener((address, PORT), authkey=key) as listener:
         while True:
             threading.Thread(target=_answer, args=(listener.accept(),), daemon=True).start()

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import os
 
-from tests.kernel.lane.machine import Machine, MachineError, Started, wait_until
+from tests.kernel.lane.machine import Machine, MachineError, StartedProgram, wait_until
 
 FOLDER = "/run/chrony"
-"""Where chronyc looks by itself. chronyd makes no command socket in a directory that others may read."""
-OWN = (f"bindcmdaddress {FOLDER}/chronyd.sock", f"pidfile {FOLDER}/chronyd.pid")
-SERVING = ("local stratum 8", "allow")
-"""Serve the own clock to whoever asks."""
-SYNCHRONISED_S = 60
+"""The directory that chronyc uses by default. chronyd makes no command socket in a directory that others may read."""
+FILES = (f"bindcmdaddress {FOLDER}/chronyd.sock", f"pidfile {FOLDER}/chronyd.pid")
+SERVE_OWN_CLOCK = ("local stratum 8", "allow")
+"""Serve the machine's own clock to every client."""
+SYNCHRONISATION_TIMEOUT_S = 60
 
 
-def following(address: str, port: int = 123) -> str:
-    """Follow a server closely: twice a second, by time stamps of what was really sent."""
+def follow_server(address: str, port: int = 123) -> str:
+    """Return the directive to follow a server closely: twice a second, with true send times (interleaved mode)."""
     return f"server {address} port {port} iburst minpoll -1 maxpoll -1 xleave"
 
 
-def start_chronyd(machine: Machine, *lines: str, adjusts_clock: bool = False) -> Started:
-    """Start chronyd with these lines of configuration; unless told otherwise it touches no clock."""
+def start_chronyd(machine: Machine, *lines: str, adjusts_clock: bool = False) -> StartedProgram:
+    """Start chronyd with these lines of configuration; by default it does not adjust the clock."""
     machine.call(os.makedirs, FOLDER, 0o750, True)
-    machine.write(f"{FOLDER}/chrony.conf", "\n".join([*OWN, *lines, ""]))
-    hands = [] if adjusts_clock else ["-x"]
-    chronyd = machine.start(["chronyd", *hands, "-d", "-u", "root", "-f", f"{FOLDER}/chrony.conf"])
+    machine.write(f"{FOLDER}/chrony.conf", "\n".join([*FILES, *lines, ""]))
+    flags = [] if adjusts_clock else ["-x"]
+    chronyd = machine.start(["chronyd", *flags, "-d", "-u", "root", "-f", f"{FOLDER}/chrony.conf"])
     wait_until(
         f"chronyd answers on the {machine.name}'s machine",
         lambda: machine.call(os.path.exists, f"{FOLDER}/chronyd.sock") or not chronyd.running,
-        SYNCHRONISED_S,
+        SYNCHRONISATION_TIMEOUT_S,
     )
     if not chronyd.running:
         raise MachineError(f"{machine.name}: chronyd did not start: {chronyd.errors}")
@@ -36,26 +36,26 @@ def start_chronyd(machine: Machine, *lines: str, adjusts_clock: bool = False) ->
 
 
 def chronyc(machine: Machine, report: str) -> list[str]:
-    """Ask chrony for a report; give the fields of its first line."""
+    """Query chrony for a report; return the fields of its first line."""
     return machine.run(["chronyc", "-n", "-c", report]).splitlines()[0].split(",")
 
 
 def correction_s(machine: Machine) -> float:
-    """Reference time less the machine's wall clock, as chrony has it: of `chronyc -c tracking` the fifth field."""
+    """Return chrony's reference time less the machine's wall clock: field 5 of `chronyc -c tracking`."""
     return float(chronyc(machine, "tracking")[4])
 
 
 def wait_synchronised(machine: Machine, *, updates: int = 1) -> None:
-    """Wait until chrony has chosen a source and has heard it so many times."""
+    """Wait until chrony has selected a source and received at least `updates` good answers."""
 
     def synchronised() -> bool:
         fields = chronyc(machine, "tracking")
-        return fields[0] != "00000000" and fields[13] == "Normal" and _heard(machine) >= updates
+        return fields[0] != "00000000" and fields[13] == "Normal" and _count_good_answers(machine) >= updates
 
-    wait_until(f"chrony is synchronised on the {machine.name}'s machine", synchronised, SYNCHRONISED_S)
+    wait_until(f"chrony is synchronised on the {machine.name}'s machine", synchronised, SYNCHRONISATION_TIMEOUT_S)
 
 
-def _heard(machine: Machine) -> int:
-    """Count the good answers of the best heard source; 99 where chrony has none, as it serves its own clock."""
+def _count_good_answers(machine: Machine) -> int:
+    """Return the good answers of the best source; 99 if chrony has none because it serves its own clock."""
     answers = [line.split(",") for line in machine.run(["chronyc", "-n", "-c", "ntpdata"]).splitlines()]
     return max((int(fields[-1]) for fields in answers if len(fields) > 30), default=99)

@@ -1,4 +1,4 @@
-"""One machine's clocks, read against what both machines share: the processor's time stamp counter."""
+"""One machine's clocks, read together with the processor's time stamp counter, which both machines share."""
 
 from __future__ import annotations
 
@@ -41,83 +41,83 @@ class Timex(ctypes.Structure):
     ]
 
 
-def counter() -> int:
-    """Read the time stamp counter."""
+def read_counter() -> int:
+    """Return the time stamp counter."""
     return _rdtsc()[1]()
 
 
-def reading(attempts: int = 60) -> tuple[int, int]:
-    """Read counter and wall clock (ns) together: of some attempts, the one that was interrupted least."""
+def read_wall_clock(attempts: int = 60) -> tuple[int, int]:
+    """Return counter and wall clock (ns), read together: the attempt with the least interruption."""
     best: tuple[int, int, int] | None = None
     for _ in range(attempts):
-        before = counter()
+        before = read_counter()
         wall_ns = time.time_ns()
-        after = counter()
+        after = read_counter()
         if best is None or after - before < best[0]:
             best = after - before, (before + after) // 2, wall_ns
     assert best is not None
     return best[1:]
 
 
-def monotonic_reading(attempts: int = 10) -> tuple[int, int]:
-    """Read counter and CLOCK_MONOTONIC (ns) together: of some attempts, the one that was interrupted least."""
-    tries = [(counter(), time.monotonic_ns(), counter()) for _ in range(attempts)]
-    before, mono_ns, after = min(tries, key=lambda each: each[2] - each[0])
+def read_monotonic_clock(attempts: int = 10) -> tuple[int, int]:
+    """Return counter and CLOCK_MONOTONIC (ns), read together: the attempt with the least interruption."""
+    attempts_read = [(read_counter(), time.monotonic_ns(), read_counter()) for _ in range(attempts)]
+    before, mono_ns, after = min(attempts_read, key=lambda each: each[2] - each[0])
     return (before + after) // 2, mono_ns
 
 
-def ahead_ns(one: tuple[int, int], other: tuple[int, int]) -> int:
-    """Return how far one clock is ahead of another, from a reading of each together with the counter."""
-    gone_ns = (one[0] - other[0]) / counter_hz() * NS_PER_S
-    return one[1] - other[1] - round(gone_ns)
+def offset_ns(one: tuple[int, int], other: tuple[int, int]) -> int:
+    """Return one clock less another, from readings of each together with the counter."""
+    elapsed_ns = (one[0] - other[0]) / counter_hz() * NS_PER_S
+    return one[1] - other[1] - round(elapsed_ns)
 
 
 @cache
 def counter_hz() -> float:
-    """Tell how fast the counter runs, against a clock that nobody adjusts."""
+    """Return the counter's frequency, measured with a clock that is never adjusted."""
     begin = _counter_and_raw()
     time.sleep(CALIBRATION_S)
     end = _counter_and_raw()
     return (end[0] - begin[0]) / (end[1] - begin[1]) * NS_PER_S
 
 
-def raw_ns() -> int:
-    """Read the clock that nobody adjusts."""
+def read_raw_clock_ns() -> int:
+    """Return CLOCK_MONOTONIC_RAW, which is never adjusted."""
     return time.clock_gettime_ns(time.CLOCK_MONOTONIC_RAW)
 
 
-def wall_less_raw_ns() -> int:
-    """Tell how far the wall clock is from the one that nobody adjusts."""
-    tries = [(raw_ns(), time.time_ns(), raw_ns()) for _ in range(60)]
-    before_ns, wall_ns, after_ns = min(tries, key=lambda each: each[2] - each[0])
+def wall_minus_raw_ns() -> int:
+    """Return the wall clock less the raw clock."""
+    attempts_read = [(read_raw_clock_ns(), time.time_ns(), read_raw_clock_ns()) for _ in range(60)]
+    before_ns, wall_ns, after_ns = min(attempts_read, key=lambda each: each[2] - each[0])
     return wall_ns - (before_ns + after_ns) // 2
 
 
 def step(by_ns: int) -> None:
-    """Set the wall clock ahead, or back, all at once."""
+    """Step the wall clock."""
     seconds, fraction = divmod(by_ns, NS_PER_S)
-    _adjust(Timex(modes=ADJ_SETOFFSET | ADJ_NANO, seconds=seconds, fraction=fraction))
+    _adjtimex(Timex(modes=ADJ_SETOFFSET | ADJ_NANO, seconds=seconds, fraction=fraction))
 
 
-def drift(by_ppm: float) -> None:
-    """Let the wall clock run fast by so many ppm from now on (at most 500, either way)."""
-    _adjust(Timex(modes=ADJ_FREQUENCY | ADJ_TICK, frequency=round(by_ppm * PPM), tick=TICK_US))
+def set_drift(by_ppm: float) -> None:
+    """Set the wall clock's frequency error in ppm (at most 500, either way)."""
+    _adjtimex(Timex(modes=ADJ_FREQUENCY | ADJ_TICK, frequency=round(by_ppm * PPM), tick=TICK_US))
 
 
-def restore(less_raw_ns: int) -> None:
-    """Let the wall clock run as it did when it was so far from the one that nobody adjusts, and set it there."""
-    drift(0)
-    _adjust(Timex(modes=ADJ_STATUS, status=STA_UNSYNC))
-    step(less_raw_ns - wall_less_raw_ns())
+def restore(minus_raw_ns: int) -> None:
+    """Reset the wall clock's frequency, and step the clock to this difference from the raw clock."""
+    set_drift(0)
+    _adjtimex(Timex(modes=ADJ_STATUS, status=STA_UNSYNC))
+    step(minus_raw_ns - wall_minus_raw_ns())
 
 
 def _counter_and_raw() -> tuple[int, int]:
-    tries = [(counter(), raw_ns(), counter()) for _ in range(60)]
-    before, raw, after = min(tries, key=lambda each: each[2] - each[0])
+    attempts_read = [(read_counter(), read_raw_clock_ns(), read_counter()) for _ in range(60)]
+    before, raw, after = min(attempts_read, key=lambda each: each[2] - each[0])
     return (before + after) // 2, raw
 
 
-def _adjust(change: Timex) -> None:
+def _adjtimex(change: Timex) -> None:
     library = ctypes.CDLL(None, use_errno=True)
     if library.adjtimex(ctypes.byref(change)) < 0:
         raise OSError(ctypes.get_errno(), "adjtimex")
@@ -125,7 +125,7 @@ def _adjust(change: Timex) -> None:
 
 @cache
 def _rdtsc() -> tuple[mmap.mmap, Callable[[], int]]:
-    """Put the instruction into memory that may be executed; the memory must live as long as the function."""
+    """Put the instructions into executable memory; the memory must live as long as the function."""
     memory = mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
     memory.write(RDTSC)
     address = ctypes.addressof(ctypes.c_char.from_buffer(memory))

@@ -1,4 +1,4 @@
-"""Machines that are processes: user-mode kernels that see this machine's files, with their own clocks and queues."""
+"""Machines that are processes: user-mode kernels with the host's files, and with clocks and qdiscs of their own."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from tests.kernel.lane import newer
 from tests.kernel.lane.packages import LIBRARIES, PROGRAMS, program, search_path
 
 MEMORY_MB = 1536
-END_S = 3
+STOP_TIMEOUT_S = 3
 PR_SET_PDEATHSIG = 1
-PRIORITY = 1
-"""Of those that go before all ordinary programs, the lowest: other work on the machine must not show.
-Nice alone was not enough: with two busy processors a drive did not get to its end."""
+REALTIME_PRIORITY = 1
+"""The lowest real-time priority, so that other work on the host does not disturb a drive.
+Niceness was not enough: with two busy processors a drive did not reach its end."""
 KEEP_MEMORY = {
     "MALLOC_ARENA_MAX": "1",
     "MALLOC_MMAP_THRESHOLD_": str(2**30),
     "MALLOC_TRIM_THRESHOLD_": str(2**32),
     "MALLOC_TOP_PAD_": str(2**26),
 }
-"""A page that is touched first costs a user-mode kernel 50 us and more: programs keep what they have been given."""
+"""Environment that makes programs keep their memory: the first access to a page costs 50 us and more."""
 
-LINE = "/run/line"
-"""A serial line: the second console, where a machine is given the other end."""
+SERIAL_LINE = "/run/line"
+"""Device of a serial line: the second console, for a machine that gets one."""
 
 MODULES = "usr/lib/uml/modules/*"
-KERNEL, LOADED = "linux.uml", "libraries"
-"""The kernel that runs, and what it loads, in the directory that the guests share."""
+KERNEL, LIBRARY_FOLDER = "linux.uml", "libraries"
+"""Names of the kernel and of its libraries in the guests' shared directory."""
 
 INIT = """#!{busybox} sh
 b={busybox}
@@ -57,54 +57,54 @@ cd {cwd}
 {{ {environment} {command}; echo $? > {scratch}/{name}.code; }} < /dev/null 2>&1 | $b cat > /dev/tty1
 exec $b poweroff -f
 """
-"""Process 1. What the guest prints goes through a pipe: a program that sees a terminal would colour it."""
+"""Process 1. The guest's output goes through a pipe, because programs would colour it for a terminal."""
 
 MODPROBE = """#!{busybox} sh
 export LD_LIBRARY_PATH={libraries}
 exec {scratch}/modprobe.d/modprobe -d {scratch}/modules "$@"
 """
-"""The kernel calls it: tc, ip and sockets get the modules that they need by themselves."""
+"""The kernel runs this to load the modules that tc, ip and sockets need."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guest:
-    """A machine that runs."""
+    """A running machine."""
 
     name: str
     process: subprocess.Popen[bytes]
     scratch: Path
 
     def exit_code(self) -> int | None:
-        """Exit code of its command; None where it has not ended, or has died before."""
+        """Return the exit code of its command; None if the command has not ended, or the machine died."""
         with suppress(OSError, ValueError):
             return int((self.scratch / f"{self.name}.code").read_text())
         return None
 
     def console(self) -> str:
-        """Last words of its kernel."""
+        """Return the last lines of its kernel's console."""
         return "\n".join((self.scratch / f"{self.name}.console").read_text(errors="replace").splitlines()[-8:])
 
-    def end(self) -> None:
-        """End it and every process that it is made of."""
+    def stop(self) -> None:
+        """Stop the machine with all of its processes."""
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):
-            self.process.wait(END_S)
+            self.process.wait(STOP_TIMEOUT_S)
         with suppress(ProcessLookupError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
 
 
 def prepare(tools: Path, scratch: Path) -> None:
-    """Lay out what the guests share."""
+    """Create the files that the guests share."""
     modules = scratch / "modules/lib/modules"
     modules.mkdir(parents=True)
     for version in [*tools.glob(MODULES), *tools.glob(f"{newer.FOLDER}/{MODULES}")]:
         (modules / version.name).symlink_to(version)
-    if not newer.lay_out(tools, scratch / KERNEL, scratch / LOADED):
+    if not newer.install(tools, scratch / KERNEL, scratch / LIBRARY_FOLDER):
         (scratch / KERNEL).symlink_to(program(tools, "linux.uml"))
-        (scratch / LOADED).mkdir()
+        (scratch / LIBRARY_FOLDER).mkdir()
     (scratch / "modprobe.d").mkdir()
-    (scratch / "modprobe.d" / "modprobe").symlink_to(program(tools, "kmod"))  # it looks at its own name
+    (scratch / "modprobe.d" / "modprobe").symlink_to(program(tools, "kmod"))  # kmod acts by the name it is called by
     text = MODPROBE.format(
         busybox=program(tools, "busybox"), libraries=search_path(tools, LIBRARIES), scratch=shlex.quote(str(scratch))
     )
@@ -126,10 +126,10 @@ def start_guest(
 ) -> Guest:
     """Start a machine that runs `command` and ends with it.
 
-    `links` says of each network device which socket it is joined to and its address; `writable` are the directories of
-    this machine that it may write. Its command's output goes to the descriptor `output`; its device LINE reads from and
-    writes to those of `line`. All of it runs on one processor of this machine, as a system call of the guest is a
-    change from one process to another, and back: from one processor to another that took four times as long.
+    `links` maps each network device to its socket and address. `writable` lists the directories of the host that the
+    machine may write to. The command's output goes to the descriptor `output`, and `line` has the descriptors to read
+    from and write to for SERIAL_LINE. The machine runs on one of the host's processors: a system call of the guest is
+    two switches between processes, which took four times as long between two processors.
     """
     busybox = program(tools, "busybox")
     setup = ["ip link set lo up"]
@@ -143,10 +143,10 @@ def start_guest(
         INIT.format(
             busybox=busybox,
             name=name,
-            line=LINE,
+            line=SERIAL_LINE,
             writable=shlex.join(str(path) for path in (scratch, *writable)),
             modprobe=scratch / "modprobe",
-            environment=shlex.join([str(busybox), "env", "-i", *_inside(environment, tools)]),
+            environment=shlex.join([str(busybox), "env", "-i", *_guest_environment(environment, tools)]),
             setup=shlex.quote(" && ".join(setup)),
             cwd=shlex.quote(str(Path.cwd())),
             command=shlex.join(command),
@@ -164,32 +164,32 @@ def start_guest(
             stdout=console,
             stderr=subprocess.STDOUT,
             pass_fds=[output, *(line or ()), *(descriptor for descriptor, _ in links.values())],
-            start_new_session=True,  # a process group of its own: Ctrl-C goes to who started it, who ends it
-            preexec_fn=partial(_settle, processor),  # noqa: PLW1509 (there are no threads here)
+            start_new_session=True,  # Ctrl-C must reach only the program that started it, which stops it
+            preexec_fn=partial(_configure_process, processor),  # noqa: PLW1509 (there are no threads here)
             env={
                 "PATH": os.environ.get("PATH", os.defpath),
                 "TMPDIR": _memory_directory(scratch),
-                "LD_LIBRARY_PATH": str(scratch / LOADED),
+                "LD_LIBRARY_PATH": str(scratch / LIBRARY_FOLDER),
             },
         )
     return Guest(name, process, scratch)
 
 
-def _inside(environment: Mapping[str, str], tools: Path) -> list[str]:
-    """List the variables of the guest's programs: ours, and where the tools are."""
+def _guest_environment(environment: Mapping[str, str], tools: Path) -> list[str]:
+    """Return the environment of the guest's programs, which includes the tools' paths."""
     path = os.pathsep.join([search_path(tools, PROGRAMS), environment.get("PATH", os.defpath), "/usr/sbin", "/sbin"])
     libraries = os.pathsep.join(
         filter(None, [environment.get("LD_LIBRARY_PATH", ""), search_path(tools, LIBRARIES)])
-    )  # only those that this machine lacks were fetched
+    )  # only libraries that the host lacks were fetched
     distributions = next(iter(tools.rglob("normal.dist")), tools)
-    changed = {"PATH": path, "TMPDIR": "/run/tmp", "TC_LIB_DIR": str(distributions.parent)}
+    replaced = {"PATH": path, "TMPDIR": "/run/tmp", "TC_LIB_DIR": str(distributions.parent)}
     if libraries:
-        changed["LD_LIBRARY_PATH"] = libraries
-    return [f"{key}={value}" for key, value in {**KEEP_MEMORY, **environment, **changed}.items()]
+        replaced["LD_LIBRARY_PATH"] = libraries
+    return [f"{key}={value}" for key, value in {**KEEP_MEMORY, **environment, **replaced}.items()]
 
 
 def _memory_directory(scratch: Path) -> str:
-    """Say where the file lies that is the guest's memory: in memory, where there is enough of it."""
+    """Return the directory for the file that is the guest's memory: in memory if there is room."""
     with suppress(OSError):
         shared = os.statvfs("/dev/shm")
         if shared.f_bavail * shared.f_frsize > 2 * MEMORY_MB * 2**20:
@@ -202,9 +202,9 @@ def _write_program(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def _settle(processor: int) -> None:
-    """Let the kernel end with the program that started it, even if that is killed outright, and go first if it may."""
+def _configure_process(processor: int) -> None:
+    """Bind the kernel to a processor, make it end with its parent, and give it real-time priority if possible."""
     os.sched_setaffinity(0, [processor])
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REALTIME_PRIORITY))

@@ -2,10 +2,10 @@
 
     python -m tests.kernel.lane.host_stalls < QUESTIONS > ANSWERS
 
-A probe inside a machine could not run before the machine itself does. So this program runs on the host, starts one
-lateness probe for each processor there, and answers through pipes that the first machine sees as a serial line. All
-machines have clocks of their own: each answer has the host's time together with the processor's counter, which all of
-them read, and `HostProbe` computes the machine's time from it.
+A probe inside a machine cannot run before the machine does. So this program runs on the host, starts one lateness
+probe for each processor, and answers through pipes that the first machine sees as a serial line. Every machine has
+clocks of its own: each answer has the host's time together with the processor's counter, which all of them read, and
+`HostProbe` converts it to the machine's time.
 """
 
 from __future__ import annotations
@@ -22,109 +22,114 @@ from typing import Any
 from tests.kernel.lane import clocks
 from tests.support.stalls import ProbeEnded, Stall, Stalls
 
-ASK_S = 0.5
-"""A machine's clock may be slewed by 500 ppm: a stall that is told so much later is 0.3 ms off."""
-AT_ONCE = 40
-"""A user-mode kernel whose line was once full, with 4 KB, hears nothing on it any more."""
+POLL_S = 0.5
+"""Polling period. A clock may be slewed by 500 ppm, which in this time makes an error of 0.3 ms."""
+STALLS_PER_ANSWER = 40
+"""Maximum per answer. A user-mode kernel whose line has once been full (4 KB) receives nothing on it any more."""
 
 
 def serve() -> None:
-    """Answer each byte on standard input with one line, until it ends."""
+    """Answer each byte on standard input with one line, until the end of input."""
     stalls = Stalls.measured()
     try:
         while os.read(0, 1):
-            sys.stdout.write(json.dumps(_answer(stalls)) + "\n")
+            sys.stdout.write(json.dumps(_query(stalls)) + "\n")
             sys.stdout.flush()
     finally:
         stalls.end()
 
 
-def _answer(stalls: Stalls) -> dict[str, Any]:
-    """Return the time, and the stalls until then that no earlier answer had; the oldest, where there are many."""
-    counter, mono_ns = clocks.monotonic_reading()
+def _query(stalls: Stalls) -> dict[str, Any]:
+    """Return the time, and the oldest stalls that no earlier answer had."""
+    counter, mono_ns = clocks.read_monotonic_clock()
     try:
         stalls.collect()
-    except ProbeEnded as ended:
-        return {"ended": str(ended)}
-    told = [[each.processor, each.begin_ns, each.end_ns] for each in stalls.recorded[:AT_ONCE]]
-    del stalls.recorded[:AT_ONCE]
+    except ProbeEnded as error:
+        return {"ended": str(error)}
+    listed = [[each.processor, each.begin_ns, each.end_ns] for each in stalls.recorded[:STALLS_PER_ANSWER]]
+    del stalls.recorded[:STALLS_PER_ANSWER]
     above = all(probe.above for probe in stalls.probes)
     return {
-        "counter": counter, "mono_ns": mono_ns, "stalls": told, "more": bool(stalls.recorded),
-        "above": above, "processor_times": stalls.processor_times(),
-    }  # fmt: skip
+        "counter": counter,
+        "mono_ns": mono_ns,
+        "stalls": listed,
+        "more": bool(stalls.recorded),
+        "above": above,
+        "processor_times": stalls.processor_times(),
+    }
 
 
 class HostProbe:
-    """All probes of the host, as one. Its times are those of this machine's CLOCK_MONOTONIC.
+    """All probes of the host as one probe, with times on this machine's CLOCK_MONOTONIC.
 
-    A thread asks twice a second, so that a clock that is slewed meanwhile has little time to go wrong.
+    A thread queries the host twice a second, so that a slewed clock makes only a small error.
     """
 
     def __init__(self, device: str | Path) -> None:
         self._line = os.open(device, os.O_RDWR | os.O_NOCTTY)
         if os.isatty(self._line):
             tty.setraw(self._line)
-        self._one_at_a_time = threading.Lock()
+        self._lock = threading.Lock()
         self._recorded: list[Stall] = []
         self._processor_times = ""
-        self._over = threading.Event()
-        self.above = bool(self._ask()["above"])
-        self._thread = threading.Thread(target=self._ask_again_and_again, daemon=True)
+        self._stopping = threading.Event()
+        self.above = bool(self._query_all()["above"])
+        self._thread = threading.Thread(target=self._poll, daemon=True)
         self._thread.start()
 
     def report(self) -> tuple[int, list[Stall]]:
         """Return the time up to which the record is complete, and the stalls since the last report."""
-        with self._one_at_a_time:
-            reported_ns = int(self._ask()["mono_ns"])
+        with self._lock:
+            reported_ns = int(self._query_all()["mono_ns"])
             recorded, self._recorded = self._recorded, []
         return reported_ns, recorded
 
     def processor_times(self) -> str:
-        """Return the first line of the host's /proc/stat as it was told last, also where the record has ended."""
+        """Return the host's first line of /proc/stat from the last answer, even after the record has ended."""
         return self._processor_times
 
     def end(self) -> None:
-        """End the thread, and close the line."""
-        self._over.set()
+        """Stop the thread and close the line."""
+        self._stopping.set()
         self._thread.join()
         os.close(self._line)
 
-    def _ask_again_and_again(self) -> None:
-        while not self._over.wait(ASK_S):
+    def _poll(self) -> None:
+        while not self._stopping.wait(POLL_S):
             try:
-                with self._one_at_a_time:
-                    self._ask()
+                with self._lock:
+                    self._query_all()
             except ProbeEnded:
-                return  # the next report raises it, too
+                return  # the next report raises it again
 
-    def _ask(self) -> dict[str, Any]:
-        """Ask until everything is told, keep the stalls, and return the last answer, its time being this machine's."""
-        answer = self._answer()
+    def _query_all(self) -> dict[str, Any]:
+        """Query until there is no more, keep the stalls, and return the last answer in this machine's time."""
+        answer = self._query()
         while answer["more"]:
-            answer = self._answer()
+            answer = self._query()
         return answer
 
-    def _answer(self) -> dict[str, Any]:
-        said = b""
+    def _query(self) -> dict[str, Any]:
+        data = b""
         try:
             os.write(self._line, b"?")
-            while not said.endswith(b"\n"):
-                piece = os.read(self._line, 65536)
-                if not piece:
+            while not data.endswith(b"\n"):
+                chunk = os.read(self._line, 65536)
+                if not chunk:
                     raise ProbeEnded("the host's record of stalls ended")
-                said += piece
+                data += chunk
         except OSError as error:
             raise ProbeEnded(f"the host's record of stalls ended: {error}") from None
-        answer: dict[str, Any] = json.loads(said)
+        answer: dict[str, Any] = json.loads(data)
         if "ended" in answer:
             raise ProbeEnded(answer["ended"])
         self._processor_times = str(answer["processor_times"])
-        ahead_ns = clocks.ahead_ns(clocks.monotonic_reading(), (answer["counter"], answer["mono_ns"]))
+        offset_ns = clocks.offset_ns(clocks.read_monotonic_clock(), (answer["counter"], answer["mono_ns"]))
         self._recorded += [
-            Stall(processor, begin_ns + ahead_ns, end_ns + ahead_ns) for processor, begin_ns, end_ns in answer["stalls"]
+            Stall(processor, begin_ns + offset_ns, end_ns + offset_ns)
+            for processor, begin_ns, end_ns in answer["stalls"]
         ]
-        return {**answer, "mono_ns": answer["mono_ns"] + ahead_ns}
+        return {**answer, "mono_ns": answer["mono_ns"] + offset_ns}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One interface to both machines: call a function there, run a program, start one and end it."""
+"""One interface to both machines: calls functions there, and runs, starts and stops programs."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 
 P = ParamSpec("P")
 R = TypeVar("R")
-Call = Callable[..., Any]
-"""(function, *arguments, **keywords) -> what it returns on that machine."""
+RemoteCall = Callable[..., Any]
+"""(function, *arguments, **keywords) -> its return value on that machine."""
 POLL_NS = 50 * NS_PER_MS
 
 
 class MachineError(AssertionError):
-    """Something failed on a machine: what it said."""
+    """A failure on a machine, with its output."""
 
 
 @dataclass(frozen=True)
@@ -36,51 +36,53 @@ class Machine:
 
     name: str
     address: str
-    """On the network under test."""
-    _call: Call
+    """Address on the network under test."""
+    _call: RemoteCall
     interface: str = "vec0"
-    """The network under test."""
+    """Interface on the network under test."""
     python: str = sys.executable
-    _started: list[Started] = field(default_factory=list)
+    _started: list[StartedProgram] = field(default_factory=list)
 
     def call(self, function: Callable[P, R], *arguments: P.args, **keywords: P.kwargs) -> R:
-        """Call a function of a module on that machine; it, what it takes and what it gives must be picklable."""
+        """Call a function of a module on that machine; function, arguments and return value must be picklable."""
         result: R = self._call(function, *arguments, **keywords)
         return result
 
     def run(self, command: Sequence[str], *, timeout_s: float = 60) -> str:
-        """Run a program to its end; give its standard output, or raise `MachineError` with its standard error."""
+        """Run a program to completion. Return its standard output, or raise `MachineError` with its standard error."""
         code, output, errors = self.call(processes.run, list(command), timeout_s)
         if code != 0:
             raise MachineError(f"{self.name}: {' '.join(command)} ended with {code}: {errors.strip() or output}")
         return output
 
-    def start(self, command: Sequence[str], *, environment: Mapping[str, str] | None = None) -> Started:
-        """Start a program, which is ended with the test at the latest."""
-        started = Started(self, list(command), self.call(processes.start, list(command), dict(environment or {})))
+    def start(self, command: Sequence[str], *, environment: Mapping[str, str] | None = None) -> StartedProgram:
+        """Start a program; it is stopped at the end of the test at the latest."""
+        started = StartedProgram(
+            self, list(command), self.call(processes.start, list(command), dict(environment or {}))
+        )
         self._started.append(started)
         return started
 
-    def start_python(self, module: str, *arguments: str) -> Started:
-        """Start a module of Python."""
+    def start_python(self, module: str, *arguments: str) -> StartedProgram:
+        """Start a Python module."""
         return self.start([self.python, "-B", "-m", module, *arguments])
 
-    def end_all(self) -> None:
-        """End all that was started, the last one first."""
+    def stop_all(self) -> None:
+        """Stop all started programs, the last one first."""
         while self._started:
             self._started.pop().stop()
 
     def read(self, path: str | Path) -> bytes:
-        """Read a file of that machine."""
+        """Return the contents of a file of that machine."""
         return self.call(Path.read_bytes, Path(path))
 
     def write(self, path: str | Path, text: str) -> None:
-        """Write a file of that machine, in a directory made where there is none."""
+        """Write a file of that machine, and create its directory if necessary."""
         self.call(processes.write, str(path), text)
 
 
 @dataclass(frozen=True)
-class Started:
+class StartedProgram:
     """A program that was started on a machine."""
 
     machine: Machine
@@ -88,21 +90,21 @@ class Started:
     number: int
 
     def poll(self) -> int | None:
-        """Exit code, None while it runs."""
+        """Return the exit code, or None while the program runs."""
         return self.machine.call(processes.poll, self.number)
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the program runs."""
         return self.poll() is None
 
     def wait(self, timeout_s: float = 60) -> int:
-        """Wait for its end; give its exit code."""
+        """Wait until the program ends; return its exit code."""
         wait_until(f"{' '.join(self.command)} has ended", lambda: not self.running, timeout_s)
         return self.poll() or 0
 
     def stop(self, with_signal: int = signal.SIGINT, timeout_s: float = 15) -> int:
-        """Tell it to end and wait until it has; one that does not is killed."""
+        """Send a signal and wait until the program ends; kill it after the timeout. Return the exit code."""
         return self.machine.call(processes.stop, self.number, with_signal, timeout_s)
 
     @property
@@ -116,13 +118,13 @@ class Started:
         return self.machine.call(processes.output, self.number, "err")
 
     def lines(self) -> list[dict[str, Any]]:
-        """Lines of JSON on standard output so far."""
+        """Return the lines of JSON on standard output so far."""
         return [json.loads(line) for line in self.output.splitlines(keepends=True) if line.endswith("\n")]
 
     def first_line(self, timeout_s: float = 60) -> dict[str, Any]:
-        """Wait for the first line of JSON; raise `MachineError` where the program ends without one."""
+        """Wait for the first line of JSON and return it. Raise `MachineError` if the program ends without one."""
         wait_until(
-            f"{' '.join(self.command)} says something", lambda: "\n" in self.output or not self.running, timeout_s
+            f"{' '.join(self.command)} prints a line", lambda: "\n" in self.output or not self.running, timeout_s
         )
         lines = self.lines()
         if not lines:
@@ -130,43 +132,43 @@ class Started:
         return lines[0]
 
     def latest(self) -> dict[str, Any]:
-        """Newest line of JSON."""
+        """Return the newest line of JSON."""
         tail = self.machine.call(processes.tail, self.number)
         return json.loads(tail) if tail else {}
 
 
-def wait_until(what: str, holds: Callable[[], bool], timeout_s: float, every_ns: int = POLL_NS) -> None:
-    """Wait until something holds; raises `MachineError` where it does not in time."""
+def wait_until(description: str, condition: Callable[[], bool], timeout_s: float, every_ns: int = POLL_NS) -> None:
+    """Wait until a condition is true. Raise `MachineError` if it is not in time."""
     for _ in range(max(1, round(timeout_s * NS_PER_S / every_ns))):
-        if holds():
+        if condition():
             return
         pause(every_ns)
-    raise MachineError(f"waited {timeout_s:g} s in vain until {what}")
+    raise MachineError(f"timed out after {timeout_s:g} s: {description}")
 
 
 def local_machine(name: str, address: str) -> Machine:
-    """Give the machine that this runs on."""
+    """Return the machine that this code runs on."""
     return Machine(name, address, lambda function, *arguments, **keywords: function(*arguments, **keywords))
 
 
-def remote_machine(name: str, address: str, manager: str, key: bytes) -> Machine:
-    """Give the machine whose agent listens at the address `manager`; it may still be booting."""
-    found: list[Connection] = []
+def remote_machine(name: str, address: str, management_address: str, key: bytes) -> Machine:
+    """Return the machine whose agent listens at the management address; the machine may still be booting."""
+    connections: list[Connection] = []
 
-    def reached() -> bool:
+    def is_reachable() -> bool:
         with suppress(OSError):
-            found.append(Client((manager, PORT), authkey=key))
-        return bool(found)
+            connections.append(Client((management_address, PORT), authkey=key))
+        return bool(connections)
 
-    wait_until(f"the {name}'s machine has booted", reached, 120)
-    one_at_a_time = threading.Lock()
+    wait_until(f"the {name}'s machine has booted", is_reachable, 120)
+    lock = threading.Lock()
 
     def call(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-        with one_at_a_time:
-            found[0].send((function, arguments, keywords))
-            raised, result = found[0].recv()
-        if raised is not None:
-            raise MachineError(f"{name}: {raised}")
+        with lock:
+            connections[0].send((function, arguments, keywords))
+            error, result = connections[0].recv()
+        if error is not None:
+            raise MachineError(f"{name}: {error}")
         return result
 
     return Machine(name, address, call)

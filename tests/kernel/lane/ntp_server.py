@@ -1,9 +1,9 @@
-"""A small NTP server with a clock of its own, and one exchange with such a server (RFC 5905, figure 8).
+"""A small NTP server with an independent clock, and exchanges with such a server (RFC 5905, figure 8).
 
     python -m tests.kernel.lane.ntp_server ADDRESS PORT [OFFSET_NS DRIFT_PPM]
 
-With an offset its clock is that far ahead of the machine's wall clock when it starts, runs fast by the drift, and goes
-its own way then, whatever is done to the wall clock. Without, it tells the machine's wall clock.
+With an offset, its clock starts that far ahead of the machine's wall clock, runs fast by the drift, and is independent
+of the wall clock from then on. Without an offset, it serves the machine's wall clock.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import struct
 import sys
 from collections.abc import Callable
 
-from tests.kernel.lane.clocks import NS_PER_S, raw_ns, wall_less_raw_ns
+from tests.kernel.lane.clocks import NS_PER_S, read_raw_clock_ns, wall_minus_raw_ns
 
 from lavt.clock import MachineClock
 
@@ -21,30 +21,30 @@ HEADER = struct.Struct("!BBbbII4sQQQQ")
 """Leap, version and mode; stratum; poll; precision; root delay; root dispersion; reference; four time stamps."""
 FROM_CLIENT, FROM_SERVER = 0x23, 0x24
 EPOCH_S = 2_208_988_800
-"""From 1900 to 1970."""
+"""Seconds from 1900 to 1970."""
 
 Clock = Callable[[], int]
 
 
 def machine_wall_ns() -> int:
-    """Read this machine's wall clock."""
+    """Return this machine's wall clock."""
     return MachineClock().now().wall_ns
 
 
-def own_clock(offset_ns: int, drift_ppm: float) -> Clock:
-    """Make a clock that only begins with the machine's."""
-    begin_raw_ns = raw_ns()
-    begin_wall_ns = begin_raw_ns + wall_less_raw_ns() + offset_ns
+def independent_clock(offset_ns: int, drift_ppm: float) -> Clock:
+    """Return a clock that only starts from the machine's wall clock."""
+    begin_raw_ns = read_raw_clock_ns()
+    begin_wall_ns = begin_raw_ns + wall_minus_raw_ns() + offset_ns
 
     def read() -> int:
-        gone_ns = raw_ns() - begin_raw_ns
-        return begin_wall_ns + gone_ns + round(gone_ns * drift_ppm / 1e6)
+        elapsed_ns = read_raw_clock_ns() - begin_raw_ns
+        return begin_wall_ns + elapsed_ns + round(elapsed_ns * drift_ppm / 1e6)
 
     return read
 
 
 def serve(address: str, port: int, clock: Clock) -> None:
-    """Answer for ever; print a line when ready."""
+    """Answer requests for ever; print a line when ready."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind((address, port))
         print("{}", flush=True)
@@ -58,33 +58,35 @@ def serve(address: str, port: int, clock: Clock) -> None:
             server.sendto(answer, client)
 
 
-def ask(address: str, port: int, times: int = 50) -> tuple[int, int]:
-    """Exchange time stamps: (server's clock less this machine's, round trip) of the quickest exchange, in ns."""
+def query_offset(address: str, port: int, exchanges: int = 50) -> tuple[int, int]:
+    """Return the server's clock less this machine's, and the round trip, in ns, of the fastest exchange."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.settimeout(2)
         client.connect((address, port))
-        return min((_exchange(client) for _ in range(times)), key=lambda each: each[1])
+        return min((_exchange(client) for _ in range(exchanges)), key=lambda each: each[1])
 
 
 def _exchange(client: socket.socket) -> tuple[int, int]:
     sent_ns = machine_wall_ns()
     client.send(HEADER.pack(FROM_CLIENT, 0, 0, 0, 0, 0, b"", 0, 0, 0, to_ntp(sent_ns)))
     answer = client.recv(2048)
-    back_ns = machine_wall_ns()
-    there_ns, away_ns = (from_ntp(stamp) for stamp in HEADER.unpack(answer[: HEADER.size])[-2:])
-    return ((there_ns - sent_ns) + (away_ns - back_ns)) // 2, (back_ns - sent_ns) - (away_ns - there_ns)
+    returned_ns = machine_wall_ns()
+    received_ns, replied_ns = (from_ntp(stamp) for stamp in HEADER.unpack(answer[: HEADER.size])[-2:])
+    return ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2, (returned_ns - sent_ns) - (
+        replied_ns - received_ns
+    )
 
 
 def to_ntp(wall_ns: int) -> int:
-    """Write nanoseconds since 1970 as seconds since 1900 with 32 bits of fraction, in 64 bits."""
+    """Convert nanoseconds since 1970 to seconds since 1900 in 64 bits, 32 of them for the fraction."""
     return ((wall_ns << 32) // NS_PER_S + (EPOCH_S << 32)) & (2**64 - 1)
 
 
 def from_ntp(stamp: int) -> int:
-    """Read such a time stamp; half a nanosecond is lost."""
+    """Convert an NTP time stamp to nanoseconds since 1970; up to half a nanosecond is lost."""
     return ((stamp - (EPOCH_S << 32)) * NS_PER_S) >> 32
 
 
 if __name__ == "__main__":
-    own = own_clock(int(sys.argv[3]), float(sys.argv[4])) if len(sys.argv) > 3 else machine_wall_ns
-    serve(sys.argv[1], int(sys.argv[2]), own)
+    clock = independent_clock(int(sys.argv[3]), float(sys.argv[4])) if len(sys.argv) > 3 else machine_wall_ns
+    serve(sys.argv[1], int(sys.argv[2]), clock)

@@ -1,4 +1,4 @@
-"""The user-mode kernel and its tools, from Debian's packages: fetched once, unpacked, never installed."""
+"""The user-mode kernel and its tools from Debian's packages: fetched once and unpacked, not installed."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.kernel.lane import newer
-from tests.kernel.lane.rejection import Refusal
+from tests.kernel.lane.unavailable import LaneUnavailable
 
-WANTED = (
+PACKAGES = (
     "user-mode-linux",
     "kmod",
     "libkmod2",
@@ -25,21 +25,21 @@ WANTED = (
     "chrony",
     "can-utils",
 )
-LIST = "".join(f"{package}\n" for package in (*WANTED, *(f"{each}/{newer.SUITE}" for each in newer.PACKAGES)))
-"""What a directory of unpacked packages was made from."""
+PACKAGE_LIST = "".join(f"{package}\n" for package in (*PACKAGES, *(f"{each}/{newer.SUITE}" for each in newer.PACKAGES)))
+"""The packages that a directory was unpacked from."""
 PROGRAMS = ("usr/bin", "usr/sbin", "bin", "sbin")
 LIBRARIES = ("usr/lib/x86_64-linux-gnu", "lib/x86_64-linux-gnu")
 
 
-def fetched(cache: Path) -> Path:
-    """Give the directory of the unpacked packages; raises `Refusal` where they are neither there nor can be fetched."""
+def fetch_packages(cache: Path) -> Path:
+    """Return the directory of the unpacked packages. Raise `LaneUnavailable` if they cannot be fetched."""
     tools = cache / "root"
-    if (tools / "packages").is_file() and (tools / "packages").read_text() == LIST:
+    if (tools / "packages").is_file() and (tools / "packages").read_text() == PACKAGE_LIST:
         return tools
     if platform.machine() != "x86_64" or not sys.platform.startswith("linux"):
-        raise Refusal("the user-mode kernel runs on amd64 Linux only: use such a machine")
+        raise LaneUnavailable("the user-mode kernel runs on amd64 Linux only: use such a machine")
     if shutil.which("apt-get") is None or shutil.which("dpkg") is None:
-        raise Refusal("the kernel comes from Debian's packages: use Debian or Ubuntu, or a container of these")
+        raise LaneUnavailable("the kernel comes from Debian's packages: use Debian or Ubuntu, or a container of these")
     try:
         cache.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=cache) as folder:
@@ -47,66 +47,66 @@ def fetched(cache: Path) -> Path:
             shutil.rmtree(tools, ignore_errors=True)
             (Path(folder) / "root").rename(tools)
     except OSError as error:
-        raise Refusal(
-            f"{cache} cannot be written ({error.strerror}): name another directory with LAVT_KERNEL"
+        raise LaneUnavailable(
+            f"cannot write {cache} ({error.strerror}): name another directory with LAVT_KERNEL"
         ) from None
     return tools
 
 
 def program(tools: Path, name: str) -> Path:
-    """Find a program among the unpacked packages: releases of Debian differ in where it lies."""
+    """Return a program's path among the unpacked packages, which depends on Debian's release."""
     return next(path for folder in PROGRAMS if (path := tools / folder / name).is_file())
 
 
 def search_path(tools: Path, folders: Sequence[str]) -> str:
-    """Join those of the folders that the packages have, for PATH and its like."""
+    """Join the folders that exist among the unpacked packages, for variables like PATH."""
     return os.pathsep.join(str(tools / folder) for folder in folders if (tools / folder).is_dir())
 
 
 def _fetch(folder: Path) -> None:
-    """Download with the lists that this machine has or, where these do not do, with fresh ones of our own."""
-    own = folder / "apt"
-    (own / "lists" / "partial").mkdir(parents=True)
-    (own / "archives" / "partial").mkdir(parents=True)
-    patient = ("-oAPT::Sandbox::User=root", "-oAcquire::Retries=3")  # apt's own user could not write here
-    fresh = (*patient, f"-oDir::State::Lists={own / 'lists'}", f"-oDir::Cache={own}")
+    """Download with the host's package lists or, if that fails, with fresh lists in a separate directory."""
+    apt_folder = folder / "apt"
+    (apt_folder / "lists" / "partial").mkdir(parents=True)
+    (apt_folder / "archives" / "partial").mkdir(parents=True)
+    retrying = ("-oAPT::Sandbox::User=root", "-oAcquire::Retries=3")  # apt's own user cannot write here
+    fresh = (*retrying, f"-oDir::State::Lists={apt_folder / 'lists'}", f"-oDir::Cache={apt_folder}")
     print("fetching a user-mode kernel and its tools from Debian's packages, once", file=sys.stderr, flush=True)
-    said = _download(folder, patient)
-    if said:
+    error_text = _download(folder, retrying)
+    if error_text:
         _apt(folder, "apt-get", *fresh, "update")
-        said = _download(folder, fresh)
-    if said:
-        raise Refusal(
-            f"the packages cannot be fetched ({said}): connect this machine to Debian's archive and try again"
+        error_text = _download(folder, fresh)
+    if error_text:
+        raise LaneUnavailable(
+            f"cannot fetch the packages ({error_text}): connect this machine to Debian's archive and try again"
         )
     (folder / "root").mkdir()
     for package in sorted(folder.glob("*.deb")):
         subprocess.run(["dpkg", "-x", str(package), str(folder / "root")], check=True)
-    why = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh)
-    if why:
+    reason = newer.fetch(folder / "root" / newer.FOLDER, _apt, fresh)
+    if reason:
         print(
-            f"the kernel is this release's own, slower one, as {newer.SUITE}'s cannot be had ({why}); to try again: "
+            f"using this release's slower kernel, because {newer.SUITE}'s is not available ({reason}); to try again: "
             f"rm -r {folder.parent}",
             file=sys.stderr,
         )
-    (folder / "root" / "packages").write_text(LIST)
+    (folder / "root" / "packages").write_text(PACKAGE_LIST)
 
 
 def _download(folder: Path, options: Sequence[str]) -> str:
-    """Download all that is wanted; tell apt's last words where that fails."""
+    """Download all packages; return apt's last error if that fails."""
     libraries = _missing_libraries(folder, options)
-    done = _apt(folder, "apt-get", *options, "download", *WANTED, *libraries)
-    return "" if done.returncode == 0 else _last_line(done.stderr)
+    completed = _apt(folder, "apt-get", *options, "download", *PACKAGES, *libraries)
+    return "" if completed.returncode == 0 else _last_line(completed.stderr)
 
 
 def _missing_libraries(folder: Path, options: Sequence[str]) -> list[str]:
-    """List the libraries that the packages need and this machine has not installed."""
+    """Return the libraries that the packages need and that are not installed on the host."""
     depends = ("--recurse", "--important", "--no-pre-depends")
-    listed = _apt(folder, "apt-cache", *options, "depends", *depends, *WANTED).stdout
+    listed = _apt(folder, "apt-cache", *options, "depends", *depends, *PACKAGES).stdout
     libraries = set(re.findall(r"^\s*\|?Depends: (lib[^\s:]+)", listed, re.MULTILINE))
     known = _apt(folder, "dpkg-query", "-W", "-f", "${db:Status-Status} ${Package}\n").stdout.splitlines()
     installed = {line.partition(" ")[2] for line in known if line.startswith("installed ")}
-    return sorted(libraries - installed - set(WANTED))
+    return sorted(libraries - installed - set(PACKAGES))
 
 
 def _apt(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
@@ -115,6 +115,6 @@ def _apt(folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def _last_line(said: str) -> str:
-    lines = [line for line in said.splitlines() if line.startswith("E:")] or ["E: no reason given"]
+def _last_line(error_text: str) -> str:
+    lines = [line for line in error_text.splitlines() if line.startswith("E:")] or ["E: no reason given"]
     return lines[-1].removeprefix("E:").strip()

@@ -1,4 +1,4 @@
-"""Programs of one machine: what `Machine` calls there."""
+"""Programs of one machine: the functions that `Machine` calls there."""
 
 from __future__ import annotations
 
@@ -15,33 +15,37 @@ _started: dict[int, tuple[subprocess.Popen[bytes], Path]] = {}
 
 
 def run(command: list[str], timeout_s: float) -> tuple[int, str, str]:
-    """Run to the end: exit code, standard output, standard error."""
-    done = subprocess.run(
+    """Run a program to completion; return exit code, standard output and standard error."""
+    completed = subprocess.run(
         command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, check=False
     )
-    return done.returncode, done.stdout, done.stderr
+    return completed.returncode, completed.stdout, completed.stderr
 
 
 def start(command: list[str], environment: dict[str, str]) -> int:
-    """Start a program, what it says going to files; tell its number."""
+    """Start a program with its output in files; return its number."""
     folder = Path(tempfile.mkdtemp(prefix="started-"))
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env={**os.environ, **environment},
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=err,
+            env={**os.environ, **environment},
             start_new_session=True,
-        )  # fmt: skip
+        )
     number = next(_numbers)
     _started[number] = (process, folder)
     return number
 
 
 def poll(number: int) -> int | None:
-    """Exit code, None while it runs."""
+    """Return the exit code, or None while the program runs."""
     return _started[number][0].poll()
 
 
 def stop(number: int, with_signal: int, timeout_s: float) -> int:
-    """Tell a program and what it has started to end; kill what has not by then; tell the exit code."""
+    """Signal a program, kill it and its children after the timeout, and return the exit code."""
     process = _started[number][0]
     if process.poll() is None:
         process.send_signal(with_signal)
@@ -58,19 +62,19 @@ def send_signal(number: int, with_signal: int) -> None:
 
 
 def output(number: int, name: str) -> str:
-    """What the program has said on `out` or `err`."""
+    """Return the program's output so far on `out` or `err`."""
     return (_started[number][1] / name).read_text(errors="replace")
 
 
 def tail(number: int) -> str:
-    """Newest whole line of standard output; empty where there is none."""
-    with (_started[number][1] / "out").open("rb") as said:
-        said.seek(max(0, said.seek(0, os.SEEK_END) - 65536))
-        lines = said.read().decode(errors="replace").splitlines(keepends=True)
+    """Return the newest complete line of standard output, or an empty string."""
+    with (_started[number][1] / "out").open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - 65536))
+        lines = file.read().decode(errors="replace").splitlines(keepends=True)
     return next((line for line in reversed(lines) if line.endswith("\n")), "")
 
 
 def write(path: str, text: str) -> None:
-    """Write a file, in a directory made where there is none."""
+    """Write a file, and create its directory if necessary."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(text)

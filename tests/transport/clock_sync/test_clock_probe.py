@@ -22,19 +22,19 @@ TIMES = st.integers(0, LATEST_NS - 1)
 KNOWN = st.tuples(st.floats(-1e9, 1e9), st.floats(0, 1e9))
 
 
-def test_the_layout_is_that_of_the_documentation() -> None:
-    """A request is 48 bytes: magic, version, kind, sequence, t1, and zeros where the server's part will be."""
+def test_layout_of_a_request() -> None:
+    """A request is 48 bytes: magic, version, kind, sequence, t1, and zeros for the server's values."""
     assert encode_request(258, 3) == b"LC\x01\x00" + b"\0\0\x01\x02" + (3).to_bytes(8, "big") + bytes(32)
 
 
-def test_a_reply_is_no_longer_than_its_request() -> None:
-    """Nobody can make a server send more than was sent to it."""
+def test_reply_is_not_longer_than_its_request() -> None:
+    """A reply is as long as its request, so that a server cannot be used for amplification."""
     assert len(encode_reply(ProbeReply(1, 2, 3, 4, 0.25, 0.001))) == len(encode_request(1, 2)) == 48
 
 
 @given(st.integers(0, 2**32 - 1), TIMES)
-def test_a_request_comes_back(sequence: int, sent_ns: int) -> None:
-    """What is encoded as a request is decoded as the same, and is no reply."""
+def test_request_round_trip(sequence: int, sent_ns: int) -> None:
+    """A request is decoded as it was encoded, and is not a reply."""
     data = encode_request(sequence, sent_ns)
     assert decode_request(data) == (sequence, sent_ns)
     with pytest.raises(BadMessage):
@@ -42,10 +42,10 @@ def test_a_request_comes_back(sequence: int, sent_ns: int) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), TIMES, TIMES, TIMES, st.one_of(st.none(), KNOWN))
-def test_a_reply_comes_back(
+def test_reply_round_trip(
     sequence: int, sent_ns: int, one_ns: int, other_ns: int, known: tuple[float, float] | None
 ) -> None:
-    """What is encoded as a reply is decoded as the same, known correction or not, and is no request."""
+    """A reply is decoded as it was encoded, with and without a correction, and is not a request."""
     reply = ProbeReply(sequence, sent_ns, min(one_ns, other_ns), max(one_ns, other_ns), *(known or (None, None)))
     data = encode_reply(reply)
     assert decode_reply(data) == reply
@@ -62,28 +62,28 @@ BAD = {
     "another version": GOOD[:2] + b"\x02" + GOOD[3:],
     "another kind": GOOD[:3] + b"\x07" + GOOD[4:],
     "t1 before 1970": LAYOUT.pack(b"LC", 1, 1, 1, -1, 3, 4, 0.0, 0.0),
-    "t2 too late to be counted with": LAYOUT.pack(b"LC", 1, 1, 1, 2, LATEST_NS, LATEST_NS, 0.0, 0.0),
-    "answered before it came": LAYOUT.pack(b"LC", 1, 1, 1, 2, 4, 3, 0.0, 0.0),
+    "t2 out of range": LAYOUT.pack(b"LC", 1, 1, 1, 2, LATEST_NS, LATEST_NS, 0.0, 0.0),
+    "answered before it was received": LAYOUT.pack(b"LC", 1, 1, 1, 2, 4, 3, 0.0, 0.0),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_no_reply_is_rejected(case: str) -> None:
-    """Anything that is not exactly a reply of this version is refused."""
+def test_invalid_replies_are_rejected(case: str) -> None:
+    """Anything but a reply of this version is rejected."""
     with pytest.raises(BadMessage):
         decode_reply(BAD[case])
 
 
 @pytest.mark.parametrize("known", [(math.nan, 0.1), (math.inf, 0.1), (0.1, math.nan), (0.1, -1.0), (0.1, math.inf)])
-def test_a_correction_that_cannot_be_is_unknown(known: tuple[float, float]) -> None:
-    """A correction or bound that is no number, or a negative bound, leaves both unknown and the times as they are."""
+def test_invalid_correction_is_unknown(known: tuple[float, float]) -> None:
+    """A correction or bound that is not finite, or a negative bound, makes both unknown and keeps the times."""
     reply = decode_reply(LAYOUT.pack(b"LC", 1, 1, 1, 2, 3, 4, *known))
     assert reply == ProbeReply(1, 2, 3, 4, None, None)
 
 
 @given(st.binary(max_size=100) | st.binary(min_size=40, max_size=40).map(lambda data: GOOD[:8] + data))
-def test_any_bytes(data: bytes) -> None:
-    """No bytes raise anything but `BadMessage`."""
+def test_any_bytes_raise_only_bad_message(data: bytes) -> None:
+    """Decoding any bytes raises nothing but `BadMessage`."""
     for decode in (decode_request, decode_reply):
         try:
             decode(data)
@@ -92,12 +92,12 @@ def test_any_bytes(data: bytes) -> None:
 
 
 @given(st.integers(-(10**12), 10**12), st.integers(0, 10**9), st.integers(0, 10**9), st.integers(0, 10**6), TIMES)
-def test_the_truth_is_within_half_the_round_trip(
-    delta_ns: int, there_ns: int, back_ns: int, busy_ns: int, sent_ns: int
+def test_true_offset_is_within_half_the_round_trip(
+    delta_ns: int, forward_ns: int, return_ns: int, processing_ns: int, sent_ns: int
 ) -> None:
-    """However the round trip is shared between both ways, Delta is within half of it from the exchange's offset."""
-    reached_ns = sent_ns + there_ns
-    answered_ns = reached_ns + busy_ns
-    probe = ClockProbe(1, sent_ns, reached_ns + delta_ns, answered_ns + delta_ns, answered_ns + back_ns)
-    assert probe.round_trip_ns == there_ns + back_ns
+    """However asymmetric the path is, Delta is within half the round trip of the exchange's offset."""
+    received_ns = sent_ns + forward_ns
+    answered_ns = received_ns + processing_ns
+    probe = ClockProbe(1, sent_ns, received_ns + delta_ns, answered_ns + delta_ns, answered_ns + return_ns)
+    assert probe.round_trip_ns == forward_ns + return_ns
     assert abs(probe.offset_ns - delta_ns) <= probe.round_trip_ns / 2

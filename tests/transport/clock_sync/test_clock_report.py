@@ -9,10 +9,10 @@ from lavt.domain import NS_PER_S, Now
 from lavt.transport.clock_sync import clock_report
 from lavt.transport.clock_sync.clock_report import (
     ClockReport,
-    ask,
     host_addresses,
     kernel_identity,
     plain_address,
+    query_clock,
     unknown_clock,
 )
 from lavt.transport.clock_sync.persistent_process import Completed
@@ -43,13 +43,13 @@ SIX = """fe80000000000000000000fffe000002 02 40 20 80     vec0
 """Its /proc/net/if_inet6."""
 
 
-def test_kernel_identity() -> None:
-    """A kernel's identity does not change while it runs."""
+def test_kernel_identity_is_constant() -> None:
+    """A kernel's identity does not change while the kernel runs."""
     assert kernel_identity() == kernel_identity()
 
 
-def test_the_identity_is_what_the_kernel_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel's identity is the text of its boot identifier without white space, and empty where it tells none."""
+def test_kernel_identity_is_the_boot_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel's identity is its boot identifier without white space, or empty if there is none."""
     monkeypatch.setattr(clock_report, "BOOT_ID", tmp_path / "boot_id")
     assert kernel_identity() == ""
     (tmp_path / "boot_id").write_text(" 5b1c\n")
@@ -57,37 +57,37 @@ def test_the_identity_is_what_the_kernel_tells(tmp_path: Path, monkeypatch: pyte
 
 
 class SteppedClock:
-    """A clock on which the same time goes by from one reading to the next."""
+    """A clock that advances by the same time between two readings."""
 
     def __init__(self, step_ns: int) -> None:
         self._step_ns = step_ns
         self._mono_ns = 0
 
     def now(self) -> Now:
-        """Read both clocks."""
+        """Return both clocks."""
         self._mono_ns += self._step_ns
         return Now(self._mono_ns, self._mono_ns + 1)
 
 
 @pytest.mark.parametrize(("took_ns", "in_time"), [(2 * NS_PER_S, True), (2 * NS_PER_S + 1, False)])
-def test_an_answer_may_take_two_seconds(took_ns: int, *, in_time: bool) -> None:
-    """An answer within 2 s is parsed with the clocks before and after it; a later one is a missed poll."""
-    requested: list[tuple[Sequence[str], float]] = []
+def test_answer_within_two_seconds_counts(took_ns: int, *, in_time: bool) -> None:
+    """An answer within 2 s is parsed with the clocks before and after the query; a later one is a missed poll."""
+    queries: list[tuple[Sequence[str], float]] = []
 
     def run(command: Sequence[str], timeout_s: float) -> Completed:
-        requested.append((command, timeout_s))
+        queries.append((command, timeout_s))
         return Completed(0, "answer")
 
     def parse(host: str, output: str, before: Now, after: Now) -> ClockReport:
         return ClockReport(before.mono_ns, after.mono_ns, host, output)
 
-    report = ask(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
-    assert requested == [(("tool",), 2.0)]
+    report = query_clock(("tool",), SteppedClock(took_ns), run, source="chrony", absent="absent", parse=parse)
+    assert queries == [(("tool",), 2.0)]
     assert report == (ClockReport(took_ns, 2 * took_ns, kernel_identity(), "answer") if in_time else None)
 
 
-def test_addresses_of_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The host's own addresses of both families are told, networks, broadcasts and loopback are not."""
+def test_host_addresses_of_both_families(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The host's own addresses of both families are listed, without networks, broadcast addresses and loopback."""
     (tmp_path / "four").write_text(ROUTES)
     (tmp_path / "six").write_text(SIX)
     monkeypatch.setattr(clock_report, "IPV4_ROUTES", tmp_path / "four")
@@ -96,8 +96,10 @@ def test_addresses_of_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("text", ["", "garbage", "/32 host LOCAL\n", "|-- \n/32 host LOCAL\n", "z" * 32 + " 02\n"])
-def test_a_system_that_does_not_tell_its_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    """Without these files, or with anything else in them, there are no addresses."""
+def test_without_kernel_tables_there_are_no_addresses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    """Without these files, or with other contents, there are no addresses."""
     monkeypatch.setattr(clock_report, "IPV4_ROUTES", tmp_path / "none")
     monkeypatch.setattr(clock_report, "IPV6_ADDRESSES", tmp_path / "none")
     assert host_addresses() == ()
@@ -105,17 +107,16 @@ def test_a_system_that_does_not_tell_its_addresses(tmp_path: Path, monkeypatch: 
     assert host_addresses() == ()
 
 
-def test_addresses_are_compared_as_numbers() -> None:
-    """Two ways of writing an address are one; what is no address is none."""
+def test_addresses_have_a_canonical_form() -> None:
+    """Two spellings of an address have the same canonical form; other text has none."""
     assert plain_address("FD09:0:0::1") == plain_address("fd09::1") == "fd09::1"
     assert plain_address("gps") == plain_address("") == ""
 
 
-def test_a_source_that_cannot_tell() -> None:
-    """Its report has the reading of the clocks and the reason, and neither correction nor bound."""
+def test_unknown_clock_has_a_reason_and_no_correction() -> None:
+    """The report of an unknown clock has the clock readings and the reason, and neither correction nor bound."""
     report = unknown_clock(Now(1, 2), "kernel", "chrony", "chrony is not installed")
     assert (report.mono_ns, report.wall_ns, report.status) == (1, 2, "chrony is not installed")
     assert (report.correction_s, report.bound_s) == (None, None)
-    assert report == ClockReport(
-        1, 2, "kernel", "chrony", status="chrony is not installed", addresses=host_addresses()
-    )  # fmt: skip
+    status = "chrony is not installed"
+    assert report == ClockReport(1, 2, "kernel", "chrony", status=status, addresses=host_addresses())

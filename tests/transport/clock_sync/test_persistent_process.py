@@ -19,8 +19,8 @@ def shell() -> Iterator[Shell]:
         yield opened
 
 
-def test_programs_are_run_one_after_the_other_by_one_process(shell: Shell) -> None:
-    """Each program's output and exit code come back, what it says on standard error does not, and the shell stays."""
+def test_one_shell_runs_all_programs(shell: Shell) -> None:
+    """One persistent shell returns each program's output and exit code, without its standard error."""
     assert shell.run(["sh", "-c", "echo one; echo two >&2; echo three; exit 3"], 10) == Completed(3, "one\nthree\n")
     assert shell.run(["printf", "no end of line"], 10) == Completed(0, "no end of line")
     parents = {shell.run(["sh", "-c", "echo $PPID"], 10) for _ in range(2)}
@@ -28,38 +28,38 @@ def test_programs_are_run_one_after_the_other_by_one_process(shell: Shell) -> No
     assert parents != {Completed(0, f"{os.getpid()}\n")}
 
 
-def test_a_program_that_is_not_there(shell: Shell) -> None:
-    """A program that is not installed has the exit code by which shells say so."""
+def test_missing_program_has_exit_code_127(shell: Shell) -> None:
+    """A program that is not installed has exit code 127, as in any shell."""
     assert shell.run(["no-such-program-of-ours"], 10) == Completed(NOT_FOUND, "")
 
 
-def test_words_are_words(shell: Shell) -> None:
-    """What means something to a shell means nothing in an argument."""
-    ended = shell.run(["printf", "%s|", "$HOME; echo 'x'", "a b", "*"], 10)
-    assert ended == Completed(0, "$HOME; echo 'x'|a b|*|")
+def test_arguments_are_quoted(shell: Shell) -> None:
+    """Shell syntax in an argument has no effect."""
+    completed = shell.run(["printf", "%s|", "$HOME; echo 'x'", "a b", "*"], 10)
+    assert completed == Completed(0, "$HOME; echo 'x'|a b|*|")
 
 
-def test_one_that_takes_too_long_is_given_up_and_the_next_is_not_disturbed(shell: Shell) -> None:
-    """An answer that does not come in time is none, and is not taken for the answer of the next program."""
+def test_timeout_does_not_disturb_the_next_program(shell: Shell) -> None:
+    """A program that exceeds its timeout has no result, and its output is not taken for the next program's."""
     assert shell.run(["sh", "-c", "sleep 10; echo late"], 0.05) is None
     assert shell.run(["echo", "next"], 10) == Completed(0, "next\n")
 
 
-def test_the_limit_holds_and_what_took_too_long_is_ended(shell: Shell, tmp_path: Path) -> None:
-    """Who asks is not held up until a program ends that takes longer than it may, and the program does not go on."""
-    os.mkfifo(tmp_path / "said")
-    with os.fdopen(os.open(tmp_path / "said", os.O_RDONLY | os.O_NONBLOCK)) as said:
-        os.set_blocking(said.fileno(), True)
+def test_program_is_killed_at_the_timeout(shell: Shell, tmp_path: Path) -> None:
+    """At the timeout the caller continues, and the program is killed."""
+    os.mkfifo(tmp_path / "fifo")
+    with os.fdopen(os.open(tmp_path / "fifo", os.O_RDONLY | os.O_NONBLOCK)) as fifo:
+        os.set_blocking(fifo.fileno(), True)
         began_ns = MachineClock().now().mono_ns
-        assert shell.run(["sh", "-c", 'exec > "$0"; echo begun; exec sleep 60', str(tmp_path / "said")], 1.0) is None
-        assert said.read() == "begun\n"  # to the end, which comes when nobody can write any more
+        assert shell.run(["sh", "-c", 'exec > "$0"; echo begun; exec sleep 60', str(tmp_path / "fifo")], 1.0) is None
+        assert fifo.read() == "begun\n"  # to the end of file, which comes when no writer is left
         assert MachineClock().now().mono_ns - began_ns < 30 * NS_PER_S
 
 
-def test_a_shell_that_was_killed_is_replaced(shell: Shell) -> None:
-    """Where the shell has died the question has no answer, and the next one has."""
-    ended = shell.run(["sh", "-c", "echo $PPID"], 10)
-    assert ended is not None
-    os.kill(int(ended.output), signal.SIGKILL)
+def test_killed_shell_is_replaced(shell: Shell) -> None:
+    """If the shell has died one command has no result, and the next command starts a new shell."""
+    completed = shell.run(["sh", "-c", "echo $PPID"], 10)
+    assert completed is not None
+    os.kill(int(completed.output), signal.SIGKILL)
     assert shell.run(["echo", "lost"], 10) is None
     assert shell.run(["echo", "next"], 10) == Completed(0, "next\n")

@@ -36,7 +36,7 @@ sending: GET TIME_STATUS_NP
 \t\tgmPresent                  true
 \t\tgmIdentity                 a6bb40.fffe.382888
 """
-"""pmc 3.1.1 of a ptp4l with software time stamps that hears a master."""
+"""Output of pmc 3.1.1 for a ptp4l with software time stamps that receives a master."""
 MASTER = """\ta6bb40.fffe.382888-1 seq 0 RESPONSE MANAGEMENT PORT_DATA_SET
 \t\tportIdentity            a6bb40.fffe.382888-1
 \t\tportState               MASTER
@@ -49,17 +49,17 @@ MASTER = """\ta6bb40.fffe.382888-1 seq 0 RESPONSE MANAGEMENT PORT_DATA_SET
 \t\tgmPresent                  false
 \t\tgmIdentity                 a6bb40.fffe.382888
 """
-"""That of its master."""
-NOBODY = "sending: GET PORT_DATA_SET\nsending: GET CURRENT_DATA_SET\nsending: GET TIME_STATUS_NP\n"
-"""Where no ptp4l runs; pmc ends with 0 all the same."""
+"""Output for its master."""
+NO_PTP4L = "sending: GET PORT_DATA_SET\nsending: GET CURRENT_DATA_SET\nsending: GET TIME_STATUS_NP\n"
+"""Output without a ptp4l; pmc exits with 0 even so."""
 
 
 def parsed(answer: str) -> ClockReport:
     return parse_ptp("host", answer, Now(0, 10**18), Now(120_000_000, 10**18 + 120_000_000))
 
 
-def test_correction_and_bound() -> None:
-    """The correction is the negative of the offset from the master, the bound the mean path delay of each step."""
+def test_correction_and_bound_of_a_slave() -> None:
+    """The correction is the negative of the offset from the master; the bound is the mean path delay per step."""
     report = parsed(SLAVE)
     assert (report.source, report.correction_s, report.bound_s) == ("ptp", -512e-9, 2304e-9)
     assert report.follows == "a6bb40.fffe.382888"
@@ -67,8 +67,8 @@ def test_correction_and_bound() -> None:
     assert parsed(SLAVE.replace("stepsRemoved     1", "stepsRemoved     3")).bound_s == pytest.approx(3 * 2304e-9)
 
 
-def test_a_master_is_the_reference() -> None:
-    """The clock of a grandmaster that is master on a port has correction 0 with bound 0."""
+def test_grandmaster_has_zero_correction() -> None:
+    """A grandmaster that is master on a port has correction 0 with bound 0."""
     report = parsed(MASTER)
     assert (report.correction_s, report.bound_s, report.follows) == (0.0, 0.0, "a6bb40.fffe.382888")
 
@@ -83,28 +83,28 @@ def test_a_master_is_the_reference() -> None:
         SLAVE.replace("true", "perhaps"),
     ],
 )
-def test_neither_master_nor_slave(answer: str) -> None:
-    """A ptp4l that has not measured its path to a master, and is none, knows nothing."""
+def test_unsynchronised_ptp4l_has_no_correction(answer: str) -> None:
+    """A ptp4l that is not a master and has not measured a path to one has no correction."""
     report = parsed(answer)
     assert (report.correction_s, report.bound_s, report.status) == (None, None, NO_MASTER)
 
 
-@pytest.mark.parametrize("answer", ["", NOBODY, "gmPresent true", "\x00"])
-def test_not_running(answer: str) -> None:
-    """An answer without the data sets is that of a ptp4l that does not run."""
+@pytest.mark.parametrize("answer", ["", NO_PTP4L, "gmPresent true", "\x00"])
+def test_ptp4l_not_running(answer: str) -> None:
+    """An answer without the data sets means that ptp4l does not run."""
     assert parsed(answer).status == NOT_RUNNING
 
 
 @given(st.lists(st.tuples(st.sampled_from(SLAVE.split()), st.text(max_size=8)), max_size=20))
-def test_any_answer(rows: list[tuple[str, str]]) -> None:
-    """No answer raises, and a bound that is given is finite and not negative."""
+def test_any_answer_is_parsed(rows: list[tuple[str, str]]) -> None:
+    """No answer raises, and a bound is finite and not negative."""
     report = parsed("\n".join(f"{name} {value}" for name, value in rows) + "\ngmIdentity x\ngmPresent true\n")
     assert report.correction_s is None or math.isfinite(report.correction_s)
     assert report.bound_s is None or 0 <= report.bound_s < math.inf
 
 
-def test_no_linuxptp() -> None:
-    """Where pmc is not installed, the report says so and has no correction."""
+def test_linuxptp_not_installed() -> None:
+    """If pmc is not installed, the report says so and has no correction."""
     report = read_ptp(MachineClock(), lambda _command, _timeout_s: Completed(NOT_FOUND, ""))
     assert report is not None
     assert (report.source, report.status, report.correction_s) == ("ptp", ABSENT, None)

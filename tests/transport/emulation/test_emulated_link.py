@@ -13,48 +13,48 @@ from numpy.typing import NDArray
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.impairment import DISTRIBUTIONS, Distribution, Impairment
-from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injected
+from lavt.transport.emulation.link import HEADER_BYTES, EmulatedLink, LinkInjection, check_injection
 from lavt.transport.emulation.random_process import LARGEST, quantiles
 from lavt.transport.emulation.trace import Trace, parse_delays, parse_mahimahi
 
 MS = NS_PER_MS
 COUNT = 40_000
 SLOW_NS = NS_PER_S
-"""So far apart no packet of these tests waits for another."""
+"""Packets this far apart never wait for each other in these tests."""
 TABLES = Path("/usr/lib/x86_64-linux-gnu/tc")
 
 
 def link(
-    law: Impairment, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any
+    impairment: Impairment, *, seed: int = 1, name: str = "video", trace: Trace | None = None, **keys: Any
 ) -> EmulatedLink:
-    return EmulatedLink(LinkInjection(law, seed, name, trace, **keys))
+    return EmulatedLink(LinkInjection(impairment, seed, name, trace, **keys))
 
 
 def times(
     made: EmulatedLink, *, count: int = COUNT, period_ns: int = SLOW_NS, size_bytes: int = 1000
 ) -> list[int | None]:
-    """For how long each packet of a steady flow was held; None: it was lost."""
-    left = [made.leaves_ns(number * period_ns, 0, size_bytes) for number in range(count)]
+    """Return the delay of each packet of a steady flow; None: it was lost."""
+    left = [made.departure_ns(number * period_ns, 0, size_bytes) for number in range(count)]
     return [None if each is None else each - number * period_ns for number, each in enumerate(left)]
 
 
-def held_ms(made: EmulatedLink, **keys: Any) -> NDArray[np.float64]:
-    """The same in milliseconds, where nothing is lost."""
+def delays_ms(made: EmulatedLink, **keys: Any) -> NDArray[np.float64]:
+    """Return the delays in milliseconds of the packets that were not lost."""
     return np.array([each for each in times(made, **keys) if each is not None]) / MS
 
 
-def test_nothing() -> None:
-    """Without a law a packet leaves when it comes, after the delay that is there anyway; a constant is exact."""
+def test_no_impairment_adds_no_delay() -> None:
+    """Without an impairment only the inherent delay counts, and a constant delay is exact."""
     assert set(times(link(Impairment()), count=1000)) == {0}
-    assert link(Impairment()).leaves_ns(5, 7, 1000) == 12
+    assert link(Impairment()).departure_ns(5, 7, 1000) == 12
     assert set(times(link(Impairment(delay_ms=0.25)), count=1000)) == {250_000}
 
 
 @pytest.mark.parametrize("loss", [0.01, 0.1, 0.5])
-def test_share_of_losses(loss: float) -> None:
-    """Of many packets the share that was asked for is lost, each by itself, within four standard deviations."""
+def test_losses_are_independent_with_the_requested_share(loss: float) -> None:
+    """The requested share of packets is lost, each independently, within four standard deviations."""
     made = link(Impairment(loss=loss))
     lost = np.array([each is None for each in times(made)])
     assert lost.mean() == pytest.approx(loss, abs=4 * (loss * (1 - loss) / COUNT) ** 0.5)
@@ -64,8 +64,8 @@ def test_share_of_losses(loss: float) -> None:
 
 
 @pytest.mark.parametrize("burst", [0.0, 5.0])
-def test_more_loss_takes_what_less_loss_took(burst: float) -> None:
-    """With the same seed every packet that is lost at 1 % is lost at 5 %, and those at 10 %, in bursts or not."""
+def test_higher_loss_includes_the_losses_of_lower_loss(burst: float) -> None:
+    """With the same seed every packet lost at 1 % is lost at 5 %, and those at 10 %, with and without bursts."""
     shares = [0.01, 0.05, 0.1]
     lost = [
         np.array([each is None for each in times(link(Impairment(loss=share, loss_burst_packets=burst)))])
@@ -75,23 +75,23 @@ def test_more_loss_takes_what_less_loss_took(burst: float) -> None:
     assert [int((less & ~more).sum()) for less, more in itertools.pairwise(lost)] == [0, 0]
 
 
-def runs_of(lost: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Lengths of the bursts."""
+def burst_lengths(lost: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the lengths of the bursts."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], lost, [False])).astype(np.int8)))
     return edges[1::2] - edges[::2]
 
 
 @pytest.mark.parametrize(("loss", "burst"), [(0.02, 5.0), (0.1, 5.0), (0.1, 2.0), (0.3, 20.0)])
-def test_bursts(loss: float, burst: float) -> None:
-    """Lost in bursts, the share and the mean length are those asked for; lengths are geometric."""
+def test_bursts_have_the_requested_share_and_mean_length(loss: float, burst: float) -> None:
+    """With burst loss the share and the mean length are as requested, and lengths are geometrically distributed."""
     lost = np.array(
         [each is None for each in times(link(Impairment(loss=loss, loss_burst_packets=burst)), count=5 * COUNT)]
     )
-    lengths = runs_of(lost)
+    lengths = burst_lengths(lost)
     deviation = (burst * (burst - 1)) ** 0.5
     assert lengths.mean() == pytest.approx(burst, abs=4 * deviation / len(lengths) ** 0.5)
     assert lengths.std() == pytest.approx(deviation, rel=0.15)
-    # the variance of a share whose correlation decays by 1 - begins - ends from packet to packet
+    # The variance of a share whose correlation decays by 1 - begins - ends from packet to packet.
     memory = 1 - 1 / burst - loss / burst / (1 - loss)
     variance = loss * (1 - loss) / len(lost) * (1 + memory) / (1 - memory)
     assert lost.mean() == pytest.approx(loss, abs=4 * variance**0.5)
@@ -103,13 +103,13 @@ DEVIATIONS = {
     "pareto": (-0.0335, 0.8197),
     "paretonormal": (-0.0253, 0.8339),
 }
-"""Mean and standard deviation of tc's tables (iproute2 6.1), in those that were asked for; uniform: half widths."""
+"""Mean and standard deviation of tc's tables (iproute2 6.1) for a requested deviation of 1; uniform: half width 1."""
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
-def test_jitter(distribution: Distribution) -> None:
-    """Packets far apart have delays around the constant, with the mean and deviation of netem's distribution."""
-    delays = (held_ms(link(Impairment(delay_ms=100, jitter_ms=10, jitter_distribution=distribution))) - 100) / 10
+def test_jitter_has_the_distribution_of_netem(distribution: Distribution) -> None:
+    """The delays of packets far apart have the mean and deviation of netem's distribution."""
+    delays = (delays_ms(link(Impairment(delay_ms=100, jitter_ms=10, jitter_distribution=distribution))) - 100) / 10
     mean, deviation = DEVIATIONS[distribution]
     assert delays.mean() == pytest.approx(mean, abs=4 * deviation / COUNT**0.5 + 5e-4)
     assert delays.std() == pytest.approx(deviation, rel=0.03)
@@ -119,205 +119,207 @@ def test_jitter(distribution: Distribution) -> None:
 
 @pytest.mark.skipif(not (TABLES / "pareto.dist").is_file(), reason="tc's tables are not installed")
 @pytest.mark.parametrize("distribution", ["normal", "pareto", "paretonormal"])
-def test_tables_are_those_of_tc(distribution: Distribution) -> None:
-    """The distributions are tc's own tables: to a hundredth of a deviation, but for a hundredth of the quantiles."""
-    words = [line for line in (TABLES / f"{distribution}.dist").read_text().splitlines() if not line.startswith("#")]
-    theirs = np.sort([int(word) / 8192 for line in words for word in line.split()])
-    assert np.quantile(np.abs(np.sort(quantiles(distribution)) - theirs), 0.99) < 0.01
+def test_distributions_match_the_tables_of_tc(distribution: Distribution) -> None:
+    """99 % of the quantiles of each distribution are within a hundredth of a deviation of tc's tables."""
+    lines = [line for line in (TABLES / f"{distribution}.dist").read_text().splitlines() if not line.startswith("#")]
+    tc_values = np.sort([int(number) / 8192 for line in lines for number in line.split()])
+    assert np.quantile(np.abs(np.sort(quantiles(distribution)) - tc_values), 0.99) < 0.01
 
 
-def test_correlated_jitter() -> None:
-    """Correlated jitter has the deviation asked for, and the correlation with itself 20 ms before, 40 ms before, ..."""
-    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
-    delays = held_ms(link(law), count=5 * COUNT, period_ns=20 * MS) - 1000
+def test_jitter_correlation_decays_as_requested() -> None:
+    """Correlated jitter has the requested deviation, and the requested correlation for each lag of 20 ms."""
+    impairment = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    delays = delays_ms(link(impairment), count=5 * COUNT, period_ns=20 * MS) - 1000
     assert delays.std() == pytest.approx(1, rel=0.03)
     for steps in (1, 2, 3):
-        found = float(np.corrcoef(delays[:-steps], delays[steps:])[0, 1])
-        assert found == pytest.approx(0.8**steps, abs=0.02)
+        correlation = float(np.corrcoef(delays[:-steps], delays[steps:])[0, 1])
+        assert correlation == pytest.approx(0.8**steps, abs=0.02)
 
 
-def test_correlated_jitter_goes_by_time() -> None:
-    """Within 20 ms the delay stays; how many packets come does not change how it goes on."""
-    law = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
-    many = held_ms(link(law), count=1000, period_ns=4 * MS)
-    few = held_ms(link(law), count=200, period_ns=20 * MS)
+def test_correlated_jitter_changes_with_time_not_packets() -> None:
+    """Correlated jitter is constant for 20 ms, and the packet rate does not change it."""
+    impairment = Impairment(delay_ms=1000, jitter_ms=1, jitter_correlation=0.8)
+    many = delays_ms(link(impairment), count=1000, period_ns=4 * MS)
+    few = delays_ms(link(impairment), count=200, period_ns=20 * MS)
     assert (many.reshape(200, 5)[:, 0] == few).all()
     assert (np.ptp(many.reshape(200, 5), axis=1) == 0).all()
 
 
-def test_jitter_beyond_the_delay() -> None:
-    """No delay is below zero: what jitter would take away from more than there is, inherent delay included, is cut."""
+def test_negative_delays_are_cut_off() -> None:
+    """A delay that jitter would make negative is cut off at 0; the inherent delay counts as delay."""
     made = link(Impairment(jitter_ms=10))
-    delays = held_ms(made)
+    delays = delays_ms(made)
     assert delays.min() == 0
     assert (delays == 0).mean() == pytest.approx(0.5, abs=0.01)
-    above = link(Impairment(jitter_ms=10))
-    left = [above.leaves_ns(number * SLOW_NS, 50 * MS, 0) for number in range(1000)]
+    inherent = link(Impairment(jitter_ms=10))
+    left = [inherent.departure_ns(number * SLOW_NS, 50 * MS, 0) for number in range(1000)]
     assert [each and each - number * SLOW_NS > 10 * MS for number, each in enumerate(left)] == [True] * 1000
 
 
-def test_rate() -> None:
-    """Packets that come at once leave one after the other, headers counted; a link that is not full adds one packet."""
+def test_rate_serialises_packets() -> None:
+    """A burst leaves one packet after the other, headers included; an idle link adds the time of one packet."""
     made = link(Impairment(delay_ms=5, rate_bps=2_000_000))
     takes_ns = round(8 * (1000 + HEADER_BYTES) * NS_PER_S / 2_000_000)
-    assert [made.leaves_ns(0, 0, 1000) for _ in range(4)] == [5 * MS + takes_ns * (number + 1) for number in range(4)]
+    assert [made.departure_ns(0, 0, 1000) for _ in range(4)] == [
+        5 * MS + takes_ns * (number + 1) for number in range(4)
+    ]
     assert set(times(link(Impairment(rate_bps=2_000_000)), count=100)) == {takes_ns}
 
 
-def test_throughput() -> None:
-    """Through a link that is too slow comes what its rate lets through, however much is sent."""
+def test_throughput_is_the_rate() -> None:
+    """An overloaded link passes exactly its rate."""
     made = link(Impairment(rate_bps=1_000_000), queue_packets=20)
-    left = [each for each in (made.leaves_ns(number * MS, 0, 958) for number in range(20_000)) if each is not None]
+    left = [each for each in (made.departure_ns(number * MS, 0, 958) for number in range(20_000)) if each is not None]
     assert 8000 * (len(left) - 1) / ((left[-1] - left[0]) / NS_PER_S) == pytest.approx(1_000_000, rel=1e-6)
     assert made.dropped == 20_000 - len(left) > 0
 
 
-def test_full_queue() -> None:
-    """A queue with room for three holds three, the one being sent among them; the next is dropped and counted."""
+def test_full_queue_drops_packets() -> None:
+    """A queue for three packets, including the one being sent, drops and counts the fourth."""
     made = link(Impairment(rate_bps=8000), queue_packets=3)  # 1 s for 1000 bytes
     size_bytes = 1000 - HEADER_BYTES
-    assert [made.leaves_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
-    assert made.leaves_ns(NS_PER_S, 0, size_bytes) == 4 * NS_PER_S
-    assert made.leaves_ns(NS_PER_S, 0, size_bytes) is None
+    assert [made.departure_ns(0, 0, size_bytes) for _ in range(5)] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S, None, None]
+    assert made.departure_ns(NS_PER_S, 0, size_bytes) == 4 * NS_PER_S
+    assert made.departure_ns(NS_PER_S, 0, size_bytes) is None
     assert made.counts == {"packets": 7, "lost": 0, "dropped": 3, "overtook": 0}
 
 
-def test_the_queue_is_behind_the_delay() -> None:
-    """What is still under way to the queue takes no room in it."""
+def test_delayed_packets_are_not_in_the_queue() -> None:
+    """A packet whose delay has not passed takes no room in the queue."""
     made = link(Impairment(delay_ms=5000, rate_bps=8000), queue_packets=1)
-    left = [made.leaves_ns(number * NS_PER_S, 0, 1000 - HEADER_BYTES) for number in range(5)]
+    left = [made.departure_ns(number * NS_PER_S, 0, 1000 - HEADER_BYTES) for number in range(5)]
     assert left == [(6 + number) * NS_PER_S for number in range(5)]
 
 
 @pytest.mark.parametrize("reorder", [0.05, 0.25])
-def test_share_that_overtakes(reorder: float) -> None:
-    """The share asked for is not delayed, and overtakes where others are under way; the rest keep their order."""
+def test_requested_share_is_reordered(reorder: float) -> None:
+    """The requested share is not delayed and overtakes packets that are; the others keep their order."""
     made = link(Impairment(delay_ms=75, reorder=reorder))
-    held = held_ms(made, period_ns=3 * MS)
-    early = held == 0
-    assert set(held) == {0.0, 75.0}
-    assert early.mean() == pytest.approx(reorder, abs=4 * (reorder * (1 - reorder) / COUNT) ** 0.5)
-    # it overtakes unless none of the 24 before it was delayed
-    assert made.overtook == pytest.approx(early.sum(), abs=1)
+    delays = delays_ms(made, period_ns=3 * MS)
+    not_delayed = delays == 0
+    assert set(delays) == {0.0, 75.0}
+    assert not_delayed.mean() == pytest.approx(reorder, abs=4 * (reorder * (1 - reorder) / COUNT) ** 0.5)
+    # A packet overtakes unless none of the 24 before it was delayed.
+    assert made.overtook == pytest.approx(not_delayed.sum(), abs=1)
     alone = link(Impairment(delay_ms=75, reorder=reorder))
-    held_ms(alone)
+    delays_ms(alone)
     assert alone.overtook == 0
 
 
-def test_capacity_by_hand() -> None:
-    """Opportunities are used up byte by byte: by a large packet several, by small ones one; unused ones are gone."""
+def test_capacity_is_used_byte_by_byte() -> None:
+    """A large packet uses several opportunities, small packets share one, and unused ones pass."""
     trace = parse_mahimahi("10\n20\n20\n30\n", "t")
     made = link(Impairment(), trace=trace)
 
     def send(at_ms: float, size_bytes: int) -> float:
-        left_ns = made.leaves_ns(round(at_ms * MS), 0, size_bytes - HEADER_BYTES)
+        left_ns = made.departure_ns(round(at_ms * MS), 0, size_bytes - HEADER_BYTES)
         assert left_ns is not None
         return left_ns / MS
 
     assert send(0, 1000) == 10
-    assert send(0, 500) == 10  # the rest of the first
+    assert send(0, 500) == 10  # the rest of the first opportunity
     assert send(0, 1) == 20
     assert send(5, 1499) == 20
-    assert send(5, 1501) == 30  # the second of 20 ms, and a byte of the next
-    assert send(30, 1499) == 30  # what that has left, at the last moment
-    assert send(31, 100) == 40  # 10 ms of the next lap
-    assert send(75, 100) == 80  # the opportunities in between have passed unused
+    assert send(5, 1501) == 30  # the second at 20 ms, and one byte of the next
+    assert send(30, 1499) == 30  # the rest of that, at the last moment
+    assert send(31, 100) == 40  # 10 ms into the second repetition
+    assert send(75, 100) == 80  # the opportunities in between passed unused
     assert send(75, 3000) == 90  # 1400 at 80, 1500 at 80, 100 at 90
 
 
-def test_capacity_counts_from_the_beginning_of_the_link() -> None:
-    """A trace begins when its link does, and follows the delay."""
+def test_trace_begins_with_the_link() -> None:
+    """A trace begins with its link, and applies after the delay."""
     made = EmulatedLink(
         LinkInjection(Impairment(delay_ms=3), 1, "video", parse_mahimahi("10\n", "t")), start_ns=500 * MS
     )
-    assert made.leaves_ns(500 * MS, 0, 100) == 510 * MS
-    assert made.leaves_ns(508 * MS, 0, 100) == 520 * MS
+    assert made.departure_ns(500 * MS, 0, 100) == 510 * MS
+    assert made.departure_ns(508 * MS, 0, 100) == 520 * MS
 
 
-def test_a_full_queue_of_capacity() -> None:
-    """The queue in front of a capacity has a bound, too."""
+def test_queue_of_a_capacity_is_limited() -> None:
+    """The queue in front of a capacity is limited, too."""
     made = link(Impairment(), trace=parse_mahimahi("10\n", "t"), queue_packets=2)
     size_bytes = 1500 - HEADER_BYTES
-    assert [made.leaves_ns(0, 0, size_bytes) for _ in range(3)] == [10 * MS, 20 * MS, None]
-    assert made.leaves_ns(10 * MS, 0, size_bytes) == 30 * MS
+    assert [made.departure_ns(0, 0, size_bytes) for _ in range(3)] == [10 * MS, 20 * MS, None]
+    assert made.departure_ns(10 * MS, 0, size_bytes) == 30 * MS
 
 
-def test_delays_by_hand() -> None:
-    """A trace of delay comes on top of the constant; a delay that falls faster than time goes lets nothing overtake."""
+def test_trace_delay_is_added_and_keeps_order() -> None:
+    """A delay trace is added to the constant; even if it falls faster than time passes, packets keep their order."""
     trace = parse_delays("time_s,delay_ms\n0,0\n1,100\n1.05,0\n2,0\n", "t")
     made = link(Impairment(delay_ms=20), trace=trace)
-    left = [made.leaves_ns(at_ms * MS, 0, 100) for at_ms in (0, 500, 1000, 1025, 1050, 1100, 1500, 2500)]
+    left = [made.departure_ns(at_ms * MS, 0, 100) for at_ms in (0, 500, 1000, 1025, 1050, 1100, 1500, 2500)]
     assert [each and each / MS for each in left] == [20, 570, 1120, 1120, 1120, 1120, 1520, 2570]
 
 
-LAWS: dict[str, dict[str, Any]] = {
+IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "loss": {"loss": 0.1},
     "bursts": {"loss": 0.1, "loss_burst_packets": 5.0},
     "reorder": {"reorder": 0.2},
     "jitter": {"jitter_ms": 5.0},
-    "wander": {"jitter_ms": 5.0, "jitter_correlation": 0.9},
+    "correlated": {"jitter_ms": 5.0, "jitter_correlation": 0.9},
     "rate": {"rate_bps": 2_000_000},
 }
 
 
 @given(
-    st.lists(st.sampled_from(sorted(set(LAWS) - {"reorder"})), max_size=3, unique=True),
+    st.lists(st.sampled_from(sorted(set(IMPAIRMENTS) - {"reorder"})), max_size=3, unique=True),
     st.lists(st.tuples(st.integers(0, 30 * MS), st.integers(0, 20 * MS), st.integers(0, 1500)), max_size=60),
 )
-def test_order_is_kept(names: list[str], packets: list[tuple[int, int, int]]) -> None:
-    """Nothing overtakes but by `reorder`, and nothing leaves before it came, whatever else is asked for."""
-    made = link(Impairment(delay_ms=10, **{key: value for name in names for key, value in LAWS[name].items()}))
+def test_order_is_kept_without_reordering(names: list[str], packets: list[tuple[int, int, int]]) -> None:
+    """Without `reorder` no packet overtakes another or leaves before it arrived, whatever the other impairments."""
+    made = link(Impairment(delay_ms=10, **{key: value for name in names for key, value in IMPAIRMENTS[name].items()}))
     now_ns, last_ns = 0, 0
     for pause_ns, inherent_ns, size_bytes in packets:
         now_ns += pause_ns
-        left_ns = made.leaves_ns(now_ns, inherent_ns, size_bytes)
+        left_ns = made.departure_ns(now_ns, inherent_ns, size_bytes)
         if left_ns is not None:
             assert left_ns >= max(now_ns, last_ns)
             last_ns = left_ns
     assert made.overtook == 0
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_it_repeats(name: str) -> None:
-    """One seed gives the same to the nanosecond; another seed or flow gives something else where there is chance."""
-    law = Impairment(delay_ms=75, **LAWS[name])
-    first = times(link(law), count=2000)
-    assert times(link(law), count=2000) == first
-    for other in (link(law, seed=2), link(law, name="control")):
+@pytest.mark.parametrize("name", IMPAIRMENTS)
+def test_same_seed_repeats(name: str) -> None:
+    """The same seed gives identical times; another seed or flow name gives others, unless nothing is random."""
+    impairment = Impairment(delay_ms=75, **IMPAIRMENTS[name])
+    first = times(link(impairment), count=2000)
+    assert times(link(impairment), count=2000) == first
+    for other in (link(impairment, seed=2), link(impairment, name="control")):
         assert (times(other, count=2000) == first) == (name == "rate")
 
 
-@pytest.mark.parametrize("name", ["jitter", "wander"])
+@pytest.mark.parametrize("name", ["jitter", "correlated"])
 @pytest.mark.parametrize("added", ["loss", "bursts", "reorder"])
-def test_runs_stay_paired(name: str, added: str) -> None:
-    """A law more leaves the delays of the packets that it does not concern as they were."""
-    law = Impairment(delay_ms=75, **LAWS[name])
-    alone = times(link(law), count=2000)
-    both = times(link(replace(law, **LAWS[added])), count=2000)
+def test_added_impairment_keeps_other_delays(name: str, added: str) -> None:
+    """An added impairment does not change the delays of the packets that it does not affect."""
+    impairment = Impairment(delay_ms=75, **IMPAIRMENTS[name])
+    alone = times(link(impairment), count=2000)
+    both = times(link(replace(impairment, **IMPAIRMENTS[added])), count=2000)
     assert sum(each in (None, 0) for each in both) > 50
     assert all(each in (None, 0, before) for before, each in zip(alone, both, strict=True))
 
 
-def test_more_loss_takes_more() -> None:
-    """With more loss the packets that were lost with less are lost again, and others."""
-    little, much = (np.array(times(link(Impairment(loss=loss)), count=5000)) == None for loss in (0.01, 0.05))  # noqa: E711
-    assert not (little & ~much).any()
-    assert much.sum() > little.sum() > 0
+def test_higher_loss_loses_more_packets() -> None:
+    """A higher loss loses the packets of a lower loss again, and others."""
+    few_lost, many_lost = (np.array(times(link(Impairment(loss=loss)), count=5000)) == None for loss in (0.01, 0.05))  # noqa: E711
+    assert not (few_lost & ~many_lost).any()
+    assert many_lost.sum() > few_lost.sum() > 0
 
 
-def test_loss_does_not_move_overtaking() -> None:
-    """The same packets overtake whether others are lost or not."""
-    law = Impairment(delay_ms=75, reorder=0.2)
-    alone, both = times(link(law), count=2000), times(link(replace(law, loss=0.1)), count=2000)
+def test_loss_does_not_change_reordering() -> None:
+    """The same packets are reordered with and without loss."""
+    impairment = Impairment(delay_ms=75, reorder=0.2)
+    alone, both = times(link(impairment), count=2000), times(link(replace(impairment, loss=0.1)), count=2000)
     assert all(each in (None, before) for before, each in zip(alone, both, strict=True))
 
 
-def test_a_line_with_a_link() -> None:
-    """A line gives out what its link lets through when that says, early ones first, and tells when each is due."""
-    law = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
-    line, made = DelayLine(DelayLaw(12.0), link(law)), link(law)
+def test_delay_line_follows_its_link() -> None:
+    """A delay line loses, delays and reorders packets like its link, and returns when each is due."""
+    impairment = Impairment(delay_ms=75, loss=0.1, reorder=0.2)
+    line, made = DelayLine(DelayModel(12.0), link(impairment)), link(impairment)
     due = [line.push(number, number * MS, 0, 100) for number in range(500)]
-    assert due == [made.leaves_ns(number * MS, 12 * MS, 100) for number in range(500)]
+    assert due == [made.departure_ns(number * MS, 12 * MS, 100) for number in range(500)]
     order = sorted((each, number) for number, each in enumerate(due) if each is not None)
     assert line.pop_due(2 * NS_PER_S) == [number for _, number in order]
     assert [number for _, number in order] != sorted(number for _, number in order)
@@ -335,36 +337,38 @@ CONTRADICTIONS: list[tuple[Impairment, str | None, str]] = [
     (Impairment(reorder=0.1), "10\n", "needs a delay"),
     (Impairment(rate_bps=1000), "10\n", "give one of the two"),
     (Impairment(rate_bps=7), None, "between 8 and"),
-    (Impairment(delay_ms=float("nan")), None, "below zero or infinite"),
+    (Impairment(delay_ms=float("nan")), None, "finite"),
 ]
 
 
-@pytest.mark.parametrize(("law", "trace", "said"), CONTRADICTIONS)
-def test_contradictions(law: Impairment, trace: str | None, said: str) -> None:
-    """What contradicts itself is refused with the flow's name."""
-    requested = LinkInjection(law, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
-    with pytest.raises(UserError, match=rf"^video: .*{said}"):
-        check_injected(requested)
+@pytest.mark.parametrize(("impairment", "trace", "message"), CONTRADICTIONS)
+def test_contradictory_impairments_are_rejected(impairment: Impairment, trace: str | None, message: str) -> None:
+    """A contradictory impairment is rejected with the flow's name."""
+    requested = LinkInjection(impairment, 1, "video", None if trace is None else parse_mahimahi(trace, "t"))
+    with pytest.raises(UserError, match=rf"^video: .*{message}"):
+        check_injection(requested)
 
 
-def test_what_the_kernel_rejects_is_allowed() -> None:
-    """Jitter beyond the delay, correlation without jitter, and overtaking what only a trace delays are no nonsense."""
-    check_injected(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
-    check_injected(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))
-    check_injected(LinkInjection(Impairment(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
+def test_combinations_beyond_netem_are_allowed() -> None:
+    """Jitter beyond the delay, correlation without jitter, and reordering with only a delay trace are allowed."""
+    check_injection(LinkInjection(Impairment(jitter_ms=10), 1, "video"))
+    check_injection(LinkInjection(Impairment(jitter_correlation=0.9), 1, "video"))
+    check_injection(LinkInjection(Impairment(reorder=0.1), 1, "video", parse_delays("time_s,delay_ms\n0,1\n1,2", "t")))
 
 
-def test_early_ones_keep_their_order() -> None:
-    """What overtakes by not being delayed still has the delay that is there anyway, and keeps order with its like."""
+def test_reordered_packets_keep_their_order() -> None:
+    """Packets that are not delayed still have the inherent delay, and keep their order among themselves."""
     made = link(Impairment(delay_ms=75, reorder=0.999))
-    early = [made.leaves_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))]
-    assert early == [40 * MS, 40 * MS, 52 * MS]
+    not_delayed = [
+        made.departure_ns(number * MS, inherent_ns, 100) for number, inherent_ns in enumerate((40 * MS, 0, 50 * MS))
+    ]
+    assert not_delayed == [40 * MS, 40 * MS, 52 * MS]
 
 
 @pytest.mark.parametrize("added", [{"loss": 0.5}, {"reorder": 0.5}])
-def test_chances_have_nothing_to_do_with_each_other(added: dict[str, Any]) -> None:
-    """Which packets are lost, or overtake, says nothing of the jitter of the others."""
-    delays = held_ms(link(Impairment(delay_ms=100, jitter_ms=10, **added)))
+def test_loss_and_reordering_are_independent_of_jitter(added: dict[str, Any]) -> None:
+    """The jitter of the remaining packets does not depend on loss or reordering."""
+    delays = delays_ms(link(Impairment(delay_ms=100, jitter_ms=10, **added)))
     delayed = delays[delays > 0]
     assert len(delayed) == pytest.approx(COUNT / 2, rel=0.05)
     assert delayed.mean() == pytest.approx(100, abs=4 * 10 / len(delayed) ** 0.5)

@@ -15,125 +15,125 @@ from lavt.transport.netem.netem import Verification
 from lavt.transport.netem.probe import ProbeResult
 
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150.0))
-NOTHING = ImpairedFlow("video", "udp", 5600, "source", Impairment())
+UNIMPAIRED = ImpairedFlow("video", "udp", 5600, "source", Impairment())
 PROBE = ExemptPort("udp", 5602, "the clock probe")
-FOUND = {"video": ProbeResult(10, 0, 0, 0, 150.0, 150.1, 150.2)}
-ANSWERS_S = 10.0
+MEASURED = {"video": ProbeResult(10, 0, 0, 0, 150.0, 150.1, 150.2)}
+TIMEOUT_S = 10.0
 
 
-class NamedQueues:
-    """A stand-in for the kernel's queues, which have tests of their own in `tests/kernel`."""
+class FakeQueues:
+    """A fake for the kernel's queues, which `tests/kernel` tests."""
 
-    def __init__(self, failure: Exception | None = None, doubts: tuple[str, ...] = ()) -> None:
-        self.did: list[Any] = []
-        self.begun, self.go = threading.Event(), threading.Event()
-        self.go.set()
+    def __init__(self, failure: Exception | None = None, problems: tuple[str, ...] = ()) -> None:
+        self.calls: list[Any] = []
+        self.applying, self.may_apply = threading.Event(), threading.Event()
+        self.may_apply.set()
         self._failure = failure
-        self._doubts = doubts
+        self._problems = problems
 
-    def apply(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], condition: str) -> None:
-        """Note it, when it may, or fail."""
-        self.begun.set()
-        self.go.wait(ANSWERS_S)
+    def apply(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], condition: str) -> None:
+        """Record the call when the test allows it, or fail."""
+        self.applying.set()
+        self.may_apply.wait(TIMEOUT_S)
         if self._failure:
             raise self._failure
-        self.did.append((condition, tuple(flows), tuple(never)))
+        self.calls.append((condition, tuple(flows), tuple(exempt)))
 
-    def verify(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int) -> Verification:
-        """Give what is always found, beside what is asked about."""
-        self.did.append(("verify", tuple(flows), tuple(never), count))
-        return Verification(list(self._doubts), FOUND)
+    def verify(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int) -> Verification:
+        """Record the call and return fixed measurements."""
+        self.calls.append(("verify", tuple(flows), tuple(exempt), count))
+        return Verification(list(self._problems), MEASURED)
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int
     ) -> dict[str, ProbeResult]:
-        """Give the same."""
-        self.did.append(("measure", tuple(flows), tuple(never), count))
-        return FOUND
+        """Record the call and return the same measurements."""
+        self.calls.append(("measure", tuple(flows), tuple(exempt), count))
+        return MEASURED
 
-    def doubts(self) -> list[str]:
-        """Have one."""
+    def problems(self) -> list[str]:
+        """Return one problem."""
         return ["its jitter has stopped"]
 
     def clear(self) -> None:
-        """Note it."""
-        self.did.append("clear")
+        """Record the call."""
+        self.calls.append("clear")
 
 
-class Told:
-    """An injector, and what it says."""
+class InjectorHarness:
+    """An injector and its results."""
 
-    def __init__(self, queues: NamedQueues | None) -> None:
-        self.said: queue.Queue[InjectionResult] = queue.Queue()
+    def __init__(self, queues: FakeQueues | None) -> None:
+        self.results: queue.Queue[InjectionResult] = queue.Queue()
         self.injector = Injector(MachineClock(), self._deliver, queues, [PROBE])
 
     def _deliver(self, _channel: str, payload: Any, _arrived: Now, _peer: Any) -> None:
-        self.said.put(payload)
+        self.results.put(payload)
 
     def order(self, order: InjectionOrder) -> InjectionResult:
-        """Give an order and wait for its answer."""
+        """Send an order and wait for its result."""
         self.injector.send(Send("inject", order))
-        return self.said.get(timeout=ANSWERS_S)
+        return self.results.get(timeout=TIMEOUT_S)
 
 
-def ordered(queues: NamedQueues | None, *orders: InjectionOrder) -> list[InjectionResult]:
-    """Give what an injector says of orders, one after the other, having been closed."""
-    told = Told(queues)
-    answers = [told.order(order) for order in orders]
-    told.injector.close()
+def execute(queues: FakeQueues | None, *orders: InjectionOrder) -> list[InjectionResult]:
+    """Return an injector's results for orders sent one after the other; close the injector."""
+    harness = InjectorHarness(queues)
+    answers = [harness.order(order) for order in orders]
+    harness.injector.close()
     return answers
 
 
-def test_an_order_is_applied_once_and_measured_whenever_it_comes() -> None:
-    """An order is applied and verified, and when it comes again measured; one without flows clears, as the end does."""
-    queues = NamedQueues()
-    said = ordered(
+def test_repeated_order_is_only_measured() -> None:
+    """An order is applied and verified once, and measured when repeated; no flows, and closing, clear the interface."""
+    queues = FakeQueues()
+    results = execute(
         queues, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ())
     )
-    assert said[0] == InjectionResult(1, "", "", (("video", 150.1),))
-    assert (said[1].number, said[1].reason, said[1].measured_ms) == (1, "", (("video", 150.1),))
-    assert said[1].doubts.startswith("its jitter has stopped; ")
-    assert "NTP: no packet came through" in said[1].doubts
-    assert said[2] == InjectionResult(2, "", "", ())
+    assert results[0] == InjectionResult(1, "", "", (("video", 150.1),))
+    assert (results[1].number, results[1].reason, results[1].measured_ms) == (1, "", (("video", 150.1),))
+    assert results[1].problems.startswith("its jitter has stopped; ")
+    assert "NTP: no packet came through" in results[1].problems
+    assert results[2] == InjectionResult(2, "", "", ())
     both = ((VIDEO,), (PROBE,))
-    assert queues.did == [("L2", *both), ("verify", *both, 10), ("measure", *both, 10), "clear", "clear"]
+    assert queues.calls == [("L2", *both), ("verify", *both, 10), ("measure", *both, 10), "clear", "clear"]
 
 
-def test_a_failure_is_told_and_the_next_order_is_done() -> None:
-    """What the queues cannot do is told, in their words where they have any, and does not end the side."""
-    queues = NamedQueues(UserError("there is no tc"))
-    assert ordered(queues, InjectionOrder(1, "L2", (VIDEO,))) == [InjectionResult(1, "there is no tc", "", ())]
-    broken = NamedQueues(OSError("the interface went down"))
-    said = ordered(broken, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ()))
-    assert said == [InjectionResult(1, "OSError: the interface went down", "", ()), InjectionResult(2, "", "", ())]
-    assert broken.did == ["clear", "clear"]
+def test_failure_is_reported_and_the_next_order_executed() -> None:
+    """A failure of the queues is reported as their message or the exception, and the next order is executed."""
+    queues = FakeQueues(UserError("there is no tc"))
+    assert execute(queues, InjectionOrder(1, "L2", (VIDEO,))) == [InjectionResult(1, "there is no tc", "", ())]
+    broken = FakeQueues(OSError("the interface went down"))
+    results = execute(broken, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "", ()))
+    assert results == [InjectionResult(1, "OSError: the interface went down", "", ()), InjectionResult(2, "", "", ())]
+    assert broken.calls == ["clear", "clear"]
 
 
-def test_a_condition_that_is_not_as_requested_when_it_is_applied_is_not_in_force() -> None:
-    """Where verifying finds otherwise than asked, the order has failed, with what was found."""
-    assert ordered(NamedQueues(doubts=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
+def test_failed_verification_fails_the_order() -> None:
+    """If the verification finds a difference, the order has failed, and the differences are reported."""
+    assert execute(FakeQueues(problems=("video was late", "no filter")), InjectionOrder(1, "L2", (VIDEO,))) == [
         InjectionResult(1, "video was late; no filter", "", ())
     ]
 
 
-def test_of_orders_that_wait_only_the_last_is_done() -> None:
-    """Of the orders that come while one is carried out only the last counts: a flood of orders is no flood of work."""
-    queues = NamedQueues()
-    queues.go.clear()
-    told = Told(queues)
-    told.injector.send(Send("inject", InjectionOrder(1, "L2", (VIDEO,))))
-    assert queues.begun.wait(ANSWERS_S)
+def test_only_the_newest_queued_order_is_executed() -> None:
+    """Of the orders that arrive during another's execution only the newest is executed."""
+    queues = FakeQueues()
+    queues.may_apply.clear()
+    harness = InjectorHarness(queues)
+    harness.injector.send(Send("inject", InjectionOrder(1, "L2", (VIDEO,))))
+    assert queues.applying.wait(TIMEOUT_S)
     for number in range(2, 100):
-        told.injector.send(Send("inject", InjectionOrder(number, "L2", (VIDEO,))))
-    told.injector.send(Send("inject", InjectionOrder(100, "", ())))
-    queues.go.set()
-    assert [told.said.get(timeout=ANSWERS_S).number for _ in range(2)] == [1, 100]
-    told.injector.close()
-    assert queues.did[-2:] == ["clear", "clear"]
+        harness.injector.send(Send("inject", InjectionOrder(number, "L2", (VIDEO,))))
+    harness.injector.send(Send("inject", InjectionOrder(100, "", ())))
+    queues.may_apply.set()
+    assert [harness.results.get(timeout=TIMEOUT_S).number for _ in range(2)] == [1, 100]
+    harness.injector.close()
+    assert queues.calls[-2:] == ["clear", "clear"]
 
 
-def test_without_an_interface_only_nothing_can_be_ordered() -> None:
-    """Where no interface is configured, a delay is refused with what to do, and none is granted."""
-    said = ordered(None, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "L0", (NOTHING,)))
-    assert said[0].reason == "no interface is configured for it: set injection.interface"
-    assert said[1].reason == ""
+def test_without_an_interface_only_zero_delay_is_accepted() -> None:
+    """Without a configured interface a delay is rejected, and zero delay is accepted."""
+    results = execute(None, InjectionOrder(1, "L2", (VIDEO,)), InjectionOrder(2, "L0", (UNIMPAIRED,)))
+    assert "injection.interface" in results[0].reason
+    assert results[1].reason == ""

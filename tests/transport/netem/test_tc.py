@@ -28,21 +28,21 @@ from lavt.transport.emulation.impairment import (
     ImpairedFlow,
     Impairment,
     check_flows,
-    check_law,
+    check_netem_impairment,
 )
-from lavt.transport.netem.correlated_jitter import CorrelatedJitter, wandering
+from lavt.transport.netem.correlated_jitter import CorrelatedJitter, next_deviation
 from lavt.transport.netem.netem import NetemInterface, run_tc
-from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summary
+from lavt.transport.netem.probe import ProbeResult, judge, measure, probes, summarize
 from lavt.transport.netem.state import (
-    NOBODY,
+    NO_OWNER,
     AppliedState,
     Owner,
     StateFiles,
-    boot,
+    boot_id,
+    current_process,
     flows_from,
-    namespace,
-    started,
-    this_process,
+    network_namespace,
+    start_ticks,
 )
 from lavt.transport.netem.tc import (
     Command,
@@ -54,22 +54,32 @@ from lavt.transport.netem.tc import (
     first_commands,
     netem_arguments,
     parse_filters,
+    parse_impairment,
     parse_qdiscs,
-    read_law,
-    set_law,
+    set_impairment,
 )
 
 VIDEO = ImpairedFlow("video", "udp", 5600, "source", Impairment(150))
 CONTROL = ImpairedFlow("control", "udp", 7448, "destination", Impairment(75))
 
-QDISCS = json.dumps([
-    {"kind": "prio", "handle": "4c56:", "root": True, "options": {"bands": 6}, "qlen": 0},
-    {
-        "kind": "netem", "handle": "4c01:", "parent": "4c56:4", "qlen": 7,
-        "options": {"limit": 10000, "delay": {"delay": 0.15, "jitter": 0, "correlation": 0},
-                    "rate": {"rate": 1250000000}, "ecn": False, "gap": 0},
-    },
-])  # fmt: skip
+QDISCS = json.dumps(
+    [
+        {"kind": "prio", "handle": "4c56:", "root": True, "options": {"bands": 6}, "qlen": 0},
+        {
+            "kind": "netem",
+            "handle": "4c01:",
+            "parent": "4c56:4",
+            "qlen": 7,
+            "options": {
+                "limit": 10000,
+                "delay": {"delay": 0.15, "jitter": 0, "correlation": 0},
+                "rate": {"rate": 1250000000},
+                "ecn": False,
+                "gap": 0,
+            },
+        },
+    ]
+)
 FREE = '[{"kind":"noqueue","handle":"0:","root":true,"refcnt":2,"options":{}}]'
 FILTERS = """filter protocol ip pref 1 u32 chain 0
 filter protocol ip pref 1 u32 chain 0 fh 800: ht divisor 1
@@ -86,8 +96,8 @@ filter protocol ipv6 pref 2 u32 chain 0 fh 801::800 order 2048 key ht 801 bkt 0 
 """
 
 
-def test_the_commands_of_a_condition_are_these() -> None:
-    """L4 with the state held on one machine is three netems behind a prio of six bands, and two filters for each."""
+def test_commands_of_a_condition() -> None:
+    """L4 with delayed state on one machine is three netems behind a prio with six bands, and two filters for each."""
     flows = netem_flows(condition("L4"), "both", video_port=5600, control_port=7448, state_delay="with_video")
     ip = "u32 match u8 0x45 0xff at 0 match u16 0x0000 0x1fff at 6"
     assert [as_typed(each) for each in first_commands("eth0", flows)] == [
@@ -111,7 +121,7 @@ def test_the_commands_of_a_condition_are_these() -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "words"),
+    ("impairment", "arguments"),
     [
         (Impairment(), "delay 0ms rate 10gbit"),
         (Impairment(75, 10), "delay 75ms 10ms distribution normal rate 10gbit"),
@@ -124,31 +134,31 @@ def test_the_commands_of_a_condition_are_these() -> None:
         (Impairment(0.123), "delay 0.123ms rate 10gbit"),
     ],
 )
-def test_a_law_in_the_words_of_netem(law: Impairment, words: str) -> None:
-    """Each law has exactly these arguments, always with limit, delay and rate, as a change keeps what is not named."""
-    assert " ".join(netem_arguments(law)) == f"netem limit 10000 {words}"
+def test_netem_arguments_of_an_impairment(impairment: Impairment, arguments: str) -> None:
+    """Each impairment has these arguments, always with limit, delay and rate, since a change keeps omitted ones."""
+    assert " ".join(netem_arguments(impairment)) == f"netem limit 10000 {arguments}"
 
 
-def test_a_long_delay_has_room_for_its_packets() -> None:
-    """Of 60 s of delay, 2000 packets a second have room; of less than 5 s there are 10 000."""
+def test_queue_limit_grows_with_the_delay() -> None:
+    """Delays over 5 s get a limit of 2000 packets per second of delay; shorter ones get 10 000."""
     assert netem_arguments(Impairment(60_000))[:3] == ["netem", "limit", "120000"]
     assert netem_arguments(Impairment(4_900))[:3] == ["netem", "limit", "10000"]
 
 
-def test_a_uniform_law_names_the_directory_of_its_table() -> None:
-    """A uniform jitter is given by a table of ours: without any, a change would keep that of the law before."""
-    command = set_law(
+def test_uniform_jitter_uses_a_table_of_ours() -> None:
+    """Uniform jitter uses LAVT's table: without a table a change would keep the previous one."""
+    command = set_impairment(
         "lo", "video", Impairment(75, 10, jitter_distribution="uniform"), verb="change", tables="/run/lavt"
     )
     assert command[:3] == ["env", "TC_LIB_DIR=/run/lavt", "tc"]
     assert command[-5:-2] == ["10ms", "distribution", "uniform"]
 
 
-def options_of(words: list[str]) -> dict[str, Any]:
-    """Tell what tc tells of a netem that was made with these arguments: our own little tc."""
-    text = " ".join(words[3:])
-    numbers = [float(word.rstrip("%gmbits")) for word in words if word[0].isdigit()]
-    options: dict[str, Any] = {"limit": int(words[2]), "gap": 0}
+def options_of(arguments: list[str]) -> dict[str, Any]:
+    """Return what tc reports for a netem with these arguments: a small model of tc."""
+    text = " ".join(arguments[3:])
+    numbers = [float(word.rstrip("%gmbits")) for word in arguments if word[0].isdigit()]
+    options: dict[str, Any] = {"limit": int(arguments[2]), "gap": 0}
     rest = iter(numbers[1:])
     options["delay"] = {"delay": next(rest) / 1000, "jitter": 0.0}
     if "distribution" in text:
@@ -163,7 +173,7 @@ def options_of(words: list[str]) -> dict[str, Any]:
     return options
 
 
-LAWS = st.builds(
+IMPAIRMENTS = st.builds(
     Impairment,
     delay_ms=st.floats(1, 1000),
     jitter_ms=st.just(0.0) | st.floats(0.1, 1),
@@ -175,53 +185,53 @@ LAWS = st.builds(
 )
 
 
-@given(LAWS)
-def test_any_law_is_read_back_as_it_was_told(law: Impairment) -> None:
-    """What a netem tells that was given the arguments of a law does not differ from that law."""
-    options = options_of(netem_arguments(law))
-    there = [Qdisc("prio", "4c56:", "root", {}, 0), Qdisc("netem", "4c01:", "4c56:4", options, 0)]
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
-    assert difference(flow, there, [expected_filter(each) for each in filters(flow)]) == []
-    if law.loss and law.loss_burst_packets > 1:
-        assert read_law(options).loss_burst_packets == pytest.approx(law.loss_burst_packets, rel=1e-3)
+@given(IMPAIRMENTS)
+def test_any_impairment_is_read_back(impairment: Impairment) -> None:
+    """Tc's report of a netem with the arguments of an impairment does not differ from that impairment."""
+    options = options_of(netem_arguments(impairment))
+    reported = [Qdisc("prio", "4c56:", "root", {}, 0), Qdisc("netem", "4c01:", "4c56:4", options, 0)]
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
+    assert difference(flow, reported, [expected_filter(each) for each in filters(flow)]) == []
+    if impairment.loss and impairment.loss_burst_packets > 1:
+        assert parse_impairment(options).loss_burst_packets == pytest.approx(impairment.loss_burst_packets, rel=1e-3)
 
 
-def test_what_tc_tells_is_read() -> None:
-    """Queues are read from JSON and filters from text, as iproute2 6.1 writes them, and agree with what was asked."""
+def test_output_of_tc_is_parsed() -> None:
+    """Qdiscs in JSON and filters in text, as iproute2 6.1 prints them, are parsed and match the request."""
     qdiscs, found = parse_qdiscs(QDISCS), parse_filters(FILTERS)
 
     assert [(each.kind, each.handle, each.parent, each.waiting_packets) for each in qdiscs] == [
         ("prio", "4c56:", "root", 0),
         ("netem", "4c01:", "4c56:4", 7),
     ]
-    assert read_law(qdiscs[1].options) == Impairment(150)
+    assert parse_impairment(qdiscs[1].options) == Impairment(150)
     assert found == [expected_filter(each) for each in filters(VIDEO)]
     assert difference(VIDEO, qdiscs, found) == []
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
-        ({"delay": {"delay": 0.1}}, "delay_ms is 100 where 150 was asked"),
-        ({"limit": 1000}, "room for 1000 packets only"),
-        ({"rate": {}}, "packets overtake each other"),
-        ({"loss-random": {"loss": 0.5}}, "loss is 0.5 where 0 was asked"),
+        ({"delay": {"delay": 0.1}}, "delay_ms is 100 instead of 150"),
+        ({"limit": 1000}, "limit"),
+        ({"rate": {}}, "no rate"),
+        ({"loss-random": {"loss": 0.5}}, "loss is 0.5 instead of 0"),
     ],
 )
-def test_what_differs_is_said(change: dict[str, Any], said: str) -> None:
-    """A delay, loss or limit that is not as asked is said, and so is a missing filter, netem or rate."""
+def test_differences_are_reported(change: dict[str, Any], message: str) -> None:
+    """A different delay, loss or limit is reported, and so is a missing filter, netem or rate."""
     qdiscs = parse_qdiscs(QDISCS)
     qdiscs[1].options.update(change)
     reasons = " ".join(difference(VIDEO, qdiscs, parse_filters(FILTERS)))
 
-    assert said in reasons
-    assert "has no filter for ipv6" in " ".join(difference(VIDEO, qdiscs, parse_filters(FILTERS)[:1]))
+    assert message in reasons
+    assert "no filter for ipv6" in " ".join(difference(VIDEO, qdiscs, parse_filters(FILTERS)[:1]))
     assert difference(CONTROL, qdiscs, []) == ["control (udp destination port 7448) has no netem"]
 
 
 @given(st.text())
-def test_garbage_from_tc_is_an_error_of_ours(text: str) -> None:
-    """Whatever tc says instead of JSON is a `WorkError`, and text without filters has none."""
+def test_garbage_from_tc_raises_work_errors(text: str) -> None:
+    """Output that is not JSON raises `WorkError`, and text without filters has none."""
     try:
         qdiscs = parse_qdiscs(text)
     except WorkError:
@@ -231,26 +241,26 @@ def test_garbage_from_tc_is_an_error_of_ours(text: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["[1]", '{"kind": 1}', '[{"kind": "x"}]', '[{"kind":"x","handle":"1:","qlen":"a"}]'])
-def test_other_json_from_tc_is_an_error_of_ours(text: str) -> None:
-    """JSON that does not hold queues is a `WorkError`."""
-    with pytest.raises(WorkError, match="not understood"):
+def test_unexpected_json_from_tc_raises_a_work_error(text: str) -> None:
+    """JSON that is not a list of qdiscs raises `WorkError`."""
+    with pytest.raises(WorkError, match="could not parse"):
         parse_qdiscs(text)
 
 
 @pytest.mark.parametrize("options", [{"delay": 3}, {"delay": {"delay": "x"}}, {"loss-gemodel": {}}, {"gap": 1}])
-def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> None:
-    """Options that are not a netem's are a `WorkError`."""
-    with pytest.raises(WorkError, match="not understood"):
-        read_law(options)
+def test_unexpected_options_from_tc_raise_a_work_error(options: dict[str, Any]) -> None:
+    """Options that are not a netem's raise `WorkError`."""
+    with pytest.raises(WorkError, match="could not parse"):
+        parse_impairment(options)
 
 
 @pytest.mark.parametrize(
-    ("law", "said"),
+    ("impairment", "message"),
     [
-        (Impairment(-1), "below zero"),
-        (Impairment(float("nan")), "below zero or infinite"),
+        (Impairment(-1), "not negative"),
+        (Impairment(float("nan")), "finite"),
         (Impairment(5, loss=1), "shares below 1"),
-        (Impairment(5, jitter_ms=6), "delays below zero"),
+        (Impairment(5, jitter_ms=6), "negative delays"),
         (Impairment(0, reorder=0.1), "needs a delay"),
         (Impairment(5, loss=0.9, loss_burst_packets=2), "longer bursts or less loss"),
         (Impairment(5, rate_bps=4), "rate_bps"),
@@ -258,58 +268,60 @@ def test_other_options_from_tc_are_an_error_of_ours(options: dict[str, Any]) -> 
         (Impairment(5, 1, 0, "poisson"), "one of normal, uniform"),  # type: ignore[arg-type]
     ],
 )
-def test_what_netem_cannot_do_is_rejected(law: Impairment, said: str) -> None:
-    """A law that netem cannot do is refused in one sentence that names the flow."""
-    with pytest.raises(UserError, match=said) as rejected:
-        check_law("video", law)
+def test_impossible_impairments_are_rejected(impairment: Impairment, message: str) -> None:
+    """An impairment that netem cannot produce is rejected with a message that names the flow."""
+    with pytest.raises(UserError, match=message) as rejected:
+        check_netem_impairment("video", impairment)
     assert str(rejected.value).startswith("video: ")
 
 
 @pytest.mark.parametrize(
-    ("flows", "said"),
+    ("flows", "message"),
     [
-        ([ImpairedFlow("video", "udp", 5602, "source", Impairment(5))], "would cover the clock probe"),
-        ([ImpairedFlow("control", "udp", 5602, "destination", Impairment(5))], "would cover the clock probe"),
-        ([ImpairedFlow("video", "udp", 123, "source", Impairment(5))], "would cover NTP"),
-        ([ImpairedFlow("control", "tcp", 22, "destination", Impairment(5))], "would cover ssh"),
-        ([ImpairedFlow("video", "udp", 0, "source", Impairment(5))], "is no port"),
+        ([ImpairedFlow("video", "udp", 5602, "source", Impairment(5))], "the clock probe"),
+        ([ImpairedFlow("control", "udp", 5602, "destination", Impairment(5))], "the clock probe"),
+        ([ImpairedFlow("video", "udp", 123, "source", Impairment(5))], "NTP"),
+        ([ImpairedFlow("control", "tcp", 22, "destination", Impairment(5))], "ssh"),
+        ([ImpairedFlow("video", "udp", 0, "source", Impairment(5))], "port number"),
         ([VIDEO, ImpairedFlow("state", "udp", 5600, "source", Impairment(5))], "the same packets as video"),
         ([], "no flow"),
     ],
 )
-def test_flows_that_must_not_be_held_are_rejected(flows: list[ImpairedFlow], said: str) -> None:
-    """A flow on a port of NTP, ssh or the clock probe is refused at either end, as are two with the same packets."""
-    with pytest.raises(UserError, match=said):
+def test_flows_on_exempt_ports_are_rejected(flows: list[ImpairedFlow], message: str) -> None:
+    """A flow at either end on a port of NTP, ssh or the clock probe is rejected, as are two with the same packets."""
+    with pytest.raises(UserError, match=message):
         check_flows(flows, [ExemptPort("udp", 5602, "the clock probe")])
 
 
-class Tc:
-    """A tc that tells what it is given and notes what it is told."""
+class FakeTc:
+    """A tc that reports what a test defines and records its commands."""
 
-    def __init__(self, qdiscs: str = FREE, filters_told: str = "") -> None:
-        self.qdiscs, self.filters_told, self.told = qdiscs, filters_told, list[str]()
+    def __init__(self, qdiscs: str = FREE, filters: str = "") -> None:
+        self.qdiscs, self.filters, self.commands = qdiscs, filters, list[str]()
         self.rejects: Callable[[Command], bool] = lambda _command: False
 
     def __call__(self, command: Command) -> str:
         """Run a command."""
         if "show" in command:
-            return self.filters_told if "filter" in command else self.qdiscs
+            return self.filters if "filter" in command else self.qdiscs
         if self.rejects(command):
             raise WorkError("rejected")
-        self.told.append(" ".join(command))
+        self.commands.append(" ".join(command))
         return ""
 
 
-def test_a_change_touches_only_what_differs(tmp_path: Path) -> None:
-    """A new delay is one change and no filter; what is no longer asked for is held no more, and its filters go."""
-    tc = Tc(QDISCS, FILTERS)
-    netem = NetemInterface("eth0", directory=tmp_path, run=tc, stays=True)
+def test_change_runs_only_the_necessary_commands(tmp_path: Path) -> None:
+    """A new delay is one change without filters; the filters of a flow that is not requested any more are deleted."""
+    tc = FakeTc(QDISCS, FILTERS)
+    netem = NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True)
     netem.apply([ImpairedFlow("video", "udp", 5600, "source", Impairment(30))])
-    one = list(tc.told)
+    first_change = list(tc.commands)
     netem.apply([CONTROL])
 
-    assert one == ["tc qdisc change dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 30ms rate 10gbit"]
-    assert [each.split(" u32")[0] for each in tc.told[1:]] == [
+    assert first_change == [
+        "tc qdisc change dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 30ms rate 10gbit"
+    ]
+    assert [each.split(" u32")[0] for each in tc.commands[1:]] == [
         "tc qdisc change dev eth0 parent 4c56:4 handle 4c01: netem limit 10000 delay 0ms rate 10gbit",
         "tc qdisc add dev eth0 parent 4c56:5 handle 4c02: netem limit 10000 delay 75ms rate 10gbit",
         "tc filter del dev eth0 parent 4c56: protocol ip prio 1",
@@ -319,238 +331,244 @@ def test_a_change_touches_only_what_differs(tmp_path: Path) -> None:
     ]
 
 
-def test_a_first_application_that_fails_is_undone(tmp_path: Path) -> None:
-    """Where a filter is refused on a free interface, the root is deleted again and nothing is written down."""
-    tc = Tc()
+def test_failed_first_application_is_undone(tmp_path: Path) -> None:
+    """If adding a filter fails on a free interface, the root is deleted again and no state is stored."""
+    tc = FakeTc()
     tc.rejects = lambda command: "filter" in command
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
     with pytest.raises(WorkError, match="rejected"):
         netem.apply([VIDEO])
 
-    assert tc.told[-1] == "tc qdisc del dev eth0 root"
+    assert tc.commands[-1] == "tc qdisc del dev eth0 root"
     assert netem.applied() is None
 
 
-def test_somebody_elses_root_is_rejected(tmp_path: Path) -> None:
-    """A root with a handle that is not ours is refused, and tc is told nothing."""
-    tc = Tc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
+def test_foreign_root_is_rejected(tmp_path: Path) -> None:
+    """A root with a foreign handle is rejected before any command runs."""
+    tc = FakeTc('[{"kind":"fq_codel","handle":"8001:","root":true}]')
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
-    uses: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(of_anybody=True), netem.check]
-    for use in uses:
+    calls: list[Callable[[], object]] = [lambda: netem.apply([VIDEO]), lambda: netem.clear(any_owner=True), netem.check]
+    for call in calls:
         with pytest.raises(UserError, match=r"\(fq_codel 8001:\)"):
-            use()
-    assert tc.told == []
+            call()
+    assert tc.commands == []
 
 
-def test_what_another_program_owns_is_rejected(tmp_path: Path) -> None:
-    """A delay that a living process owns, or that was left in place, is not changed by another program of ours."""
-    tc = Tc(QDISCS, FILTERS)
-    owner = os.getppid(), started(os.getppid())
-    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
-    with pytest.raises(UserError, match=f"there is L3 on eth0, of process {owner[0]}"):
+def test_impairment_of_another_program_is_not_changed(tmp_path: Path) -> None:
+    """An impairment that a live process owns, or that was left in place, is not changed by another program."""
+    tc = FakeTc(QDISCS, FILTERS)
+    owner = os.getppid(), start_ticks(os.getppid())
+    StateFiles(tmp_path).write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
+    with pytest.raises(UserError, match=rf"L3 on eth0, .*process {owner[0]}"):
         NetemInterface("eth0", directory=tmp_path, run=tc).apply([VIDEO])
-    StateFiles(tmp_path).forget("eth0")
+    StateFiles(tmp_path).remove("eth0")
     with pytest.raises(UserError, match="a delay on eth0, left in place"):
         NetemInterface("eth0", directory=tmp_path, run=tc).check()
-    assert tc.told == []
+    assert tc.commands == []
 
 
-@pytest.mark.parametrize("owner", [(os.getppid(), started(os.getppid())), NOBODY, None])
-def test_what_somebody_else_owns_is_cleared_only_on_demand(tmp_path: Path, owner: Owner | None) -> None:
-    """A program clears neither another's delay nor one left in place, with a file or without; on demand it does."""
-    tc, files = Tc(QDISCS, FILTERS), StateFiles(tmp_path)
+@pytest.mark.parametrize("owner", [(os.getppid(), start_ticks(os.getppid())), NO_OWNER, None])
+def test_impairment_of_another_owner_is_cleared_only_on_demand(tmp_path: Path, owner: Owner | None) -> None:
+    """A program clears another owner's impairment only with `any_owner`, with and without a state file."""
+    tc, files = FakeTc(QDISCS, FILTERS), StateFiles(tmp_path)
     if owner is not None:
-        files.write(AppliedState("eth0", namespace(), boot(), owner, "L3", (VIDEO,)))
-    there = files.read("eth0")
-    with pytest.raises(UserError, match="there is"), NetemInterface("eth0", directory=tmp_path, run=tc) as netem:
+        files.write(AppliedState("eth0", network_namespace(), boot_id(), owner, "L3", (VIDEO,)))
+    reported = files.read("eth0")
+    with pytest.raises(UserError, match="eth0"), NetemInterface("eth0", directory=tmp_path, run=tc) as netem:
         netem.check()
 
     assert netem.clear() == []
-    assert tc.told == []
-    assert files.read("eth0") == there
-    assert netem.clear(at_once=True, of_anybody=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
+    assert tc.commands == []
+    assert files.read("eth0") == reported
+    assert netem.clear(at_once=True, any_owner=True) == [["tc", "qdisc", "del", "dev", "eth0", "root"]]
     assert files.read("eth0") is None
 
 
-@pytest.mark.parametrize("written", [True, False])
-def test_what_was_left_in_place_is_cleared_by_who_leaves_in_place(tmp_path: Path, written: bool) -> None:
-    """What `lavt netem apply` or a script left, the command that leaves in place owns, and clears."""
-    tc = Tc(QDISCS, FILTERS)
-    if written:
-        StateFiles(tmp_path).write(AppliedState("eth0", namespace(), boot(), NOBODY, "L3", (VIDEO,)))
-    assert NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).clear(at_once=True) != []
+@pytest.mark.parametrize("state_is_stored", [True, False])
+def test_persistent_impairment_is_cleared_by_a_persistent_interface(tmp_path: Path, state_is_stored: bool) -> None:
+    """Impairments that `lavt netem apply` or a script left in place are cleared by a persistent interface."""
+    tc = FakeTc(QDISCS, FILTERS)
+    if state_is_stored:
+        StateFiles(tmp_path).write(AppliedState("eth0", network_namespace(), boot_id(), NO_OWNER, "L3", (VIDEO,)))
+    assert NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True).clear(at_once=True) != []
 
 
-@pytest.mark.parametrize("dead", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}])
-def test_what_the_dead_left_is_taken_away(tmp_path: Path, dead: dict[str, Any]) -> None:
-    """What belongs to an earlier boot, or a process that is no more, is cleared, also where its number came again."""
-    tc = Tc(QDISCS, FILTERS)
-    fields = {"boot": boot(), "owner": this_process(), **dead}
-    StateFiles(tmp_path).write(AppliedState("eth0", namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,)))
-    said = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
+@pytest.mark.parametrize(
+    "abandoned", [{"boot": "an earlier boot"}, {"owner": (2**22 + 1, 5)}, {"owner": (os.getpid(), 5)}]
+)
+def test_abandoned_impairment_is_cleared(tmp_path: Path, abandoned: dict[str, Any]) -> None:
+    """An impairment of an earlier boot, or of a dead process, is cleared, even if the process number was reused."""
+    tc = FakeTc(QDISCS, FILTERS)
+    fields = {"boot": boot_id(), "owner": current_process(), **abandoned}
+    StateFiles(tmp_path).write(
+        AppliedState("eth0", network_namespace(), fields["boot"], fields["owner"], "L3", (VIDEO,))
+    )
+    message = NetemInterface("eth1", directory=tmp_path, run=tc).restore()
 
-    assert len(said) == 1
-    assert "eth0 was still held (L3 on eth0" in said[0]
-    assert tc.told == ["tc qdisc del dev eth0 root"]
+    assert len(message) == 1
+    assert "found L3 on eth0" in message[0]
+    assert tc.commands == ["tc qdisc del dev eth0 root"]
     assert StateFiles(tmp_path).read("eth0") is None
 
 
 @pytest.mark.parametrize(
-    ("interface", "qdiscs", "became", "kept"),
+    ("interface", "qdiscs", "outcome", "is_kept"),
     [
-        ("lo", '[{"kind":"fq_codel","handle":"8001:","root":true}]', "it is not put back: lo has a queue that", True),
-        ("lo", "garbage", "it is not put back: tc told its queues", True),
-        ("nowhere0", "garbage", "the interface is gone", False),
+        ("lo", '[{"kind":"fq_codel","handle":"8001:","root":true}]', "could not be restored: lo has a root", True),
+        ("lo", "garbage", "could not be restored: could not parse", True),
+        ("nowhere0", "garbage", "no longer exists", False),
     ],
 )
-def test_what_cannot_be_put_back_is_said_and_kept(
-    tmp_path: Path, interface: str, qdiscs: str, became: str, kept: bool
+def test_failed_restoration_is_reported_and_kept(
+    tmp_path: Path, interface: str, qdiscs: str, outcome: str, is_kept: bool
 ) -> None:
-    """What cannot be put back is said with its reason and tried again; an interface that is gone is forgotten."""
-    dead = AppliedState(interface, namespace(), "an earlier boot", this_process(), "L3", (VIDEO,))
-    StateFiles(tmp_path).write(dead)
-    said = NetemInterface("eth1", directory=tmp_path, run=Tc(qdiscs)).restore()
+    """A failed restoration is reported with its reason and tried again; a missing interface is dropped."""
+    abandoned = AppliedState(interface, network_namespace(), "an earlier boot", current_process(), "L3", (VIDEO,))
+    StateFiles(tmp_path).write(abandoned)
+    message = NetemInterface("eth1", directory=tmp_path, run=FakeTc(qdiscs)).restore()
 
-    assert len(said) == 1
-    assert (
-        f"{interface} was still held (L3 on {interface}, of process {os.getpid()}, which has died): {became}" in said[0]
-    )
-    assert (StateFiles(tmp_path).read(interface) is not None) == kept
+    assert len(message) == 1
+    assert f"found L3 on {interface}, " in message[0]
+    assert f"process {os.getpid()}" in message[0]
+    assert outcome in message[0]
+    assert (StateFiles(tmp_path).read(interface) is not None) == is_kept
 
 
 @pytest.mark.parametrize("name", ["state", "table"])
-def test_a_directory_that_cannot_be_written_is_a_sentence(tmp_path: Path, name: str) -> None:
-    """Where a file of ours cannot be written, that is said before tc is told anything, and what is held goes on."""
-    tc = Tc(QDISCS, FILTERS)
-    file = {"state": f"netem-{namespace()}-eth0.json", "table": "uniform.dist"}[name]
+def test_unwritable_directory_is_reported_before_tc_runs(tmp_path: Path, name: str) -> None:
+    """If a file cannot be written, this is reported before tc runs, and existing impairments stay."""
+    tc = FakeTc(QDISCS, FILTERS)
+    file = {"state": f"netem-{network_namespace()}-eth0.json", "table": "uniform.dist"}[name]
     (tmp_path / f"{file}.part").mkdir()
     flow = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, jitter_distribution="uniform"))
     with pytest.raises(UserError, match=r"\(Is a directory\)"):
-        NetemInterface("eth0", directory=tmp_path, run=tc, stays=True).apply([flow])
+        NetemInterface("eth0", directory=tmp_path, run=tc, persistent=True).apply([flow])
 
-    assert tc.told == []
-    assert not (tmp_path / f"netem-{namespace()}-eth0.json").exists()
+    assert tc.commands == []
+    assert not (tmp_path / f"netem-{network_namespace()}-eth0.json").exists()
 
 
 @pytest.mark.parametrize(
     "text", ["", "{}", "[]", "null", '{"interface": 3, "owner": 7}', '{"owner": [1, 2], "flows": [{}]}']
 )
-def test_a_broken_file_is_no_application(tmp_path: Path, text: str) -> None:
-    """A file that is not one of ours counts as nothing, and is written anew."""
-    (tmp_path / f"netem-{namespace()}-eth0.json").write_text(text)
-    netem = NetemInterface("eth0", directory=tmp_path, run=Tc())
+def test_broken_state_file_is_ignored(tmp_path: Path, text: str) -> None:
+    """A broken state file counts as none, and is replaced."""
+    (tmp_path / f"netem-{network_namespace()}-eth0.json").write_text(text)
+    netem = NetemInterface("eth0", directory=tmp_path, run=FakeTc())
     assert netem.applied() is None
     netem.apply([VIDEO], condition="L2")
     applied = netem.applied()
     assert applied is not None
-    assert (applied.condition, applied.flows, applied.owner) == ("L2", (VIDEO,), this_process())
+    assert (applied.condition, applied.flows, applied.owner) == ("L2", (VIDEO,), current_process())
 
 
-def test_flows_are_read_as_they_were_written() -> None:
-    """Flows come back from JSON as they were."""
+def test_flows_survive_json() -> None:
+    """Flows are the same after a round trip through JSON."""
     assert flows_from(json.loads(json.dumps([asdict(VIDEO), asdict(CONTROL)]))) == (VIDEO, CONTROL)
 
 
 @pytest.mark.parametrize("name", ["", "eth0/1", "-x", "a" * 16, "a b", ".."])
-def test_a_name_that_no_interface_has_is_rejected(name: str) -> None:
-    """An interface's name is up to 15 characters without space and slash, and no option of tc."""
-    with pytest.raises(UserError, match="no name of an interface"):
+def test_invalid_interface_name_is_rejected(name: str) -> None:
+    """An interface name has up to 15 characters without space and slash, and does not look like an option of tc."""
+    with pytest.raises(UserError, match="not an interface name"):
         NetemInterface(name)
 
 
-def test_correlated_jitter_needs_somebody_who_stays(tmp_path: Path) -> None:
-    """What ends at once cannot let a delay wander: refused with what to do instead."""
+def test_correlated_jitter_needs_a_running_program(tmp_path: Path) -> None:
+    """Correlated jitter without a running program is rejected with the alternative."""
     with pytest.raises(UserError, match="--hold"):
-        NetemInterface("eth0", directory=tmp_path, run=Tc(), stays=True).apply(
+        NetemInterface("eth0", directory=tmp_path, run=FakeTc(), persistent=True).apply(
             [ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 5, 0.9))]
         )
 
 
-def test_a_wandering_delay_is_correlated_as_requested_and_repeats() -> None:
-    """Steps of the process have standard deviation 1 and are correlated by 0.9, and the same seed gives the same."""
+def test_correlated_jitter_has_its_correlation_and_repeats() -> None:
+    """The steps have standard deviation 1 and correlation 0.9, and the same seed gives the same steps."""
 
     def walk(seed: int) -> list[float]:
-        values, before = [], None
+        values, previous = [], None
         for index in range(4000):
-            values.append(wandering(Impairment(75, 10, 0.9), seed, "video", index, before))
-            before = index, values[-1]
+            values.append(next_deviation(Impairment(75, 10, 0.9), seed, "video", index, previous))
+            previous = index, values[-1]
         return values
 
     values = walk(3)
-    together = sum(a * b for a, b in pairwise(values)) / sum(a * a for a in values)
-    assert abs(together - 0.9) < 0.03
+    correlation = sum(a * b for a, b in pairwise(values)) / sum(a * a for a in values)
+    assert abs(correlation - 0.9) < 0.03
     assert 0.8 < sum(a * a for a in values) / 4000 < 1.2
     assert walk(3) == values
     assert walk(4) != values
 
 
-WANDERING = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, 0.9))
+CORRELATED = ImpairedFlow("video", "udp", 5600, "source", Impairment(75, 10, 0.9))
 
 
-def tc_that(does: str, folder: Path) -> dict[str, str]:
-    """Make a tc that does something else, and give the environment in which it is found."""
+def fake_tc_environment(script: str, folder: Path) -> dict[str, str]:
+    """Install a script as tc, and return the environment in which it is found."""
     program = folder / "tc"
-    program.write_text(f"#!/bin/sh\n{does}\n")
+    program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     return {"PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def test_the_tc_that_steps_a_delay_is_in_a_session_of_its_own(tmp_path: Path) -> None:
-    """Ctrl-C at the terminal, which goes to a whole group of processes, does not reach it: it leads its own session."""
-    said = tmp_path / "said"
-    does = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
-    does += f"; echo $pid $session > {said}"
-    CorrelatedJitter("eth0", [WANDERING], tc_that(does, tmp_path), seed=1).end()
-    pid, session = said.read_text().split()
+def test_tc_of_correlated_jitter_has_its_own_session(tmp_path: Path) -> None:
+    """Ctrl-C at the terminal, which is sent to a process group, does not reach tc: it leads its own session."""
+    message = tmp_path / "message"
+    script = "cat > /dev/null; read pid name state parent group session rest < /proc/self/stat"
+    script += f"; echo $pid $session > {message}"
+    CorrelatedJitter("eth0", [CORRELATED], fake_tc_environment(script, tmp_path), seed=1).stop()
+    pid, session = message.read_text().split()
 
     assert session == pid
 
 
-def test_a_wander_that_has_stopped_is_said_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the tc that steps a delay has ended by itself, that is a doubt of its flow, and clearing goes on."""
-    monkeypatch.setenv("PATH", tc_that("exit 1", tmp_path)["PATH"])
-    tc = Tc()
+def test_stopped_jitter_is_reported_and_can_be_cleared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the tc that steps a delay has ended, the flow has a problem, and clearing still works."""
+    monkeypatch.setenv("PATH", fake_tc_environment("exit 1", tmp_path)["PATH"])
+    tc = FakeTc()
     netem = NetemInterface("eth0", directory=tmp_path, run=tc)
-    netem.apply([WANDERING, CONTROL])
+    netem.apply([CORRELATED, CONTROL])
     limit_ns = MachineClock().now().mono_ns + 10 * NS_PER_S
-    while not netem.doubts() and MachineClock().now().mono_ns < limit_ns:
+    while not netem.problems() and MachineClock().now().mono_ns < limit_ns:
         pause(NS_PER_MS)
-    doubts, tc.qdiscs = netem.doubts(), QDISCS.replace('"qlen": 7', '"qlen": 0')
+    problems, tc.qdiscs = netem.problems(), QDISCS.replace('"qlen": 7', '"qlen": 0')
 
-    (doubt,) = doubts
-    assert doubt.startswith("video (udp source port 5600): ")
+    (problem,) = problems
+    assert problem.startswith("video (udp source port 5600): ")
     assert netem.clear()[-1] == ["tc", "qdisc", "del", "dev", "eth0", "root"]
-    assert netem.doubts() == []
+    assert netem.problems() == []
 
 
-def test_a_wander_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wander that steps is in no doubt; one whose thread has died is, a second after its last step, not before."""
+def test_jitter_without_a_step_for_a_second_has_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jitter is reported as stopped when its last step is more than a second ago, and not before."""
     monkeypatch.setattr(threading.Thread, "start", lambda _thread: None)
     monkeypatch.setattr(threading.Thread, "join", lambda _thread: None)
     clock = ManualClock()
-    wander = CorrelatedJitter("eth0", [WANDERING], tc_that("cat > /dev/null", tmp_path), seed=1, clock=clock)
+    jitter = CorrelatedJitter(
+        "eth0", [CORRELATED], fake_tc_environment("cat > /dev/null", tmp_path), seed=1, clock=clock
+    )
     clock.mono_ns = NS_PER_S
-    now = wander.doubts()
+    at_one_second = jitter.problems()
     clock.mono_ns += 1
-    later = wander.doubts()
-    wander.end()
+    later = jitter.problems()
+    jitter.stop()
 
-    assert now == []
+    assert at_one_second == []
     assert later == ["video (udp source port 5600): its correlated jitter has stopped"]
 
 
-def test_what_has_stopped_is_among_the_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A verification tells what has stopped, beside what was read back and measured."""
-    netem = NetemInterface("eth0", directory=tmp_path, run=Tc(QDISCS, FILTERS))
-    monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: JUDGED)
-    monkeypatch.setattr(netem, "doubts", lambda: ["stopped"])
+def test_verification_reports_stopped_jitter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A verification reports stopped jitter along with the other differences."""
+    netem = NetemInterface("eth0", directory=tmp_path, run=FakeTc(QDISCS, FILTERS))
+    monkeypatch.setattr(netem, "measure", lambda *_arguments, **_more: AS_REQUESTED)
+    monkeypatch.setattr(netem, "problems", lambda: ["stopped"])
     assert netem.verify([VIDEO]).reasons == ["stopped"]
 
 
-def test_what_is_probed_beside_the_flows() -> None:
-    """Beside L4's flows are probed: challenges, the other directions, NTP, ssh and the clock probe."""
+def test_probes_of_a_condition() -> None:
+    """The probes for L4 are its flows, the challenges, the other directions, NTP, ssh and the clock probe."""
     requested = probes([VIDEO, CONTROL], [ExemptPort("udp", 5602, "the clock probe")])
-    assert [(each.name, each.source, each.destination, each.law.delay_ms) for each in requested] == [
+    assert [(each.name, each.source, each.destination, each.impairment.delay_ms) for each in requested] == [
         ("video", 5600, 9, 150),
         ("control", 9, 7448, 75),
         ("video, other direction", 9, 5600, 0),
@@ -562,40 +580,40 @@ def test_what_is_probed_beside_the_flows() -> None:
     ]
 
 
-def test_frames_are_summed_up() -> None:
-    """Of 10 frames one is lost, one passed by a later one and one early; the delays are of those that were held."""
+def test_measured_frames_are_summarized() -> None:
+    """Lost, reordered and early frames are counted, and the delays are those of the delayed frames."""
     delays = [(0, 75.0), (1, 75.2), (3, 75.1), (2, 75.3), (9, 0.1), (4, 75.0), (5, 75.0), (6, 75.0), (7, 75.0)]
-    found = summary(Impairment(75, reorder=0.25), 10, delays)
+    found = summarize(Impairment(75, reorder=0.25), 10, delays)
 
     assert (found.sent, found.lost, found.early) == (10, 1, 1)
     assert found.reordered == 5
     assert found.median_ms == 75.0
-    assert summary(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
+    assert summarize(Impairment(), 10, []) == ProbeResult(10, 10, 0, 0, None, None, None)
 
 
-JUDGED = {
-    each.name: ProbeResult(50, 0, 0, 0, each.law.delay_ms, each.law.delay_ms, each.law.delay_ms)
+AS_REQUESTED = {
+    each.name: ProbeResult(50, 0, 0, 0, each.impairment.delay_ms, each.impairment.delay_ms, each.impairment.delay_ms)
     for each in probes([VIDEO])
 }
 
 
 @pytest.mark.parametrize(
-    ("law", "name", "found", "said"),
+    ("impairment", "name", "found", "message"),
     [
-        (Impairment(150), "video", ProbeResult(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms where 150 ms"),
+        (Impairment(150), "video", ProbeResult(50, 0, 0, 0, 148.0, 148.5, 149.0), "delayed by 148.50 ms"),
         (
             Impairment(150),
             "NTP",
             ProbeResult(50, 0, 0, 0, 150.0, 150.0, 150.0),
-            "NTP was delayed by 150.00 ms where 0 ms",
+            "NTP was delayed by 150.00 ms instead of 0 ms",
         ),
         (
             Impairment(150),
             "video",
             ProbeResult(50, 1, 0, 0, 150.0, 150.0, 150.0),
-            "1 of 50 packets were lost where 0.0%",
+            "1 of 50 packets were lost",
         ),
-        (Impairment(150), "video", ProbeResult(50, 0, 2, 0, 150.0, 150.0, 150.0), "2 packets were overtaken"),
+        (Impairment(150), "video", ProbeResult(50, 0, 2, 0, 150.0, 150.0, 150.0), "2 packets were reordered"),
         (Impairment(150), "video", ProbeResult(50, 50, 0, 0, None, None, None), "no packet came through"),
         (
             Impairment(150, loss=0.5),
@@ -615,32 +633,40 @@ JUDGED = {
             Impairment(150, 10),
             "video",
             ProbeResult(50, 0, 0, 0, 140.0, 191.1, 195.0),
-            "191.10 ms (median) where 191.00 ms",
+            "191.10 ms (median)",
         ),
         (
             Impairment(150, 10, 0.9),
             "video",
             ProbeResult(50, 0, 0, 0, 140.0, 191.1, 195.0),
-            "191.10 ms (median) where 191.00 ms",
+            "191.10 ms (median)",
         ),
         (Impairment(150, loss=0.1), "video", ProbeResult(50, 50, 0, 0, None, None, None), "50 of 50 packets were lost"),
     ],
 )
-def test_what_is_measured_otherwise_than_requested_is_said(
-    law: Impairment, name: str, found: ProbeResult, said: str
+def test_each_measured_difference_is_reported(
+    impairment: Impairment, name: str, found: ProbeResult, message: str
 ) -> None:
-    """Each quantity that is not as asked is one sentence, and what is as asked is none."""
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
-    good = ProbeResult(50, round(50 * law.loss), 5 * bool(law.reorder), round(50 * law.reorder), 140.0, 150.0, 160.0)
-    reasons = judge([flow], [], {**JUDGED, "video": good, name: found})
+    """Each quantity that differs from the request is reported once, and the others are not."""
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
+    good = ProbeResult(
+        50,
+        round(50 * impairment.loss),
+        5 * bool(impairment.reorder),
+        round(50 * impairment.reorder),
+        140.0,
+        150.0,
+        160.0,
+    )
+    reasons = judge([flow], [], {**AS_REQUESTED, "video": good, name: found})
 
     assert len(reasons) == 1
-    assert said in reasons[0]
-    assert judge([flow], [], {**JUDGED, "video": good}) == []
+    assert message in reasons[0]
+    assert judge([flow], [], {**AS_REQUESTED, "video": good}) == []
 
 
 @pytest.mark.parametrize(
-    ("law", "found"),
+    ("impairment", "found"),
     [
         (Impairment(150, loss=0.1, loss_burst_packets=5), ProbeResult(10, 10, 0, 0, None, None, None)),
         (Impairment(150, loss=0.5), ProbeResult(10, 9, 0, 0, None, None, None)),
@@ -649,21 +675,21 @@ def test_what_is_measured_otherwise_than_requested_is_said(
         (Impairment(150, 10, rate_bps=20_000), ProbeResult(50, 0, 0, 0, 150.0, 400.0, 600.0)),
     ],
 )
-def test_what_a_law_may_do_is_no_reason(law: Impairment, found: ProbeResult) -> None:
-    """Possible shares of losses and overtaking, a late median that jitter allows, and any where there is a rate."""
-    flow = ImpairedFlow("video", "udp", 5600, "source", law)
-    assert judge([flow], [], {**JUDGED, "video": found}) == []
+def test_plausible_measurements_are_accepted(impairment: Impairment, found: ProbeResult) -> None:
+    """Plausible shares of losses and reordering, a median that jitter allows, and any median with a rate pass."""
+    flow = ImpairedFlow("video", "udp", 5600, "source", impairment)
+    assert judge([flow], [], {**AS_REQUESTED, "video": found}) == []
 
 
-def test_a_rejection_of_tc_is_a_sentence() -> None:
-    """An interface that is not there is said so, whatever tc calls it."""
-    with pytest.raises(UserError, match=r"there is no interface nowhere0|no tc"):
+def test_missing_interface_is_reported() -> None:
+    """A missing interface is reported as such, whatever tc prints."""
+    with pytest.raises(UserError, match=r"nowhere0|tc is not installed"):
         run_tc(["tc", "qdisc", "show", "dev", "nowhere0"])
 
 
 @pytest.mark.parametrize("call", ["setsockopt", "bind", "getsockname", "sendto", "recvmsg"])
-def test_an_interface_that_goes_down_cannot_be_measured(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
-    """Whatever a packet socket refuses while it measures, as the interface went down, is one sentence."""
+def test_measuring_an_interface_that_goes_down_fails(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    """A failing call of the packet socket, because the interface went down, raises one `UserError`."""
 
     def down(*_: object) -> None:
         raise OSError(errno.ENETDOWN, "Network is down")
@@ -674,11 +700,11 @@ def test_an_interface_that_goes_down_cannot_be_measured(monkeypatch: pytest.Monk
     opened.return_value.recvmsg.side_effect = BlockingIOError
     getattr(opened.return_value, call).side_effect = down
     monkeypatch.setattr(socket, "socket", opened)
-    with pytest.raises(UserError, match=r"eth0 cannot be measured \(Network is down\)"):
+    with pytest.raises(UserError, match=r"eth0 \(Network is down\)"):
         measure("eth0", probes([VIDEO]), count=1)
 
 
-def test_an_interface_that_is_not_there_cannot_be_measured() -> None:
-    """Measuring says what is wrong with the interface, or that it needs root."""
-    with pytest.raises(UserError, match=r"nowhere0 cannot be measured|only root may measure"):
+def test_measuring_a_missing_interface_fails() -> None:
+    """Measuring a missing interface raises a `UserError` that names it, or that asks for root."""
+    with pytest.raises(UserError, match=r"nowhere0|only root may measure"):
         measure("nowhere0", probes([VIDEO]))

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.rtp.fec import RepairChooser, RepairReceiver, RepairSender
+from lavt.transport.rtp.fec import RedundancyController, RepairReceiver, RepairSender
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer, RtpPacket, parse_packet
 
 REPAIR_PAYLOAD_TYPE, MAX_SYMBOL_BYTES = 97, 1500
-MEDIA_KEPT, OPEN_BLOCKS, BLOCK_LIFE_NS = 4096, 64, 500 * NS_PER_MS
-"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+MAX_STORED_MEDIA, MAX_OPEN_BLOCKS, BLOCK_TIMEOUT_NS = 4096, 64, 500 * NS_PER_MS
+"""The design's limits, repeated here: a change of the code's limits must change these, too."""
 MEDIA_SSRC, REPAIR_SSRC = 0x01020304, 0x0A0B0C0D
 
 
@@ -25,8 +25,8 @@ def frame(
     payloads = list(payloads)
     last = len(payloads) - 1
     return [
-        RtpPacket(96, (first + place) % 2**16, timestamp, ssrc, place == last, payload)
-        for place, payload in enumerate(payloads)
+        RtpPacket(96, (first + index) % 2**16, timestamp, ssrc, index == last, payload)
+        for index, payload in enumerate(payloads)
     ]
 
 
@@ -43,15 +43,15 @@ def counters(receiver: RepairReceiver) -> tuple[int, int, int]:
     return receiver.recovered, receiver.malformed, receiver.unrepaired
 
 
-EIGHT = frame(bytes([place]) * (20 + place) for place in range(8))
+EIGHT = frame(bytes([index]) * (20 + index) for index in range(8))
 REPAIRS = repairs_of(EIGHT, 2)
 
 
 def changed(packet: RtpPacket, **fields: int) -> RtpPacket:
-    """The repair packet with other header bytes: place and new byte."""
+    """Return the repair packet with other bytes at the given positions of its payload."""
     payload = bytearray(packet.payload)
-    for place, byte in fields.items():
-        payload[int(place[1:])] = byte
+    for position, byte in fields.items():
+        payload[int(position[1:])] = byte
     return with_payload(packet, bytes(payload))
 
 
@@ -60,7 +60,7 @@ def with_payload(packet: RtpPacket, payload: bytes) -> RtpPacket:
 
 
 def test_bytes_of_a_repair_packet() -> None:
-    """The bytes of a repair packet are those of docs/wire.md; for a frame of one packet the coded bytes are its own."""
+    """A repair packet has the format of docs/wire.md; for a frame of one packet P and Q are its own bytes."""
     media = RtpPacket(96, 0xFFFE, 0x05060708, MEDIA_SSRC, marker=True, payload=b"abc")
     repairs = RepairSender(REPAIR_SSRC, 0xFFFF).repair([media.to_bytes()], 2)
     header = "01 60 fffe 01020304 0001 00"
@@ -71,7 +71,7 @@ def test_bytes_of_a_repair_packet() -> None:
 
 
 def test_bytes_of_p_and_q() -> None:
-    """Of the frame in docs/wire.md the first repair packet carries P and the second one Q."""
+    """The repair packets of the example frame in docs/wire.md are its P and Q."""
     repairs = repairs_of(frame([b"\x61\x62\x63", b"\xc4"]), 2)
     assert [repair.payload[12:].hex(" ") for repair in repairs] == ["00 02 a5 62 63", "00 01 f4 62 63"]
 
@@ -80,35 +80,35 @@ def test_bytes_of_p_and_q() -> None:
     ("packets", "blocks"), [(0, 0), (1, 1), (16, 1), (17, 2), (32, 2), (33, 3), (4080, 255), (4081, 0)]
 )
 def test_blocks(packets: int, blocks: int) -> None:
-    """A frame is cut into as few blocks of at most 16 as will do; one too large for 255 blocks is not repaired."""
+    """A frame has the fewest blocks of at most 16 packets; a frame of more than 255 blocks gets no repair packets."""
     media = frame([b"x"] * packets)
     for count in (0, 1, 2):
         assert len(repairs_of(media, count)) == blocks * count
 
 
 def test_order() -> None:
-    """The second repair packets of all blocks follow the first ones, so that a burst hits few of one block."""
+    """The second repair packets of all blocks follow the first ones."""
     repairs = repairs_of(frame([b"x"] * 33), 2)
     assert [tuple(repair.payload[10:12]) for repair in repairs] == [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
     assert [repair.sequence for repair in repairs] == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("count", [-1, 3])
-def test_count_that_is_none(count: int) -> None:
-    """Another number of repair packets than the wire format has room for is refused."""
-    with pytest.raises(UserError, match="choose 0, 1 or 2"):
+def test_invalid_count(count: int) -> None:
+    """A number of repair packets other than 0, 1 or 2 is rejected."""
+    with pytest.raises(UserError, match="choose"):
         RepairSender(1, 0).repair([], count)
 
 
 def test_repair_packets_are_small() -> None:
-    """A repair packet of packets of 1200 bytes is 14 bytes longer than these."""
+    """A repair packet is 14 bytes longer than the packets of 1200 bytes that it protects."""
     media = frame([b"x" * 1188] * 8)
     assert [len(repair.to_bytes()) for repair in repairs_of(media, 2)] == [1214, 1214]
 
 
 @pytest.mark.parametrize(("payload_bytes", "repairs"), [(1498, 2), (1499, 0)])
 def test_long_packets(payload_bytes: int, repairs: int) -> None:
-    """A frame with a payload of more than 1498 bytes gets no repair packets, one of 1498 bytes is repaired."""
+    """A frame with a payload of more than 1498 bytes gets no repair packets; one with 1498 bytes does."""
     media = frame([b"short", b"x" * payload_bytes])
     assert len(repairs_of(media, 2)) == repairs
     receiver = RepairReceiver()
@@ -116,7 +116,7 @@ def test_long_packets(payload_bytes: int, repairs: int) -> None:
 
 
 def test_the_largest_frame() -> None:
-    """A frame of 255 blocks is repaired, and repair packets of a larger one are malformed."""
+    """Packets of a frame of 255 blocks are recovered, and repair packets of a larger one are malformed."""
     media = frame([b"x"] * 4080)
     repairs = repairs_of(media, 1)
     receiver = RepairReceiver()
@@ -126,35 +126,35 @@ def test_the_largest_frame() -> None:
     assert counters(receiver) == (1, 1, 0)
 
 
-def test_the_first_number_is_taken_modulo_2_to_the_16() -> None:
-    """A first sequence number beyond the field of the header wraps."""
+def test_the_first_sequence_number_wraps() -> None:
+    """A first sequence number is taken modulo 2^16."""
     assert RepairSender(1, 2**16).next_sequence == 0
     assert RepairSender(1, 2**16 - 1).next_sequence == 2**16 - 1
 
 
 def test_burst() -> None:
-    """A burst of as many packets as there are blocks is repaired by one repair packet a block."""
-    media = frame(bytes([place]) * 5 for place in range(40))
+    """A burst of as many packets as there are blocks is recovered from one repair packet for each block."""
+    media = frame(bytes([index]) * 5 for index in range(40))
     receiver = RepairReceiver()
-    came = [*media[:11], *media[14:], *repairs_of(media, 1)]
-    assert sorted(push_all(receiver, came), key=lambda packet: packet.sequence) == media[11:14]
+    arrived = [*media[:11], *media[14:], *repairs_of(media, 1)]
+    assert sorted(push_all(receiver, arrived), key=lambda packet: packet.sequence) == media[11:14]
     assert counters(receiver) == (3, 0, 0)
 
 
 @pytest.mark.parametrize("lost", list(itertools.combinations(range(8), 2)))
 def test_two_lost(lost: tuple[int, int]) -> None:
-    """Any two packets of a block come back from two repair packets, equal to those sent, in order and once."""
+    """Any two packets of a block are recovered from two repair packets, equal to those sent, in order and once."""
     receiver = RepairReceiver()
-    came = [packet for place, packet in enumerate(EIGHT) if place not in lost]
-    assert push_all(receiver, came) == []
+    arrived = [packet for index, packet in enumerate(EIGHT) if index not in lost]
+    assert push_all(receiver, arrived) == []
     assert receiver.push(REPAIRS[0], 0) == []
-    assert receiver.push(REPAIRS[1], 0) == [EIGHT[place] for place in lost]
+    assert receiver.push(REPAIRS[1], 0) == [EIGHT[index] for index in lost]
     assert push_all(receiver, [*REPAIRS, *EIGHT]) == []
     assert counters(receiver) == (2, 0, 0)
 
 
 def test_media_after_repair() -> None:
-    """A media packet that comes after the repair packet completes a block too."""
+    """A media packet that arrives after the repair packet also completes a block."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT[:6], REPAIRS[0]]) == []
     assert receiver.push(EIGHT[7], 0) == [EIGHT[6]]
@@ -163,16 +163,16 @@ def test_media_after_repair() -> None:
 
 
 def test_nothing_lost() -> None:
-    """Without loss nothing is made, nothing waits and nothing is counted."""
+    """Without loss no packet is recovered, no block stays open and no counter changes."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT, *REPAIRS]) == []
     assert receiver._open == {}
-    assert receiver.push(EIGHT[0], BLOCK_LIFE_NS) == []
+    assert receiver.push(EIGHT[0], BLOCK_TIMEOUT_NS) == []
     assert counters(receiver) == (0, 0, 0)
 
 
 def test_repair_before_media() -> None:
-    """Repair packets that overtake media stand for as many of them, and those are not given again when they come."""
+    """Repair packets that arrive before media replace as many of them, and these are not returned again."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*REPAIRS, *EIGHT[:5]]) == []
     assert receiver.push(EIGHT[5], 0) == EIGHT[6:]
@@ -182,13 +182,13 @@ def test_repair_before_media() -> None:
 
 
 def test_given_up() -> None:
-    """A block that lacks more than its repair packets can make is given up after half a second, and counted."""
+    """A block with more losses than repair packets is given up after half a second, and counted."""
     receiver = RepairReceiver()
     push_all(receiver, [*EIGHT[:6], REPAIRS[0]], now_ns=7)
     next_frame = frame([b"n"], first=108, timestamp=12_000)
-    receiver.push(next_frame[0], 7 + BLOCK_LIFE_NS - 1)
+    receiver.push(next_frame[0], 7 + BLOCK_TIMEOUT_NS - 1)
     assert counters(receiver) == (0, 0, 0)
-    assert receiver.push(EIGHT[6], 7 + BLOCK_LIFE_NS) == []
+    assert receiver.push(EIGHT[6], 7 + BLOCK_TIMEOUT_NS) == []
     assert counters(receiver) == (0, 0, 1)
 
 
@@ -197,31 +197,28 @@ FRAMES = st.lists(st.binary(min_size=1, max_size=60), min_size=1, max_size=60)
 
 @given(FRAMES, FRAMES, st.integers(1, 2), st.integers(0, 2**16 - 1), st.data())
 def test_any_loss(payloads: list[bytes], others: list[bytes], count: int, first: int, data: st.DataObject) -> None:
-    """A block that lost no more media than it has repair packets is whole again; else nothing but what was sent comes.
-
-    In any order, with any packets twice, over any wrap of the sequence numbers.
-    """
+    """A block with no more losses than repair packets is recovered, for any order, duplicates and sequence numbers."""
     frames = [frame(payloads, first), frame(others, first + len(payloads), 12_000)]
     sent = [packet for media in frames for packet in media + repairs_of(media, count)]
     lost = data.draw(st.sets(st.integers(0, len(sent) - 1), max_size=12))
     twice = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=6))
-    came = [packet for place, packet in enumerate(sent) if place not in lost]
-    came += [sent[place] for place in twice if place not in lost]
-    came = data.draw(st.one_of(st.just(came), st.permutations(came)))
+    arrived = [packet for index, packet in enumerate(sent) if index not in lost]
+    arrived += [sent[index] for index in twice if index not in lost]
+    arrived = data.draw(st.one_of(st.just(arrived), st.permutations(arrived)))
     receiver = RepairReceiver()
-    made = push_all(receiver, came)
+    recovered = push_all(receiver, arrived)
     expected = set()
     for media in frames:
         blocks = -(-len(media) // 16)
         repairs = repairs_of(media, count)
         for block in range(blocks):
-            missing = [packet for packet in media[block::blocks] if packet not in came]
-            if len(missing) <= sum(repair in came for repair in repairs[block::blocks]):
+            missing = [packet for packet in media[block::blocks] if packet not in arrived]
+            if len(missing) <= sum(repair in arrived for repair in repairs[block::blocks]):
                 expected |= set(missing)
-    assert set(made) - set(came) == expected
-    assert set(made) <= {packet for media in frames for packet in media}
-    assert len(set(made)) == len(made)
-    assert receiver.recovered == len(made)
+    assert set(recovered) - set(arrived) == expected
+    assert set(recovered) <= {packet for media in frames for packet in media}
+    assert len(set(recovered)) == len(recovered)
+    assert receiver.recovered == len(recovered)
     assert receiver.malformed == 0
 
 
@@ -244,7 +241,7 @@ WRONG_HEADERS = [
 
 @pytest.mark.parametrize("repair", WRONG_HEADERS)
 def test_malformed_header(repair: RtpPacket) -> None:
-    """A repair packet that is not ours, cut off, too long or of another stream is counted also if nothing was lost."""
+    """A repair packet with an invalid header is counted even if no packet was lost."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT, repair]) == []
     assert counters(receiver) == (0, 1, 0)
@@ -254,16 +251,16 @@ def test_malformed_header(repair: RtpPacket) -> None:
     "repair",
     [
         *WRONG_HEADERS,
-        # Shorter than the media of its block: cut off.
+        # Cut off: shorter than the media of its block.
         with_payload(REPAIRS[0], REPAIRS[0].payload[:-1]),
-        # What would come out is longer than the packet, has something behind its end, or is empty.
+        # The recovered payload would be longer than the packet, have bytes after its end, or be empty.
         changed(REPAIRS[0], _12=REPAIRS[0].payload[12] ^ 1),
         changed(REPAIRS[0], _40=REPAIRS[0].payload[40] ^ 1),
         repairs_of([*EIGHT[:3], with_payload(EIGHT[3], b""), *EIGHT[4:]], 1)[0],
     ],
 )
 def test_malformed(repair: RtpPacket) -> None:
-    """A repair packet that is not ours, cut off, of another stream or without sense is counted, and leaves nothing."""
+    """A malformed repair packet is counted and leaves no state."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT[:3], *EIGHT[4:], repair]) == []
     assert counters(receiver) == (0, 1, 0)
@@ -281,8 +278,8 @@ def test_malformed(repair: RtpPacket) -> None:
         changed(REPAIRS[0], _20=REPAIRS[0].payload[20] ^ 1),
     ],
 )
-def test_repair_packets_that_disagree(repair: RtpPacket) -> None:
-    """Of two repair packets of a block that disagree the second is counted and dropped."""
+def test_contradicting_repair_packets(repair: RtpPacket) -> None:
+    """The second of two contradicting repair packets of a block is counted as malformed and dropped."""
     receiver = RepairReceiver()
     assert push_all(receiver, [*EIGHT[:6], REPAIRS[0], repair]) == []
     assert counters(receiver) == (0, 1, 0)
@@ -299,12 +296,12 @@ HEADERS = st.tuples(
     st.integers(0, 2).map(lambda which: bytes([which])),
     st.binary(max_size=40),
 ).map(b"".join)
-"""Payloads that are nearly those of repair packets for the packets of EIGHT."""
+"""Payloads that resemble those of repair packets for the packets of EIGHT."""
 
 
 @given(st.lists(st.one_of(st.binary(max_size=60), HEADERS, st.sampled_from(EIGHT)), max_size=30))
 def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
-    """Whatever comes as repair payload raises nothing, and what cannot be right is counted."""
+    """No repair payload raises an error, and invalid ones are counted as malformed."""
     receiver = RepairReceiver()
     cut_off = 0
     for one in pushed:
@@ -312,50 +309,50 @@ def test_any_bytes(pushed: list[bytes | RtpPacket]) -> None:
             RtpPacket(REPAIR_PAYLOAD_TYPE, 0, 9000, 1, marker=False, payload=one) if isinstance(one, bytes) else one
         )
         cut_off += isinstance(one, bytes) and (len(one) < 15 or one[0] != 1)
-        made = receiver.push(packet, 0)
-        assert all(packet.timestamp == 9000 and packet.payload for packet in made)
+        recovered = receiver.push(packet, 0)
+        assert all(packet.timestamp == 9000 and packet.payload for packet in recovered)
     assert cut_off <= receiver.malformed <= len(pushed)
 
 
 def test_bounded_memory() -> None:
-    """However many blocks stay open and packets come, the newest 64 and 4096 are held and the oldest given up."""
+    """At most the newest 64 open blocks and 4096 packets are stored."""
     receiver = RepairReceiver()
-    for number in range(3 * OPEN_BLOCKS):
+    for number in range(3 * MAX_OPEN_BLOCKS):
         media = frame([b"m"] * 4, first=4 * number, timestamp=number)
         push_all(receiver, [media[0], *repairs_of(media, 2)])
-    assert len(receiver._open) == OPEN_BLOCKS
-    assert counters(receiver) == (0, 0, 2 * OPEN_BLOCKS)
-    newest = frame([b"m"] * 4, first=4 * (3 * OPEN_BLOCKS - 1), timestamp=3 * OPEN_BLOCKS - 1)
+    assert len(receiver._open) == MAX_OPEN_BLOCKS
+    assert counters(receiver) == (0, 0, 2 * MAX_OPEN_BLOCKS)
+    newest = frame([b"m"] * 4, first=4 * (3 * MAX_OPEN_BLOCKS - 1), timestamp=3 * MAX_OPEN_BLOCKS - 1)
     assert receiver.push(newest[1], 0) == newest[2:]
     size = sys.getsizeof(receiver._media)
     push_all(receiver, (RtpPacket(96, number % 2**16, 7, MEDIA_SSRC, False, b"") for number in range(70_000)))
     assert sys.getsizeof(receiver._media) == size
-    assert len(receiver._media) == MEDIA_KEPT
+    assert len(receiver._media) == MAX_STORED_MEDIA
 
 
 def test_bounded_memory_of_long_packets() -> None:
-    """Media packets longer than any that are repaired are not kept."""
+    """Media packets that are too long for repair are not stored."""
     receiver = RepairReceiver()
     push_all(receiver, frame(b"x" * size for size in (1498, 1499, 65_000)))
-    assert [kept.sequence for kept in receiver._media if kept] == [100]
+    assert [stored.sequence for stored in receiver._media if stored] == [100]
 
 
 def test_repair_packet_from_long_ago() -> None:
-    """A repair packet that comes again when its media packets are no longer kept gives nothing again."""
+    """A repair packet that is repeated when its media packets are no longer stored recovers nothing."""
     receiver = RepairReceiver()
     alone = frame([b"alone"])
     repair = repairs_of(alone, 1)[0]
     assert receiver.push(repair, 0) == alone
-    push_all(receiver, (RtpPacket(96, 101 + number, 7, MEDIA_SSRC, False, b"") for number in range(MEDIA_KEPT)))
+    push_all(receiver, (RtpPacket(96, 101 + number, 7, MEDIA_SSRC, False, b"") for number in range(MAX_STORED_MEDIA)))
     assert receiver.push(repair, 0) == []
     assert counters(receiver) == (1, 0, 0)
 
 
 def test_new_stream() -> None:
-    """When the media stream changes, blocks of the one before are given up and its repair packets fit no more."""
+    """When the media stream changes, the blocks of the previous stream are given up and its repair packets rejected."""
     receiver = RepairReceiver()
     push_all(receiver, [*EIGHT[:6], REPAIRS[0]])
-    # The same sequence numbers and timestamp: nothing but the SSRC tells them apart.
+    # The sequence numbers and timestamp are the same: only the SSRC differs.
     other = frame((b"other" for _ in range(8)), ssrc=9)
     assert push_all(receiver, [*other[:6], other[7]]) == []
     assert receiver.push(REPAIRS[1], 0) == []
@@ -364,7 +361,7 @@ def test_new_stream() -> None:
 
 
 def test_same_numbers_of_another_frame() -> None:
-    """Media packets with the sequence numbers of a block but another timestamp are not of it."""
+    """Media packets with the sequence numbers of a block but another timestamp do not belong to it."""
     receiver = RepairReceiver()
     stale = frame((b"stale" for _ in range(8)), timestamp=1)
     later = frame((b"later" for _ in range(8)), timestamp=2)
@@ -373,21 +370,21 @@ def test_same_numbers_of_another_frame() -> None:
 
 
 def test_same_numbers_of_another_stream() -> None:
-    """Media packets of the stream before are not of a block, though they have its sequence numbers and timestamp."""
+    """Media packets of another SSRC with a block's sequence numbers and timestamp do not belong to it."""
     receiver = RepairReceiver()
     other = frame((b"other" for _ in range(8)), ssrc=9)
     assert push_all(receiver, [*other, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
 
 
-def test_same_place_among_those_kept() -> None:
-    """Media packets as far apart as packets are kept are not taken for one another."""
+def test_same_storage_index() -> None:
+    """Media packets with the same storage index are not confused."""
     receiver = RepairReceiver()
-    before = frame((b"before" for _ in range(8)), first=(100 - MEDIA_KEPT) % 2**16)
+    before = frame((b"before" for _ in range(8)), first=(100 - MAX_STORED_MEDIA) % 2**16)
     assert push_all(receiver, [*before, *EIGHT[:6], EIGHT[7], REPAIRS[0]]) == [EIGHT[6]]
 
 
 def test_access_unit() -> None:
-    """A depacketizer fed with the recovered packets gives the access unit that was sent."""
+    """A depacketizer that gets the recovered packets returns the access unit that was sent."""
     unit = b"\x00\x00\x00\x01\x67\x42\x80" + b"\x00\x00\x00\x01\x65" + bytes(range(1, 256)) * 30
     datagrams = Packetizer(MEDIA_SSRC, 65_533).packetize(unit, 9000)
     repairs = RepairSender(REPAIR_SSRC, 0).repair(datagrams, 2)
@@ -420,23 +417,23 @@ def test_access_unit() -> None:
         ([(25, 1000, 0), (0, 1, 1)], 1, 1),
         ([(0, 1000, 0), (25, 1000, 4)], 4, 1),
         ([(0, 1000, 0), (25, 1000, 4)], 5, 2),
-        # Packets that came after all, counted as lost in the report before.
+        # Packets that arrived later, counted as lost in the previous report.
         ([(25, 1000, 0), (-25, 0, 1)], 1, 1),
         ([(0, 0, 0)], 0, 0),
         ([(1, 40, 0)], 0, 2),
     ],
 )
-def test_chooser(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:
-    """No repair before loss, one packet for 30 s after any, two while 2.5 % of the last 5 s were lost."""
-    chooser = RepairChooser()
+def test_redundancy_controller(notes: list[tuple[int, int, float]], now_s: float, count: int) -> None:
+    """A block gets no repair packet before a loss, one for 30 s after it, two while 2.5 % were lost in the last 5 s."""
+    controller = RedundancyController()
     for lost, expected, at_s in notes:
-        chooser.note(lost, expected, int(at_s * NS_PER_S))
-    assert chooser.count(int(now_s * NS_PER_S)) == count
+        controller.note_loss(lost, expected, int(at_s * NS_PER_S))
+    assert controller.repair_packets(int(now_s * NS_PER_S)) == count
 
 
-def test_chooser_forgets() -> None:
-    """The chooser keeps the notes of its window only."""
-    chooser = RepairChooser()
+def test_redundancy_controller_forgets() -> None:
+    """The controller keeps only the notes within its window."""
+    controller = RedundancyController()
     for number in range(1000):
-        chooser.note(0, 10, number * 100 * NS_PER_MS)
-    assert len(chooser._notes) == 50
+        controller.note_loss(0, 10, number * 100 * NS_PER_MS)
+    assert len(controller._notes) == 50

@@ -1,4 +1,4 @@
-"""Steps 3 to 8 of the life of a frame over a link that loses and reorders: what `complete` promises about a picture."""
+"""Stages 3 to 8 of the life of a frame over a link that loses and reorders packets: the meaning of `complete`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, Picture
 from lavt.streams import stream
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer, Ordered
 from lavt.transport.rtp.rtp import Depacketizer, Packetizer, parse_packet
 from lavt.transport.video.h264 import Decoder, Encoder
@@ -27,8 +27,8 @@ def stamp_of(number: int) -> int:
     return START_NS + number * FRAME_NS
 
 
-class Sent:
-    """30 frames with a keyframe every 10: the datagrams of each, and what a decoder makes of them without loss."""
+class SentFrames:
+    """30 frames with a keyframe every 10: the datagrams of each, and the pictures decoded without loss."""
 
     def __init__(self) -> None:
         encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=GOP_FRAMES)
@@ -48,16 +48,16 @@ class Sent:
 
 
 @pytest.fixture(scope="module")
-def sent() -> Sent:
-    return Sent()
+def sent() -> SentFrames:
+    return SentFrames()
 
 
-def test_reordered(sent: Sent) -> None:
-    """Over a link that reorders within the hold every frame arrives complete, and its stamp says when it was sent."""
+def test_reordered(sent: SentFrames) -> None:
+    """Over a link that reorders within the hold every frame arrives complete and with its stamp."""
     random = stream(1, "delay")
     arrivals = []
     for number, datagrams in enumerate(sent.datagrams):
-        delays_ns = random.integers(0, LEAST_HOLD_NS - NS_PER_MS, len(datagrams))
+        delays_ns = random.integers(0, MIN_HOLD_NS - NS_PER_MS, len(datagrams))
         arrivals += [(number * FRAME_NS + int(delay), one) for delay, one in zip(delays_ns, datagrams, strict=True)]
     buffer, depacketizer, decoder = JitterBuffer(), Depacketizer(), Decoder()
     ordered: Ordered = []
@@ -79,19 +79,19 @@ def test_reordered(sent: Sent) -> None:
 @settings(max_examples=60)
 @given(st.sets(st.integers(0, 500), max_size=12))
 @example(set())
-def test_lost(sent: Sent, lost: set[int]) -> None:
-    """Pictures up to the first loss after a keyframe are trusted, no others, and each is exactly the one sent."""
+def test_lost(sent: SentFrames, lost: set[int]) -> None:
+    """Only the pictures from a keyframe to the first loss are trusted, and each is the one decoded without loss."""
     packets = [parse_packet(datagram) for datagrams in sent.datagrams for datagram in datagrams]
     lost = {number % len(packets) for number in lost}
     damaged = {packets[number].timestamp for number in lost}
     depacketizer, decoder = Depacketizer(), Decoder()
-    in_doubt, before_lost = True, False
+    in_doubt, lost_before = True, False
     trusted: list[int] = []
     for number, packet in enumerate(packets):
         if number in lost:
-            before_lost = True
+            lost_before = True
             continue
-        for unit in depacketizer.push(packet, before_lost):
+        for unit in depacketizer.push(packet, lost_before):
             in_doubt = not unit.complete or (in_doubt and not unit.keyframe)
             decoded = decoder.decode(unit.data)
             if not in_doubt:
@@ -99,7 +99,7 @@ def test_lost(sent: Sent, lost: set[int]) -> None:
                 assert np.array_equal(decoded.picture, sent.pictures[unit.timestamp])
                 assert not decoded.corrupt
                 trusted.append(unit.timestamp)
-        before_lost = False
+        lost_before = False
     assert depacketizer.malformed == 0
     timestamps = [rtp_timestamp(stamp_of(number)) for number in range(FRAMES)]
     groups = [timestamps[begin : begin + GOP_FRAMES] for begin in range(0, FRAMES, GOP_FRAMES)]

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.errors import BadPacket
-from lavt.transport.rtp.parity import P, Q, missing, parity
+from lavt.transport.rtp.parity import P, Q, compute_parity, recover
 
 
 def product(one: int, other: int) -> int:
-    """Of two bytes as polynomials over the field of two elements, modulo 0x11d: by hand, one bit after the other."""
+    """Return the product of two bytes as polynomials over the field of two elements, modulo 0x11d, bit by bit."""
     total = 0
     for bit in range(8):
         if other >> bit & 1:
@@ -24,26 +24,26 @@ def product(one: int, other: int) -> int:
 
 
 def slow_parity(symbols: Sequence[bytes]) -> list[bytes]:
-    """P and Q as their definition says."""
+    """Return P and Q by their definition."""
     size = max(len(symbol) for symbol in symbols)
     p, q = bytearray(size), bytearray(size)
     power = 1
     for symbol in symbols:
-        for place, byte in enumerate(symbol):
-            p[place] ^= byte
-            q[place] ^= product(power, byte)
+        for index, byte in enumerate(symbol):
+            p[index] ^= byte
+            q[index] ^= product(power, byte)
         power = product(power, 2)
     return [bytes(p), bytes(q)]
 
 
-def some(count: int, size: int) -> list[bytes]:
-    """Symbols of any bytes, the same in each run."""
+def random_symbols(count: int, size: int) -> list[bytes]:
+    """Return symbols of pseudorandom bytes, the same in each run."""
     drawn = shake_256(f"{count} {size}".encode()).digest(count * size)
-    return [drawn[place * size :][:size] for place in range(count)]
+    return [drawn[index * size :][:size] for index in range(count)]
 
 
-def without(symbols: Sequence[bytes], *places: int) -> list[bytes | None]:
-    return [None if place in places else symbol for place, symbol in enumerate(symbols)]
+def without(symbols: Sequence[bytes], *indices: int) -> list[bytes | None]:
+    return [None if index in indices else symbol for index, symbol in enumerate(symbols)]
 
 
 BY_HAND = [bytes.fromhex("01 80"), bytes.fromhex("80 ff"), bytes.fromhex("c0")]
@@ -56,13 +56,13 @@ Q_BY_HAND = bytes.fromhex("3b 63")
 
 def test_parity_by_hand() -> None:
     """P is the sum of the symbols and Q that of 2^i times symbol i, over the polynomial 0x11d."""
-    assert parity(BY_HAND, 2) == [P_BY_HAND, Q_BY_HAND]
-    assert parity(BY_HAND, 1) == [P_BY_HAND]
-    assert parity(BY_HAND, 0) == []
+    assert compute_parity(BY_HAND, 2) == [P_BY_HAND, Q_BY_HAND]
+    assert compute_parity(BY_HAND, 1) == [P_BY_HAND]
+    assert compute_parity(BY_HAND, 0) == []
 
 
 @pytest.mark.parametrize(
-    ("places", "parities"),
+    ("indices", "parities"),
     [
         ([1], {P: P_BY_HAND}),
         ([1], {Q: Q_BY_HAND}),
@@ -71,68 +71,69 @@ def test_parity_by_hand() -> None:
         ([1, 2], {Q: Q_BY_HAND, P: P_BY_HAND}),
     ],
 )
-def test_missing_by_hand(places: list[int], parities: Mapping[int, bytes]) -> None:
-    """What is missing comes back in order, filled with zeros to the length of the parity symbols."""
-    filled = [*BY_HAND[:2], bytes.fromhex("c0 00")]
-    assert missing(without(BY_HAND, *places), parities) == [filled[place] for place in places]
+def test_recovery_by_hand(indices: list[int], parities: Mapping[int, bytes]) -> None:
+    """Missing symbols are recovered in order, padded with zeros to the length of the parity symbols."""
+    padded = [*BY_HAND[:2], bytes.fromhex("c0 00")]
+    assert recover(without(BY_HAND, *indices), parities) == [padded[index] for index in indices]
 
 
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=40), st.data())
 def test_any_missing(symbols: list[bytes], data: st.DataObject) -> None:
-    """Any one or two missing of any symbols come back from any parity symbols that are as many or more."""
-    made = parity(symbols, 2)
-    assert made == slow_parity(symbols)
-    places = sorted(data.draw(st.sets(st.integers(0, len(symbols) - 1), min_size=1, max_size=2)))
-    there = data.draw(st.sampled_from([[P, Q]] if len(places) == 2 else [[P], [Q], [P, Q]]))
-    filled = [symbol.ljust(len(made[P]), b"\x00") for symbol in symbols]
-    assert missing(without(symbols, *places), {which: made[which] for which in there}) == [filled[at] for at in places]
+    """Any one or two missing symbols are recovered from as many or more parity symbols."""
+    parities = compute_parity(symbols, 2)
+    assert parities == slow_parity(symbols)
+    lost = sorted(data.draw(st.sets(st.integers(0, len(symbols) - 1), min_size=1, max_size=2)))
+    received = data.draw(st.sampled_from([[P, Q]] if len(lost) == 2 else [[P], [Q], [P, Q]]))
+    padded = [symbol.ljust(len(parities[P]), b"\x00") for symbol in symbols]
+    recovered = recover(without(symbols, *lost), {which: parities[which] for which in received})
+    assert recovered == [padded[index] for index in lost]
 
 
 @pytest.mark.parametrize("size", [1, 3])
 def test_every_count(size: int) -> None:
-    """From 1 to 255 symbols P and Q are those of the definition, and make the first and last ones again."""
+    """P and Q of 1 to 255 symbols are those of the definition, and the first and last symbols are recovered."""
     for count in range(1, 256):
-        symbols = some(count, size)
-        p, q = parity(symbols, 2)
+        symbols = random_symbols(count, size)
+        p, q = compute_parity(symbols, 2)
         assert [p, q] == slow_parity(symbols)
-        for place in {0, count // 2, count - 1}:
-            assert missing(without(symbols, place), {P: p}) == [symbols[place]]
-            assert missing(without(symbols, place), {Q: q}) == [symbols[place]]
+        for index in {0, count // 2, count - 1}:
+            assert recover(without(symbols, index), {P: p}) == [symbols[index]]
+            assert recover(without(symbols, index), {Q: q}) == [symbols[index]]
         for first, second in {(0, count - 1), (0, 1), (count // 2, count - 1), (count - 2, count - 1)}:
             if 0 <= first < second < count:
                 lost = without(symbols, first, second)
-                assert missing(lost, {P: p, Q: q}) == [symbols[first], symbols[second]]
+                assert recover(lost, {P: p, Q: q}) == [symbols[first], symbols[second]]
 
 
-def test_every_place() -> None:
-    """Of 255 symbols each comes back from Q alone, and any two whatever lies between them."""
-    symbols = some(255, 2)
-    p, q = parity(symbols, 2)
-    for place in range(255):
-        assert missing(without(symbols, place), {Q: q}) == [symbols[place]]
+def test_every_index() -> None:
+    """Each of 255 symbols is recovered from Q alone, and two at any distance from P and Q."""
+    symbols = random_symbols(255, 2)
+    p, q = compute_parity(symbols, 2)
+    for index in range(255):
+        assert recover(without(symbols, index), {Q: q}) == [symbols[index]]
     for apart in range(1, 255):
         first = apart * 7 % (255 - apart)
         lost = without(symbols, first, first + apart)
-        assert missing(lost, {P: p, Q: q}) == [symbols[first], symbols[first + apart]]
+        assert recover(lost, {P: p, Q: q}) == [symbols[first], symbols[first + apart]]
 
 
 def test_empty_symbols() -> None:
-    """Symbols without bytes have parity without bytes."""
-    assert parity([b"", b""], 2) == [b"", b""]
-    assert missing([None, b"", None], {P: b"", Q: b""}) == [b"", b""]
+    """Empty symbols have empty parity symbols."""
+    assert compute_parity([b"", b""], 2) == [b"", b""]
+    assert recover([None, b"", None], {P: b"", Q: b""}) == [b"", b""]
 
 
 @pytest.mark.parametrize("parities", [{}, {P: b"p"}, {P: b"p", Q: b"q"}])
 def test_nothing_missing(parities: Mapping[int, bytes]) -> None:
-    """Where nothing is missing nothing is made."""
-    assert missing([b"a", b"b"], parities) == []
+    """If no symbol is missing, none is recovered."""
+    assert recover([b"a", b"b"], parities) == []
 
 
 @pytest.mark.parametrize(("symbols", "count"), [(0, 1), (256, 1), (1, 3), (1, -1)])
 def test_no_parity(symbols: int, count: int) -> None:
-    """Parity of no symbols or of more than 255, and other than P and Q, is refused."""
+    """Parity of no symbols or of more than 255, and other than P and Q, is rejected."""
     with pytest.raises(ValueError, match="choose 0 to 2 of 1 to 255"):
-        parity([b"x"] * symbols, count)
+        compute_parity([b"x"] * symbols, count)
 
 
 @pytest.mark.parametrize(
@@ -148,10 +149,10 @@ def test_no_parity(symbols: int, count: int) -> None:
         ([b"a"] * 255 + [None], {P: b"p"}),
     ],
 )
-def test_cannot_be(symbols: list[bytes | None], parities: Mapping[int, bytes]) -> None:
-    """More missing than there is parity, symbols longer than it and more than 255 of them are a bad packet."""
+def test_invalid_symbols(symbols: list[bytes | None], parities: Mapping[int, bytes]) -> None:
+    """Too few parity symbols, symbols longer than these and more than 255 symbols raise `BadPacket`."""
     with pytest.raises(BadPacket):
-        missing(symbols, parities)
+        recover(symbols, parities)
 
 
 @given(
@@ -159,9 +160,9 @@ def test_cannot_be(symbols: list[bytes | None], parities: Mapping[int, bytes]) -
     st.dictionaries(st.integers(-1, 3), st.binary(max_size=4)),
 )
 def test_any_bytes(symbols: list[bytes | None], parities: dict[int, bytes]) -> None:
-    """Whatever is taken for symbols and parity gives as many symbols as are missing or is a bad packet."""
+    """Any symbols and parity symbols give as many symbols as are missing or raise `BadPacket`."""
     try:
-        made = missing(symbols, parities)
+        recovered = recover(symbols, parities)
     except BadPacket:
         return
-    assert len(made) == symbols.count(None)
+    assert len(recovered) == symbols.count(None)

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.transport.rtp.adaptive_hold import LEAST_HOLD_NS
+from lavt.transport.rtp.adaptive_hold import MIN_HOLD_NS
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
-from lavt.transport.rtp.ntp_time import ntp_of_elapsed, short_time
+from lavt.transport.rtp.ntp_time import elapsed_to_ntp, ntp_to_short
 from lavt.transport.rtp.reception_stats import Reception, ReceptionSample
 from lavt.transport.rtp.rtcp import Announcement, SenderReport
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer
@@ -18,27 +18,27 @@ SSRC = 7
 
 
 class Stream:
-    """A reception with its reorder buffer, fed as the receiver node does."""
+    """Reception statistics with a jitter buffer, used as the receiver node does."""
 
     def __init__(self) -> None:
-        self.reorder = JitterBuffer()
-        self.reception = Reception(self.reorder)
+        self.jitter_buffer = JitterBuffer()
+        self.reception = Reception(self.jitter_buffer)
 
     def arrive(self, sequence: int, at_ns: int, timestamp: int = 0, ssrc: int = SSRC) -> None:
-        """Let a packet come from the network."""
+        """Push a packet from the network."""
         packet = RtpPacket(96, sequence % 2**16, timestamp % 2**32, ssrc, False, b"")
-        self.reorder.push(packet, at_ns)
+        self.jitter_buffer.push(packet, at_ns)
         self.reception.received(packet, at_ns)
 
     def recover(self, sequence: int, at_ns: int) -> None:
-        """Let a packet be made again."""
-        self.reorder.push_recovered(RtpPacket(96, sequence % 2**16, 0, SSRC, False, b""), at_ns)
+        """Push a recovered packet."""
+        self.jitter_buffer.push_recovered(RtpPacket(96, sequence % 2**16, 0, SSRC, False, b""), at_ns)
 
     def start(self, first: int, count: int = 1) -> None:
-        """Let the first packets come in order, and their hold be over."""
+        """Push the first packets in order, and let their hold expire."""
         for number in range(first, first + count):
             self.arrive(number, 0)
-        self.reorder.expire(LEAST_HOLD_NS)
+        self.jitter_buffer.expire(MIN_HOLD_NS)
 
 
 def losses(stream: Stream, at_ns: int) -> tuple[int, float, int]:
@@ -48,19 +48,19 @@ def losses(stream: Stream, at_ns: int) -> tuple[int, float, int]:
 
 
 def sample(stream: Stream, at_ns: int) -> tuple[int, ...]:
-    """Give packets, lost before repair, recovered, lost after it, reordered, late and duplicate."""
+    """Return packets, lost before repair, recovered, lost after repair, reordered, late and duplicate."""
     return astuple(stream.reception.sample(at_ns))[1:-2]
 
 
 def test_nothing_yet() -> None:
-    """Before the first packet there is nothing to report, and a sample is empty and has no duration."""
+    """Before the first packet there is no report, and a sample is empty and has no duration."""
     stream = Stream()
     assert stream.reception.report(NS_PER_S) is None
     assert stream.reception.sample(NS_PER_S) == ReceptionSample(0, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
 def test_samples_follow_each_other() -> None:
-    """The first sample begins with the first packet, each other one where the one before ended."""
+    """The first sample begins with the first packet, each later one at the end of the previous sample."""
     stream = Stream()
     stream.reception.sample(NS_PER_S)
     stream.arrive(1, 2 * NS_PER_S)
@@ -69,14 +69,14 @@ def test_samples_follow_each_other() -> None:
 
 
 def test_loss_without_repair() -> None:
-    """A packet that never comes is lost before and after repair, when its hold is over."""
+    """A packet that never arrives is lost before and after repair, once its hold has expired."""
     stream = Stream()
     stream.start(100, 5)
-    assert losses(stream, LEAST_HOLD_NS) == (104, 0.0, 0)
+    assert losses(stream, MIN_HOLD_NS) == (104, 0.0, 0)
     for number in (105, 107, 108):
         stream.arrive(number, 20 * NS_PER_MS)
     assert losses(stream, 20 * NS_PER_MS) == (108, 0.0, 0)
-    stream.reorder.expire(30 * NS_PER_MS)
+    stream.jitter_buffer.expire(30 * NS_PER_MS)
     stream.arrive(109, 31 * NS_PER_MS)
     assert losses(stream, 31 * NS_PER_MS) == (109, 1 / 2, 1)
     assert losses(stream, 32 * NS_PER_MS) == (109, 0.0, 1)
@@ -84,7 +84,7 @@ def test_loss_without_repair() -> None:
 
 
 def test_a_recovered_packet_is_lost_before_repair_only() -> None:
-    """A packet that was made again counts as lost in the report and before repair, and not after it."""
+    """A recovered packet counts as lost in the report and before repair, but not after repair."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
@@ -95,7 +95,7 @@ def test_a_recovered_packet_is_lost_before_repair_only() -> None:
 
 
 def test_the_original_after_its_recovery() -> None:
-    """A packet that comes after it was made again did arrive: it is a duplicate, and no loss any more."""
+    """A packet that arrives after it was recovered is a duplicate, and no longer lost."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
@@ -108,25 +108,25 @@ def test_the_original_after_its_recovery() -> None:
 
 
 def test_recovered_too_late() -> None:
-    """What is made again after it was given up, or was there already, counts nowhere."""
+    """A packet that is recovered after it was given up, or that is present already, is not counted."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
-    stream.reorder.expire(30 * NS_PER_MS)
+    stream.jitter_buffer.expire(30 * NS_PER_MS)
     stream.recover(2, 31 * NS_PER_MS)
     stream.recover(3, 31 * NS_PER_MS)
     assert sample(stream, 32 * NS_PER_MS) == (3, 1, 0, 1, 0, 0, 0)
 
 
 def test_reordered_late_and_duplicate() -> None:
-    """A late packet is lost to the decoder but arrived; an overtaken one is no loss at all."""
+    """A late packet is lost after repair but arrived; a reordered one is not lost."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS)
     stream.arrive(2, 25 * NS_PER_MS)
     assert sample(stream, 25 * NS_PER_MS) == (4, 0, 0, 0, 1, 0, 0)
     stream.arrive(5, 40 * NS_PER_MS)
-    stream.reorder.expire(50 * NS_PER_MS)
+    stream.jitter_buffer.expire(50 * NS_PER_MS)
     assert sample(stream, 50 * NS_PER_MS) == (1, 1, 0, 1, 0, 0, 0)
     stream.arrive(4, 51 * NS_PER_MS)
     stream.arrive(5, 51 * NS_PER_MS)
@@ -140,18 +140,18 @@ FATES = {
     "reordered": [("arrive", 5)],
     "late": [("arrive", 40)],
     "lost": [],
-    "made again": [("recover", 3)],
-    "made again late": [("recover", 40)],
-    "made again before": [("recover", 3), ("arrive", 6)],
-    "made again after": [("arrive", 3), ("recover", 6)],
+    "recovered": [("recover", 3)],
+    "recovered late": [("recover", 40)],
+    "recovered before arrival": [("recover", 3), ("arrive", 6)],
+    "recovered after arrival": [("arrive", 3), ("recover", 6)],
 }
-"""What happens to a packet, and how many ms after its time."""
+"""The events of a packet, each with its delay in ms."""
 SENT = st.lists(st.sampled_from(sorted(FATES)), max_size=20).map(lambda fates: [*fates, "arrives"])
 
 
 @given(st.integers(0, 2**16 - 1), st.lists(SENT, min_size=1, max_size=4))
 def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> None:
-    """Whatever happens to packets, the report says what the program of RFC 3550, A.3, computes."""
+    """For any events the report has the values that the program of RFC 3550, A.3, computes."""
     stream = Stream()
     stream.start(first)
     number, at_ms, received = first, 20, 1
@@ -160,13 +160,13 @@ def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> No
         events = []
         for fate in fates:
             number, at_ms = number + 1, at_ms + 1
-            events += [(at_ms + after_ms, what, number) for what, after_ms in FATES[fate]]
-        for event_ms, what, event_number in sorted(events):
-            stream.reorder.expire(event_ms * NS_PER_MS)
-            {"arrive": stream.arrive, "recover": stream.recover}[what](event_number, event_ms * NS_PER_MS)
-            received += what == "arrive"
+            events += [(at_ms + after_ms, kind, number) for kind, after_ms in FATES[fate]]
+        for event_ms, kind, event_number in sorted(events):
+            stream.jitter_buffer.expire(event_ms * NS_PER_MS)
+            {"arrive": stream.arrive, "recover": stream.recover}[kind](event_number, event_ms * NS_PER_MS)
+            received += kind == "arrive"
         at_ms += 100
-        stream.reorder.expire(at_ms * NS_PER_MS)
+        stream.jitter_buffer.expire(at_ms * NS_PER_MS)
         expected = number - first + 1
         expected_interval, expected_prior = expected - expected_prior, expected
         received_interval, received_prior = received - received_prior, received
@@ -177,7 +177,7 @@ def test_losses_are_those_of_the_rfc(first: int, periods: list[list[str]]) -> No
 
 
 def test_jitter_by_hand() -> None:
-    """Jitter moves by a sixteenth of each change of transit, over all packets, also those of one frame."""
+    """Jitter changes by a sixteenth of each change of transit time, over all packets, including those of one frame."""
     stream = Stream()
     stream.arrive(1, 0, timestamp=0)
     stream.arrive(2, 1_100_000, timestamp=0)  # 99 ticks later in the same frame
@@ -194,7 +194,7 @@ def test_jitter_by_hand() -> None:
     st.integers(0, 2**62),
 )
 def test_jitter_is_that_of_the_rfc(packets: list[tuple[int, int]], begin_ns: int) -> None:
-    """The jitter is what the program of RFC 3550, A.8, computes, across the wraps of both its clocks."""
+    """The jitter is the value that the program of RFC 3550, A.8, computes, across the wraps of both clocks."""
     stream = Stream()
     at_ns, timestamp, transit, jitter = begin_ns, 0, None, 0.0
     for number, (pause_ns, step) in enumerate(packets):
@@ -211,14 +211,14 @@ def test_jitter_is_that_of_the_rfc(packets: list[tuple[int, int]], begin_ns: int
 
 
 def test_sequence_numbers_wrap() -> None:
-    """The highest sequence number counts the wraps."""
+    """The highest sequence number includes the wraps."""
     stream = Stream()
     stream.start(65_534, 4)
-    assert losses(stream, LEAST_HOLD_NS) == (65_537, 0.0, 0)
+    assert losses(stream, MIN_HOLD_NS) == (65_537, 0.0, 0)
 
 
 def test_sender_report_comes_back() -> None:
-    """A reception report carries the middle of the last sender report's time and how long ago that came."""
+    """A reception report has the time of the last sender report, in short format, and the time since its arrival."""
     stream = Stream()
     stream.arrive(1, 0)
     report = stream.reception.report(NS_PER_S)
@@ -236,21 +236,21 @@ def test_sender_report_comes_back() -> None:
     assert report.last_report == 0
 
 
-def test_a_round_trip_of_less_than_a_step_is_known() -> None:
-    """It is 0 then, and not unknown."""
+def test_a_round_trip_time_of_less_than_a_step() -> None:
+    """A round-trip time of less than a step is 0, and not None."""
     reception = Reception(JitterBuffer())
     sent_ns = 5 * NS_PER_S
-    answer = ReferenceAnswer(1, short_time(ntp_of_elapsed(sent_ns)), 0)
+    answer = ReferenceAnswer(1, ntp_to_short(elapsed_to_ntp(sent_ns)), 0)
     reception.note_announcement(Announcement((), (answer,)), 1, sent_ns + 1000)
     assert reception.round_trip_ns == 0
 
 
-def test_an_answer_tells_the_round_trip() -> None:
-    """The sender's answer to a reference time of ours gives the round trip; that to another receiver's does not."""
+def test_an_answer_gives_the_round_trip_time() -> None:
+    """The sender's answer to our reference time gives the round-trip time; an answer to another receiver does not."""
     stream = Stream()
     stream.arrive(1, 0)
     sent_ns, kept_ns = 100 * NS_PER_S, 300 * NS_PER_MS
-    middle = short_time(ntp_of_elapsed(sent_ns))
+    middle = ntp_to_short(elapsed_to_ntp(sent_ns))
     arrived_ns = sent_ns + kept_ns + 80 * NS_PER_MS
     stream.reception.note_announcement(Announcement((), (ReferenceAnswer(6, middle, kept_ns),)), 5, arrived_ns)
     assert stream.reception.round_trip_ns is None
@@ -260,8 +260,8 @@ def test_an_answer_tells_the_round_trip() -> None:
     assert stream.reception.sample(arrived_ns).round_trip_us == stream.reception.round_trip_ns // 1000
 
 
-def test_another_stream_begins_anew() -> None:
-    """A report is about one SSRC; samples go on."""
+def test_another_stream_begins_new_reports() -> None:
+    """A report covers one SSRC; samples continue across streams."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(3, 20 * NS_PER_MS, timestamp=10**6)
@@ -274,8 +274,8 @@ def test_another_stream_begins_anew() -> None:
     assert sample(stream, NS_PER_S) == (5, 2, 0, 2, 0, 0, 0)
 
 
-def test_a_stray_packet_says_nothing() -> None:
-    """A packet far from all others counts neither as received nor in the jitter; two in a row are the stream's."""
+def test_a_stray_packet_is_not_counted() -> None:
+    """A stray packet counts neither as received nor in the jitter; two consecutive ones belong to the stream."""
     stream = Stream()
     stream.start(0, 2)
     stream.arrive(30_000, 20 * NS_PER_MS, timestamp=10**9)

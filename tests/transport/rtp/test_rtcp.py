@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import BadPacket
-from lavt.transport.rtp.ntp_time import delay_ns_of, ntp_of_elapsed, ntp_of_wall, round_trip_ns, short_delay, short_time
+from lavt.transport.rtp.ntp_time import (
+    delay_to_short,
+    elapsed_to_ntp,
+    ntp_to_short,
+    round_trip_ns,
+    short_to_delay_ns,
+    wall_to_ntp,
+)
 from lavt.transport.rtp.rtcp import (
     Announcement,
     BitRateLimit,
@@ -24,11 +31,11 @@ from lavt.transport.rtp.rtcp import (
     receiver_report,
     sender_report,
 )
-from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime, answered_round_trip_ns
+from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime, round_trip_of_answer_ns
 from lavt.transport.rtp.rtp import RtpPacket
 
 WORD = st.integers(0, 2**32 - 1)
-DELAY_NS = WORD.map(delay_ns_of)
+DELAY_NS = WORD.map(short_to_delay_ns)
 CLOCK_NS = st.integers(0, 2**62)
 CNAME = st.text("abcdefghij@.", min_size=1, max_size=300)
 REPORTS = st.builds(
@@ -55,7 +62,7 @@ SOME_SENDER_REPORT = sender_report(
     answered=[ReferenceAnswer(1, 0x8000, 2**20)],
 )
 
-# By hand, from the figures of the RFCs.
+# Written by hand from the figures of the RFCs.
 REPORT_BLOCK = "00000002 40 000005 00000003 00000006 b44db705 00054000"
 RECEIVER_REPORT = "81 c9 0007 00000001" + REPORT_BLOCK  # RFC 3550, section 6.4.2
 EMPTY_REPORT = "80 c9 0001 00000001"
@@ -69,17 +76,17 @@ LIMIT = "83 cd 0004 00000001 00000000 00000002"  # RFC 5104, section 4.2.1
 
 
 def test_receiver_report_as_in_the_rfcs() -> None:
-    """A receiver report, its source description and its reference time have the bytes that the RFCs give them."""
+    """A receiver report, its source description and its reference time have the formats of the RFCs."""
     assert bytes.fromhex(RECEIVER_REPORT + DESCRIPTION + REFERENCE_TIME) == SOME_REPORT
 
 
 def test_sender_report_as_in_the_rfcs() -> None:
-    """A sender report, its source description and its answers have the bytes that the RFCs give them."""
+    """A sender report, its source description and its answers have the formats of the RFCs."""
     assert bytes.fromhex(SENDER_REPORT + SENDER_DESCRIPTION + ANSWER) == SOME_SENDER_REPORT
 
 
 def test_sender_report_without_answers() -> None:
-    """A sender that has seen no reference time sends no extended report."""
+    """A sender without a reference time to answer sends no extended report."""
     datagram = sender_report(9, wall_ns=0, rtp_timestamp=7, packets=8, octets=9, cname="a")
     assert datagram == bytes.fromhex(SENDER_REPORT + SENDER_DESCRIPTION)
 
@@ -103,7 +110,7 @@ def test_picture_loss_as_in_the_rfcs() -> None:
     ],
 )
 def test_max_bit_rate_as_in_the_rfc(bit_rate_bps: int, exponent: int, mantissa: int) -> None:
-    """A limit of the bit rate is exponent, mantissa and overhead, rounded down and cut to what fits."""
+    """A bit rate limit is written as exponent, mantissa and overhead, rounded down and clamped."""
     datagram = max_bit_rate(1, 2, bit_rate_bps, overhead_bytes=40, cname="ab")
     word = exponent * 2**26 + mantissa * 2**9 + 40
     assert datagram == bytes.fromhex(EMPTY_REPORT + DESCRIPTION + LIMIT) + word.to_bytes(4, "big")
@@ -112,14 +119,14 @@ def test_max_bit_rate_as_in_the_rfc(bit_rate_bps: int, exponent: int, mantissa: 
 
 
 def test_overhead_beyond_its_field() -> None:
-    """An overhead above 511 bytes is said to be 511, and the bit rate stays as it is."""
+    """An overhead above 511 bytes is written as 511, and the bit rate is unchanged."""
     (limit,) = parse_feedback(max_bit_rate(1, 2, 1000, overhead_bytes=600)).limits
     assert limit == BitRateLimit(2, 1000, 511)
 
 
 @given(WORD, WORD, st.integers(0, 2**80), st.integers(0, 511))
 def test_max_bit_rate_round_trip(ssrc: int, media_ssrc: int, bit_rate_bps: int, overhead_bytes: int) -> None:
-    """A limit is read back at most one part in 2^16 below what was asked, and never above."""
+    """A limit is parsed as at most one part in 2^16 below the requested one, and never above it."""
     datagram = max_bit_rate(ssrc, media_ssrc, bit_rate_bps, overhead_bytes=overhead_bytes)
     (limit,) = parse_feedback(datagram).limits
     assert (limit.media_ssrc, limit.overhead_bytes) == (media_ssrc, overhead_bytes)
@@ -128,7 +135,7 @@ def test_max_bit_rate_round_trip(ssrc: int, media_ssrc: int, bit_rate_bps: int, 
 
 @given(WORD, REPORTS, CLOCK_NS, CNAME)
 def test_receiver_report_round_trip(ssrc: int, report: ReceptionReport, clock_ns: int, cname: str) -> None:
-    """A receiver report that is written is read back as it was, with its reference time."""
+    """A written receiver report is parsed back unchanged, with its reference time."""
     datagram = receiver_report(ssrc, report, clock_ns=clock_ns, cname=cname)
     assert is_rtcp(datagram)
     reference = ReferenceTime(ssrc, clock_ns * 65_536 // NS_PER_S % 2**32)
@@ -140,20 +147,20 @@ def test_receiver_report_round_trip(ssrc: int, report: ReceptionReport, clock_ns
 def test_sender_report_round_trip(
     ssrc: int, wall_ns: int, counts: tuple[int, int, int], cname: str, answers: list[ReferenceAnswer]
 ) -> None:
-    """A sender report that is written is read back as it was, with its answers."""
+    """A written sender report is parsed back unchanged, with its answers."""
     timestamp, packets, octets = counts
     datagram = sender_report(
         ssrc, wall_ns=wall_ns, rtp_timestamp=timestamp, packets=packets, octets=octets, cname=cname, answered=answers
     )
     assert is_rtcp(datagram)
-    report = SenderReport(ssrc, ntp_of_wall(wall_ns), timestamp, packets, octets)
+    report = SenderReport(ssrc, wall_to_ntp(wall_ns), timestamp, packets, octets)
     assert parse_announcement(datagram) == Announcement((report,), tuple(answers))
     assert parse_feedback(datagram) == Feedback()
 
 
 @given(st.text(max_size=400))
 def test_any_cname(cname: str) -> None:
-    """A source description is of whole words and ends with at least one zero byte, whatever the name is."""
+    """A source description has whole words and ends with at least one zero byte for any name."""
     datagram = picture_loss(1, 2, cname=cname)
     assert parse_feedback(datagram) == Feedback(picture_loss=True)
     name = cname.encode()[:255]
@@ -166,27 +173,27 @@ def test_any_cname(cname: str) -> None:
 
 
 def test_values_beyond_their_fields() -> None:
-    """Values that do not fit their field are cut to the nearest that do, and the sequence number wraps."""
+    """Values that do not fit their field are clamped, and the sequence number wraps."""
     beyond = ReceptionReport(2, 2**32 + 9, 1.0, 2**30, 2**40, 1, 2**60)
     (report,) = parse_feedback(receiver_report(1, beyond, clock_ns=0)).reports
-    assert report == ReceptionReport(2, 9, 255 / 256, 2**23 - 1, 2**32 - 1, 1, delay_ns_of(2**32 - 1))
+    assert report == ReceptionReport(2, 9, 255 / 256, 2**23 - 1, 2**32 - 1, 1, short_to_delay_ns(2**32 - 1))
     below = ReceptionReport(2, 9, -1.0, -(2**30), 0, 1, -1)
     (report,) = parse_feedback(receiver_report(1, below, clock_ns=0)).reports
     assert report == ReceptionReport(2, 9, 0.0, -(2**23), 0, 1, 0)
 
 
 def test_compound() -> None:
-    """Reports of senders give their blocks, too, and what is not known is passed over: packets, formats, blocks."""
+    """Report blocks of sender reports are parsed, too, and unknown packets, formats and blocks are skipped."""
     with_block = "81 c8 000c 00000009" + "00" * 20 + REPORT_BLOCK
     unknown = (
         "80 d0 0000" + "8f ce 0002 00000001 00000002" + "81 cd 0003 00000001 00000002 00010000" + "81 cb 0001 00000001"
     )
     extended = "80 cf 0006 00000001 07 00 0001 00000000 04 00 0002 00000000 80000000"
-    heard = parse_feedback(bytes.fromhex(with_block + DESCRIPTION + unknown + extended + PICTURE_LOSS))
-    assert heard == Feedback((REPORT,), picture_loss=True, reference_times=(ReferenceTime(1, 0x8000),))
-    known = parse_announcement(bytes.fromhex(SENDER_REPORT + unknown + extended + ANSWER))
-    answer = ReferenceAnswer(1, 0x8000, delay_ns_of(0x45))
-    assert known == Announcement((SenderReport(9, 0x83AA7E80 << 32, 7, 8, 9),), (answer,))
+    feedback = parse_feedback(bytes.fromhex(with_block + DESCRIPTION + unknown + extended + PICTURE_LOSS))
+    assert feedback == Feedback((REPORT,), picture_loss=True, reference_times=(ReferenceTime(1, 0x8000),))
+    announcement = parse_announcement(bytes.fromhex(SENDER_REPORT + unknown + extended + ANSWER))
+    answer = ReferenceAnswer(1, 0x8000, short_to_delay_ns(0x45))
+    assert announcement == Announcement((SenderReport(9, 0x83AA7E80 << 32, 7, 8, 9),), (answer,))
 
 
 def test_padding_and_extension() -> None:
@@ -197,16 +204,23 @@ def test_padding_and_extension() -> None:
     assert parse_feedback(bytes.fromhex(extended)) == Feedback((REPORT,))
 
 
-WRONG_HEADS = ("", RECEIVER_REPORT[:-2], PICTURE_LOSS, DESCRIPTION, "81c90000 81c90000", "41" + RECEIVER_REPORT[2:])
-WRONG_TAILS = (
+INVALID_BEGINNINGS = (
+    "",
+    RECEIVER_REPORT[:-2],
+    PICTURE_LOSS,
+    DESCRIPTION,
+    "81c90000 81c90000",
+    "41" + RECEIVER_REPORT[2:],
+)
+INVALID_ENDS = (
     "81ce",
     "81ca0005",
     "41ce0000",
     "a1ca0000",  # padding without room for its own length
-    "a1ca000100000000",  # of no length
-    "a1ca000100000003",  # of no whole words
-    "a1ca000100000008",  # longer than the packet
-    "a1ca000100000004" + DESCRIPTION,  # before the last packet
+    "a1ca000100000000",  # padding of length 0
+    "a1ca000100000003",  # padding that is not whole words
+    "a1ca000100000008",  # padding longer than the packet
+    "a1ca000100000004" + DESCRIPTION,  # padding before the last packet
 )
 WRONG_FOR_SENDER = (
     "82" + RECEIVER_REPORT[2:],
@@ -231,9 +245,9 @@ WRONG_FOR_RECEIVER = (
 )
 
 
-@pytest.mark.parametrize("datagram", [*WRONG_HEADS, *(EMPTY_REPORT + tail for tail in WRONG_TAILS)])
+@pytest.mark.parametrize("datagram", [*INVALID_BEGINNINGS, *(EMPTY_REPORT + end for end in INVALID_ENDS)])
 def test_not_rtcp(datagram: str) -> None:
-    """A datagram that does not begin with a report, is cut off, of another version or padded wrongly is refused."""
+    """A datagram without a report first, cut off, of another version or with invalid padding raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_feedback(bytes.fromhex(datagram))
     with pytest.raises(BadPacket):
@@ -242,14 +256,14 @@ def test_not_rtcp(datagram: str) -> None:
 
 @pytest.mark.parametrize("packet", WRONG_FOR_SENDER)
 def test_wrong_lengths_for_the_sender(packet: str) -> None:
-    """A report, request or reference time of a length that it cannot have is refused."""
+    """A report, request or reference time of an impossible length raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_feedback(bytes.fromhex(EMPTY_REPORT + packet))
 
 
 @pytest.mark.parametrize("packet", WRONG_FOR_RECEIVER)
 def test_wrong_lengths_for_the_receiver(packet: str) -> None:
-    """A sender report or an answer of a length that it cannot have is refused."""
+    """A sender report or an answer of an impossible length raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_announcement(bytes.fromhex(EMPTY_REPORT + packet))
 
@@ -267,7 +281,7 @@ PACKETS = st.builds(
 
 @given(st.one_of(st.binary(max_size=80), st.lists(PACKETS, max_size=4).map(b"".join)))
 def test_any_bytes(data: bytes) -> None:
-    """No bytes make a parser raise anything but `BadPacket`."""
+    """For any bytes a parser raises nothing but `BadPacket`."""
     for head in (b"", b"\x81\xc9", bytes.fromhex(EMPTY_REPORT)):
         for parse in (parse_feedback, parse_announcement):
             try:
@@ -278,24 +292,24 @@ def test_any_bytes(data: bytes) -> None:
 
 
 def test_ntp_times() -> None:
-    """An NTP timestamp counts from 1900 for a wall clock, and from the clock's own zero for any other."""
+    """An NTP timestamp counts from 1900 for the wall clock, and from the clock's own epoch for any other."""
     half_past = 1_500_000_000_500_000_000
-    assert ntp_of_wall(half_past) == (1_500_000_000 + 2_208_988_800) << 32 | 2**31
-    assert ntp_of_elapsed(half_past) == 1_500_000_000 << 32 | 2**31
-    assert short_time(0x0123_4567_89AB_CDEF) == 0x4567_89AB
+    assert wall_to_ntp(half_past) == (1_500_000_000 + 2_208_988_800) << 32 | 2**31
+    assert elapsed_to_ntp(half_past) == 1_500_000_000 << 32 | 2**31
+    assert ntp_to_short(0x0123_4567_89AB_CDEF) == 0x4567_89AB
     second_era_ns = (2**32 - 2_208_988_800) * NS_PER_S
-    assert (ntp_of_wall(second_era_ns - 1) >> 32, ntp_of_wall(second_era_ns)) == (2**32 - 1, 0)
+    assert (wall_to_ntp(second_era_ns - 1) >> 32, wall_to_ntp(second_era_ns)) == (2**32 - 1, 0)
 
 
 @given(WORD)
 def test_delays(short: int) -> None:
-    """A delay on the wire is the nearest 1/65536 s to its ns, and back."""
-    assert short_delay(delay_ns_of(short)) == short
-    assert abs(delay_ns_of(short) * 65_536 - short * NS_PER_S) <= 32_768
+    """A delay is converted to 1/65536 s and back with rounding to the nearest."""
+    assert delay_to_short(short_to_delay_ns(short)) == short
+    assert abs(short_to_delay_ns(short) * 65_536 - short * NS_PER_S) <= 32_768
 
 
 def test_round_trip_of_the_rfc() -> None:
-    """The example of RFC 3550 (figure 2) gives its 6.125 s."""
+    """The round-trip time of the example in RFC 3550 (figure 2) is 6.125 s."""
     assert round_trip_ns(0xB710_8000, 0xB705_2000, 5_250_000_000) == 6_125_000_000
 
 
@@ -303,26 +317,24 @@ STEP_NS = -(-NS_PER_S // 65_536)
 
 
 @given(CLOCK_NS, st.integers(0, 59 * NS_PER_S), st.integers(0, 65_000 * NS_PER_S))
-def test_both_know_the_round_trip(sent_ns: int, trip_ns: int, kept_ns: int) -> None:
-    """Each side gets the round trip to two steps of 1/65536 s, also across the wraps of the clock's middle bits.
-
-    Ours is the receiver; what any sender computes from its report is written out here.
-    """
-    back_ns = sent_ns + trip_ns + kept_ns
-    last = short_time(ntp_of_wall(sent_ns))
-    trips = [(last, round_trip_ns(short_time(ntp_of_wall(back_ns)), last, kept_ns))]
-    last = short_time(ntp_of_elapsed(sent_ns))
-    trips.append((last, answered_round_trip_ns(ReferenceAnswer(1, last, kept_ns), back_ns)))
-    for last, known_ns in trips:
+def test_both_sides_know_the_round_trip_time(sent_ns: int, trip_ns: int, kept_ns: int) -> None:
+    """Each side computes the round-trip time to two steps of 1/65536 s, also across the wrap of the short format."""
+    arrived_ns = sent_ns + trip_ns + kept_ns
+    # The sender's computation from a receiver report.
+    last = ntp_to_short(wall_to_ntp(sent_ns))
+    trips = [(last, round_trip_ns(ntp_to_short(wall_to_ntp(arrived_ns)), last, kept_ns))]
+    last = ntp_to_short(elapsed_to_ntp(sent_ns))
+    trips.append((last, round_trip_of_answer_ns(ReferenceAnswer(1, last, kept_ns), arrived_ns)))
+    for last, computed_ns in trips:
         if last == 0:
-            assert known_ns is None
+            assert computed_ns is None
         else:
-            assert known_ns is not None
-            assert abs(known_ns - trip_ns) <= 2 * STEP_NS
+            assert computed_ns is not None
+            assert abs(computed_ns - trip_ns) <= 2 * STEP_NS
 
 
 def test_impossible_round_trips() -> None:
-    """There is none before the first report, below zero by more than a step, or above 60 s."""
+    """There is no round-trip time before the first report, below zero by more than a step, or above 60 s."""
     assert round_trip_ns(2**31, 0, 0) is None
     assert round_trip_ns(100, 100, 2 * STEP_NS) is None
     assert round_trip_ns(100, 100, STEP_NS) == 0
@@ -332,13 +344,13 @@ def test_impossible_round_trips() -> None:
 
 
 @given(st.binary(max_size=30))
-def test_one_or_the_other(datagram: bytes) -> None:
-    """No datagram is RTP and RTCP at once."""
+def test_no_datagram_is_both(datagram: bytes) -> None:
+    """No datagram is both RTP and RTCP."""
     assert not (is_rtp(datagram) and is_rtcp(datagram))
 
 
-def test_telling_apart() -> None:
-    """RTP of our payload type is RTP with and without marker, and what is neither is neither."""
+def test_rtp_and_rtcp_are_told_apart() -> None:
+    """RTP of our payload type is RTP with and without marker; other datagrams are neither RTP nor RTCP."""
     for marker in (False, True):
         datagram = RtpPacket(96, 1, 2, 3, marker, b"").to_bytes()
         assert is_rtp(datagram)

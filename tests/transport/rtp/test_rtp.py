@@ -15,7 +15,7 @@ from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, Packetizer, RtpPack
 from lavt.transport.video.h264 import Encoder
 
 MAX_ACCESS_UNIT_BYTES = 2 * 1024 * 1024
-"""The design's limit, in a number of our own: whoever changes the code's must change this."""
+"""The design's limit, repeated here: a change of the code's limit must change this one, too."""
 START = b"\x00\x00\x00\x01"
 SPS, PPS, IDR, SLICE = b"\x67\x42\xc0\x1e", b"\x68\xce\x3c\x80", b"\x65", b"\x41"
 
@@ -28,7 +28,7 @@ PACKETS = st.builds(
     marker=st.booleans(),
     payload=st.binary(max_size=100),
 )
-# NAL units as an encoder makes them: a type that stands alone, no start code inside, no zero at the end.
+# NAL units as an encoder makes them: of a single NAL unit type, without start codes, without a zero at the end.
 BODIES = st.binary(max_size=5000).map(lambda body: body.replace(b"\x00", b"\x07"))
 NAL_UNITS = st.builds(lambda kind, body: bytes([0x60 | kind]) + body + b"\x80", st.integers(1, 23), BODIES)
 
@@ -57,20 +57,20 @@ PICTURE = byte_stream(SLICE + b"\x9a" + b"p" * 3000)
 
 @given(PACKETS)
 def test_packet_round_trip(sent: RtpPacket) -> None:
-    """A packet that is written is read back as it was."""
+    """A written packet is parsed back unchanged."""
     assert parse_packet(sent.to_bytes()) == sent
 
 
 def test_header_as_in_the_rfc() -> None:
-    """The header has the bytes that RFC 3550 gives it."""
+    """The header has the format of RFC 3550."""
     sent = RtpPacket(96, 0x0102, 0x03040506, 0x0708090A, marker=True, payload=b"x")
     assert sent.to_bytes() == bytes.fromhex("80 e0 0102 03040506 0708090a") + b"x"
     of_type_0 = parse_packet(bytes.fromhex("80 80 0102 03040506 0708090a"))
     assert (of_type_0.payload_type, of_type_0.marker) == (0, True)
 
 
-def test_what_others_put_into_a_header() -> None:
-    """Contributing sources, header extension and padding are left out of the payload."""
+def test_optional_parts_of_a_packet() -> None:
+    """Contributing sources, header extension and padding are not part of the payload."""
     fixed = bytes.fromhex("b2 60 0102 03040506 0708090a")
     sources, extension = b"c" * 8, bytes.fromhex("bede 0002") + b"e" * 8
     assert parse_packet(fixed + sources + extension + b"payload" + b"\x00\x00\x03").payload == b"payload"
@@ -91,14 +91,14 @@ def test_what_others_put_into_a_header() -> None:
     ],
 )
 def test_not_rtp(datagram: str) -> None:
-    """A datagram of another version, or shorter than its own header says, is no packet."""
+    """A datagram of another version, or shorter than its header says, raises `BadPacket`."""
     with pytest.raises(BadPacket):
         parse_packet(bytes.fromhex(datagram))
 
 
 @given(st.binary(max_size=80))
 def test_any_bytes_as_packet(data: bytes) -> None:
-    """No datagram makes the parser raise anything but `BadPacket`."""
+    """For any datagram the parser raises nothing but `BadPacket`."""
     for datagram in (data, b"\xbf" + data):
         try:
             parsed = parse_packet(datagram)
@@ -109,7 +109,7 @@ def test_any_bytes_as_packet(data: bytes) -> None:
 
 
 def test_split() -> None:
-    """NAL units are found behind long and short start codes, without filling zeros and empty units."""
+    """NAL units are found after long and short start codes, without trailing zeros and empty units."""
     assert split_nal_units(b"junk" + START + SPS + b"\x00\x00\x01" + PPS + b"\x00\x00" + START + START + IDR) == [
         SPS,
         PPS,
@@ -122,7 +122,7 @@ def test_split() -> None:
 
 @given(st.lists(NAL_UNITS, min_size=1, max_size=8), st.integers(64, 1500), st.integers(0, 2**32 - 1))
 def test_there_and_back(units: list[bytes], max_packet_bytes: int, timestamp: int) -> None:
-    """Whatever an access unit consists of, it comes out of its packets byte for byte, complete, with the last one."""
+    """Any access unit is reassembled byte for byte and complete with its last packet."""
     data = byte_stream(*units)
     packets = packets_of(data, timestamp, max_packet_bytes)
     depacketizer = Depacketizer()
@@ -134,7 +134,7 @@ def test_there_and_back(units: list[bytes], max_packet_bytes: int, timestamp: in
 
 @given(st.lists(NAL_UNITS, min_size=1, max_size=8), st.integers(64, 1500))
 def test_packets(units: list[bytes], max_packet_bytes: int) -> None:
-    """No packet is too large, all carry the timestamp, numbers run on over the wrap, the last has the marker."""
+    """Packets keep to the size and the timestamp, their numbers continue across the wrap, the last has the marker."""
     packetizer = Packetizer(ssrc=9, first_sequence=65_534, payload_type=99, max_packet_bytes=max_packet_bytes)
     datagrams = packetizer.packetize(byte_stream(*units), 1234)
     packets = [parse_packet(datagram) for datagram in datagrams]
@@ -145,8 +145,8 @@ def test_packets(units: list[bytes], max_packet_bytes: int) -> None:
     assert packetizer.next_sequence == (65_534 + len(packets)) % 2**16
 
 
-def test_three_ways() -> None:
-    """Small neighbours share a STAP-A, a lone unit goes as it is, a large one goes in FU-A of equal size."""
+def test_packet_types() -> None:
+    """Small consecutive units share a STAP-A, a single unit is sent unchanged, a large one in FU-A of equal size."""
     packets = packets_of(KEYFRAME)
     assert packets[0].payload == bytes([0x78]) + b"\x00\x04" + SPS + b"\x00\x04" + PPS
     fragments = packets[1:]
@@ -158,56 +158,56 @@ def test_three_ways() -> None:
 
 
 @pytest.mark.parametrize("units", [(b"\x06sei", b"\x41slice"), (b"\x41slice", b"\x06sei")])
-def test_importance_of_units_that_share_a_packet(units: tuple[bytes, bytes]) -> None:
-    """A STAP-A is as important as the most important of its units (RFC 6184, section 5.7.1)."""
+def test_nal_ref_idc_of_a_stap_a(units: tuple[bytes, bytes]) -> None:
+    """A STAP-A has the highest NRI of its units (RFC 6184, section 5.7.1)."""
     (shared,) = packets_of(byte_stream(*units))
     assert shared.payload[0] == 0x58
 
 
 def test_headers_of_fragments() -> None:
-    """Each piece of a large unit has its importance and type, the first also the start bit and the last the end bit."""
+    """Each fragment has the NRI and type of its unit, the first also the start bit and the last the end bit."""
     payloads = [one.payload for one in packets_of(START + b"\x46" + b"s" * 5000)]
     assert [payload[:2].hex() for payload in payloads] == ["5c86", "5c06", "5c06", "5c06", "5c46"]
 
 
 @pytest.mark.parametrize(
-    ("unit_bytes", "kinds"),
+    ("unit_bytes", "types"),
     [([1188], [1]), ([1189], [28, 28]), ([1000, 183], [24]), ([1000, 184], [1, 1]), ([100, 1189, 100], [1, 28, 28, 1])],
 )
-def test_what_fits_one_packet(unit_bytes: list[int], kinds: list[int]) -> None:
-    """A packet of 1200 bytes has room for a unit of 1188 bytes, or for units that take 1188 with type and sizes."""
+def test_room_of_a_packet(unit_bytes: list[int], types: list[int]) -> None:
+    """A packet of 1200 bytes has room for a unit of 1188 bytes, or for units of 1188 bytes with type and sizes."""
     packets = packets_of(byte_stream(*(SLICE + b"p" * (size - 1) for size in unit_bytes)))
-    assert [one.payload[0] & 0x1F for one in packets] == kinds
+    assert [one.payload[0] & 0x1F for one in packets] == types
 
 
-def test_the_first_number_is_taken_modulo_2_to_the_16() -> None:
-    """A first sequence number beyond the field of the header wraps."""
+def test_the_first_sequence_number_wraps() -> None:
+    """A first sequence number is taken modulo 2^16."""
     assert Packetizer(1, 2**16).next_sequence == 0
     assert Packetizer(1, 2**16 - 1).next_sequence == 2**16 - 1
 
 
 def test_nothing_to_send() -> None:
-    """An access unit without NAL units makes no packets."""
+    """An access unit without NAL units gives no packets."""
     assert Packetizer(1, 0).packetize(b"", 1) == []
 
 
 @pytest.mark.parametrize("size", [0, 63, 65_508])
 def test_bad_packet_size(size: int) -> None:
-    """A packet size that no stream can use is refused."""
+    """A packet size that no stream can use is rejected."""
     with pytest.raises(UserError, match="choose"):
         Packetizer(1, 0, max_packet_bytes=size)
 
 
 @pytest.mark.parametrize("size", [64, 65_507])
 def test_smallest_and_largest_packet_size(size: int) -> None:
-    """Packets may have 64 bytes at least and 65 507 at most, as many as a datagram has room for."""
+    """Packets may have 64 to 65 507 bytes, the most that a datagram has room for."""
     sizes = [len(one.to_bytes()) for one in packets_of(START + SLICE + b"p" * (size - 13), max_packet_bytes=size)]
     assert sizes == [size]
 
 
 @pytest.mark.parametrize("missing", range(6))
 def test_a_packet_is_lost(missing: int) -> None:
-    """Whichever packet of a keyframe is lost, its access unit leaves once, incomplete, and the next one is whole."""
+    """If any packet of a keyframe is lost, its access unit is returned once, incomplete, and the next one complete."""
     depacketizer = Depacketizer()
     first, second = packets_of(KEYFRAME, 1), packets_of(KEYFRAME, 2)
     units = push_all(depacketizer, first[:missing])
@@ -219,8 +219,8 @@ def test_a_packet_is_lost(missing: int) -> None:
     assert depacketizer.malformed == 0
 
 
-def test_what_is_left_of_a_fragmented_unit() -> None:
-    """Of a NAL unit with a hole the part before the hole stays, and that after it is left out."""
+def test_fragments_before_a_gap_are_kept() -> None:
+    """Of a NAL unit with a lost fragment, the fragments before the gap are kept and those after it dropped."""
     packets = packets_of(KEYFRAME)
     depacketizer = Depacketizer()
     push_all(depacketizer, packets[:3])
@@ -230,7 +230,7 @@ def test_what_is_left_of_a_fragmented_unit() -> None:
 
 
 def test_a_whole_access_unit_is_lost() -> None:
-    """A picture right after a lost one is not complete, since it refers to it; a keyframe with parameter sets is."""
+    """A picture directly after a lost one is incomplete, unless it is a keyframe with parameter sets."""
     depacketizer = Depacketizer()
     units = push_all(depacketizer, packets_of(PICTURE, 1), lost_before=True)
     units += push_all(depacketizer, packets_of(PICTURE, 2))
@@ -239,8 +239,8 @@ def test_a_whole_access_unit_is_lost() -> None:
     assert [unit.complete for unit in units] == [False, True, True, False]
 
 
-def test_only_a_keyframe_stands_alone() -> None:
-    """After a loss only a keyframe is complete, whatever else an access unit begins with."""
+def test_only_a_keyframe_is_complete_after_a_loss() -> None:
+    """After a loss an access unit that is not a keyframe is incomplete, even if it begins with a delimiter."""
     for head in (b"\x09\x10", SPS):
         (unit,) = push_all(Depacketizer(), packets_of(byte_stream(head, SLICE + b"p"), 1), lost_before=True)
         assert not unit.complete
@@ -250,13 +250,13 @@ def test_only_a_keyframe_stands_alone() -> None:
     ("head", "complete"), [(b"\x09\x10", True), (SPS, True), (PPS, False), (b"\x06sei", False), (b"\x0aend", False)]
 )
 def test_a_keyframe_after_a_loss(head: bytes, *, complete: bool) -> None:
-    """After a loss a keyframe is complete when it begins with a delimiter or a sequence parameter set."""
+    """After a loss a keyframe is complete only if it begins with a delimiter or a sequence parameter set."""
     packets = packets_of(byte_stream(head, IDR + b"k"))
     assert [unit.complete for unit in push_all(Depacketizer(), packets, lost_before=True)] == [complete]
 
 
-def test_pieces_without_bytes() -> None:
-    """A piece of a fragmented unit may be empty (RFC 6184, section 5.8)."""
+def test_empty_fragments() -> None:
+    """A fragment of a unit may be empty (RFC 6184, section 5.8)."""
     payloads = [b"\x7c\x85", b"\x7c\x05", b"\x7c\x05k", b"\x7c\x45"]
     packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
     assert push_all(Depacketizer(), packets) == [AccessUnit(byte_stream(IDR + b"k"), 1, complete=True, keyframe=True)]
@@ -264,7 +264,7 @@ def test_pieces_without_bytes() -> None:
 
 @pytest.mark.parametrize("missing", [0, 1, 2])
 def test_a_slice_is_lost(missing: int) -> None:
-    """Of a picture in slices, each with a packet of its own, no slice is missing unnoticed."""
+    """A picture with a slice in each packet is incomplete if any slice is lost."""
     packets = [packet(SLICE + b"%d" % number, 1, marker=number == 2) for number in range(3)]
     depacketizer = Depacketizer()
     units = push_all(depacketizer, packets[:missing])
@@ -272,14 +272,14 @@ def test_a_slice_is_lost(missing: int) -> None:
     assert [(unit.timestamp, unit.complete) for unit in units] == [(1, False)]
 
 
-def test_nothing_left() -> None:
-    """An access unit of which only useless packets came leaves empty and incomplete."""
+def test_only_useless_packets() -> None:
+    """An access unit of which only useless fragments arrived is returned empty and incomplete."""
     (unit,) = push_all(Depacketizer(), packets_of(PICTURE)[1:], lost_before=True)
     assert unit == AccessUnit(b"", 1, complete=False, keyframe=False)
 
 
 def test_lost_marker() -> None:
-    """When the marker packet is lost, the access unit leaves with the first packet of the next, which may end too."""
+    """If the marker packet is lost, the access unit is returned with the first packet of the next one."""
     depacketizer = Depacketizer()
     small = byte_stream(SPS, PPS, IDR + b"s")
     assert push_all(depacketizer, packets_of(PICTURE, 1)[:-1]) == []
@@ -288,7 +288,7 @@ def test_lost_marker() -> None:
 
 
 def test_sender_without_markers() -> None:
-    """From a sender that sets no markers access units leave one later, but complete, since nothing is missing."""
+    """Without markers an access unit is returned complete when the next one begins."""
     depacketizer = Depacketizer()
     assert depacketizer.push(packet(SLICE + b"one", 1), False) == []
     assert depacketizer.push(packet(SLICE + b"two", 2), False) == [
@@ -315,14 +315,14 @@ MALFORMED = {
     "FU-A that starts and ends": b"\x7c\xc5abc",
     "FU-A of type 28": b"\x7c\x9cabc",
     "FU-A that starts type 0": b"\x7c\x80abc",
-    "FU-A that goes on with type 0": b"\x7c\x00abc",
+    "FU-A that continues type 0": b"\x7c\x00abc",
     "FU-A that ends type 0": b"\x7c\x40abc",
 }
 
 
 @pytest.mark.parametrize("payload", MALFORMED.values(), ids=MALFORMED.keys())
 def test_malformed(payload: bytes) -> None:
-    """A payload that is not H.264 in mode 1 is counted and leaves its access unit incomplete, and only that one."""
+    """A payload that is not H.264 in mode 1 is counted and makes only its access unit incomplete."""
     depacketizer = Depacketizer()
     assert depacketizer.push(packet(SLICE + b"good"), False) == []
     (unit,) = depacketizer.push(packet(payload, marker=True), False)
@@ -344,14 +344,14 @@ def test_malformed(payload: bytes) -> None:
     ],
 )
 def test_fragments_without_end(payloads: list[bytes]) -> None:
-    """A fragmented unit whose start or end is missing makes its access unit incomplete, even if no packet is."""
+    """A fragmented unit without start or end makes its access unit incomplete, even if no packet is missing."""
     packets = [packet(payload) for payload in payloads]
     units = push_all(Depacketizer(), [*packets[:-1], packet(payloads[-1], marker=True)])
     assert [unit.complete for unit in units] == [False]
 
 
-def test_pieces_of_another_unit_end_a_fragmented_unit() -> None:
-    """After a piece of another type the remaining pieces of a fragmented unit are left out."""
+def test_fragments_of_another_unit_end_a_fragmented_unit() -> None:
+    """After a fragment of another type the remaining fragments of a unit are dropped."""
     payloads = [b"\x7c\x81start", b"\x7c\x05other", b"\x7c\x41end"]
     packets = [packet(payload, marker=payload is payloads[-1]) for payload in payloads]
     assert push_all(Depacketizer(), packets) == [
@@ -360,7 +360,7 @@ def test_pieces_of_another_unit_end_a_fragmented_unit() -> None:
 
 
 def test_a_peer_that_never_ends() -> None:
-    """An access unit without end takes a bounded amount of memory; what comes beyond is counted as malformed."""
+    """An access unit without end uses bounded memory; payloads beyond the limit are counted as malformed."""
     depacketizer = Depacketizer()
     piece = packet(SLICE + bytes(60_000))
     count = MAX_ACCESS_UNIT_BYTES // 60_000 + 5
@@ -376,7 +376,7 @@ def test_the_largest_access_unit(more_bytes: int, malformed: int) -> None:
     """An access unit of the largest size is complete; a packet that would make it longer is malformed."""
     depacketizer = Depacketizer()
     depacketizer.push(packet(SLICE + bytes(999)), False)
-    # What is there already has a start code before its 1000 bytes.
+    # The first NAL unit has a start code before its 1000 bytes.
     last = SLICE + bytes(MAX_ACCESS_UNIT_BYTES - 1004 - 1 + more_bytes)
     (unit,) = depacketizer.push(packet(last, marker=True), False)
     assert (depacketizer.malformed, unit.complete) == (malformed, not malformed)
@@ -390,7 +390,7 @@ PAYLOADS = st.builds(lambda head, tail: head + tail, HEADS, st.binary(max_size=2
 
 @given(st.lists(st.tuples(PAYLOADS, st.integers(0, 2), st.booleans(), st.booleans()), max_size=30))
 def test_any_payloads(steps: list[tuple[bytes, int, bool, bool]]) -> None:
-    """No payloads make the depacketizer raise or spoil what comes after, and at most two access units leave at once."""
+    """No payloads make the depacketizer raise or affect later access units, and a push returns two units at most."""
     depacketizer = Depacketizer()
     for payload, timestamp, marker, lost_before in steps:
         units = depacketizer.push(packet(payload, timestamp, marker), lost_before)
@@ -404,19 +404,19 @@ def test_any_payloads(steps: list[tuple[bytes, int, bool, bool]]) -> None:
 
 
 class DatagramList:
-    """A file to FFmpeg's RTP sender."""
+    """A file object that collects the datagrams of FFmpeg's RTP sender."""
 
     def __init__(self) -> None:
         self.datagrams: list[bytes] = []
 
     def write(self, datagram: bytes) -> int:
-        """Take one packet."""
+        """Store one datagram."""
         self.datagrams.append(bytes(datagram))
         return len(datagram)
 
 
 def test_another_sender() -> None:
-    """What FFmpeg's own RTP sender makes of a stream comes out NAL unit by NAL unit as it was."""
+    """A stream sent by FFmpeg's RTP sender is reassembled with unchanged NAL units."""
     noise = stream(1, "noise")
     encoder = Encoder(160, 128, rate_hz=30, bit_rate_bps=2_000_000, gop_frames=4)
     sent = [encoder.encode(noise.integers(0, 256, (128, 160, 3), dtype=np.uint8)) for _ in range(8)]

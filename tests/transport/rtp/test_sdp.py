@@ -11,7 +11,7 @@ START = b"\x00\x00\x00\x01"
 
 
 def test_the_whole_file() -> None:
-    """A description has the lines of RFC 8866 in their order, each ended as the RFC asks."""
+    """A description has the lines of RFC 8866 in their order, each ended by CRLF."""
     described = session_description(("192.0.2.7", 5004), rate_hz=30.0, profile_level_id="42C01E")
     assert described == (
         "v=0\r\n"
@@ -28,32 +28,32 @@ def test_the_whole_file() -> None:
     )
 
 
-def test_a_rate_that_is_not_whole() -> None:
-    """A frame rate with a fraction is written with it."""
+def test_a_fractional_rate() -> None:
+    """A fractional frame rate is written with its fraction."""
     assert "a=framerate:29.97\r\n" in session_description(("192.0.2.7", 5004), rate_hz=29.97, profile_level_id="42C01E")
 
 
-def test_many_receivers() -> None:
-    """The address of a group of receivers is followed by how far its datagrams go (RFC 8866, section 5.7)."""
+def test_multicast() -> None:
+    """A multicast address is followed by the time to live (RFC 8866, section 5.7)."""
     assert "c=IN IP4 239.1.2.3/1\r\n" in session_description(("239.1.2.3", 5004), rate_hz=30, profile_level_id="42C01E")
 
 
 @pytest.mark.parametrize("port", [0, -1, 65536])
-def test_no_port(port: int) -> None:
-    """A port that nobody can listen on is refused."""
-    with pytest.raises(UserError, match=f"port {port} of 192.0.2.7"):
+def test_invalid_port(port: int) -> None:
+    """A port outside 1 to 65535 is rejected."""
+    with pytest.raises(UserError, match=f"port {port}"):
         session_description(("192.0.2.7", port), rate_hz=30, profile_level_id="42C01E")
 
 
 @pytest.mark.parametrize(("size", "level"), [((640, 480), "42C01E"), ((1280, 720), "42C01F"), ((1920, 1080), "42C028")])
-def test_what_the_encoder_says_of_itself(size: tuple[int, int], level: str) -> None:
+def test_profile_and_level_of_the_encoder(size: tuple[int, int], level: str) -> None:
     """Profile and level are read from the stream: constrained baseline, at the level that its size needs."""
     encoder = Encoder(*size, rate_hz=30, bit_rate_bps=4_000_000, gop_frames=30)
     assert profile_level_id(encoder.encode(np.zeros((size[1], size[0], 3), np.uint8))) == level
 
 
 @pytest.mark.parametrize("access_unit", [b"", START + b"\x41\x9a\x01\x02", START + b"\x67\x42", b"\x67\x42\xc0\x1e"])
-def test_nothing_to_read(access_unit: bytes) -> None:
-    """An access unit without whole sequence parameters is refused."""
+def test_no_sequence_parameters(access_unit: bytes) -> None:
+    """An access unit without complete sequence parameters raises `BadPacket`."""
     with pytest.raises(BadPacket):
         profile_level_id(access_unit)

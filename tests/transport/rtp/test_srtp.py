@@ -33,7 +33,7 @@ def counters(unprotector: Unprotector) -> tuple[int, int]:
     key=st.binary(min_size=28, max_size=28),
 )
 def test_round_trip(payload: bytes, first: int, key: bytes) -> None:
-    """Whatever the payload, the key and the first sequence number, what was protected comes out as it was."""
+    """A protected packet is unprotected unchanged for any payload, key and first sequence number."""
     plain = packet(first, payload)
     protected = Protector(key).protect(plain)
     assert len(protected) == len(plain) + 16
@@ -42,12 +42,12 @@ def test_round_trip(payload: bytes, first: int, key: bytes) -> None:
 
 
 def test_payload_is_not_readable() -> None:
-    """Nothing of a payload stands in the protected packet."""
+    """A protected packet does not contain its payload in plain text."""
     assert b"picture" not in Protector(KEY).protect(packet(1, b"picture" * 100))
 
 
-def test_sequence_numbers_begin_again() -> None:
-    """The numbers go on from 65535 to 0, twice, and every packet comes out."""
+def test_sequence_numbers_wrap() -> None:
+    """Every packet is unprotected while the sequence numbers wrap twice."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     packets = [packet(sequence) for sequence in range(32000, 2 * 65536 + 100, 3)]
     assert [unprotector.unprotect(protector.protect(each)) for each in packets] == packets
@@ -55,8 +55,8 @@ def test_sequence_numbers_begin_again() -> None:
 
 
 @given(st.permutations(range(65500, 65572)))
-def test_reordered_where_numbers_begin_again(order: list[int]) -> None:
-    """Packets around 65535 and 0 come out in whatever order they arrive, once the stream is known."""
+def test_reordered_at_the_wrap(order: list[int]) -> None:
+    """Packets around the wrap are unprotected in any order of arrival, once the stream is known."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     for sequence in (32000, 64000):
         assert unprotector.unprotect(protector.protect(packet(sequence)))
@@ -65,7 +65,7 @@ def test_reordered_where_numbers_begin_again(order: list[int]) -> None:
 
 
 def test_missed_packets() -> None:
-    """A receiver that missed 2^15 - 2 packets in a row takes the next one."""
+    """A receiver that missed 2^15 - 2 consecutive packets accepts the next one."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(65000, 65000 + 2**15)]
     assert unprotector.unprotect(protected[0]) is not None
@@ -73,14 +73,14 @@ def test_missed_packets() -> None:
 
 
 def test_first_packet_of_65535_missed() -> None:
-    """Where a stream begins at 65535 and that packet is lost, no other is taken: why it should begin below 2^15."""
+    """If a stream begins at 65535 and that packet is lost, no other is accepted: streams must begin below 2^15."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(65535, 65535 + 100)]
     assert [unprotector.unprotect(each) for each in protected[1:]] == [None] * 99
 
 
 def test_window() -> None:
-    """A packet 4095 numbers behind the newest is taken, one that is 4096 behind is not."""
+    """A packet 4095 numbers behind the newest is accepted, one 4096 behind is rejected."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(WINDOW_PACKETS + 1)]
     assert unprotector.unprotect(protected[WINDOW_PACKETS]) is not None
@@ -90,19 +90,19 @@ def test_window() -> None:
 
 
 def test_tampered_anywhere() -> None:
-    """A packet with any single bit changed, in header, payload or tag, is refused; the true one is then taken."""
+    """A packet with any bit changed, in header, payload or tag, is rejected; the original is accepted afterwards."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = protector.protect(packet(1))
-    for place in range(8 * len(protected)):
+    for bit in range(8 * len(protected)):
         changed = bytearray(protected)
-        changed[place // 8] ^= 1 << place % 8
+        changed[bit // 8] ^= 1 << bit % 8
         assert unprotector.unprotect(bytes(changed)) is None
     assert counters(unprotector) == (8 * len(protected), 0)
     assert unprotector.unprotect(protected) == packet(1)
 
 
-def test_cut_anywhere() -> None:
-    """A packet of which the end is missing is refused."""
+def test_truncated_anywhere() -> None:
+    """A truncated packet is rejected."""
     unprotector = Unprotector(KEY)
     protected = Protector(KEY).protect(packet(1))
     assert [unprotector.unprotect(protected[:length]) for length in range(len(protected))] == [None] * len(protected)
@@ -110,7 +110,7 @@ def test_cut_anywhere() -> None:
 
 
 def test_replayed() -> None:
-    """A packet that comes again, at once or after others, is refused and counted as a replay."""
+    """A packet that is received again after others is rejected and counted as a replay."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = [protector.protect(packet(sequence)) for sequence in range(10)]
     assert all(unprotector.unprotect(each) for each in protected)
@@ -119,33 +119,33 @@ def test_replayed() -> None:
 
 
 def test_other_key() -> None:
-    """What was protected under another key is refused."""
+    """A packet protected under another key is rejected."""
     unprotector = Unprotector(OTHER_KEY)
     assert unprotector.unprotect(Protector(KEY).protect(packet(1))) is None
-    assert unprotector.unprotect_control(Protector(KEY).protect_control(CONTROL)) is None
+    assert unprotector.unprotect_rtcp(Protector(KEY).protect_rtcp(CONTROL)) is None
     assert counters(unprotector) == (2, 0)
 
 
 def test_plain_packets() -> None:
-    """Packets that were not protected at all are refused."""
+    """Unprotected packets are rejected."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(packet(1, bytes(100))) is None
-    assert unprotector.unprotect_control(CONTROL) is None
+    assert unprotector.unprotect_rtcp(CONTROL) is None
     assert counters(unprotector) == (2, 0)
 
 
 @settings(max_examples=1000)
 @given(st.binary(max_size=2000) | st.binary(max_size=100).map(lambda tail: packet(1) + tail))
-def test_bytes_from_outside(garbage: bytes) -> None:
-    """Whatever bytes arrive, nothing comes out, nothing is raised, and each is counted."""
+def test_any_bytes(garbage: bytes) -> None:
+    """Arbitrary bytes are rejected without an error, and each datagram is counted."""
     unprotector = Unprotector(KEY)
     assert unprotector.unprotect(garbage) is None
-    assert unprotector.unprotect_control(garbage) is None
+    assert unprotector.unprotect_rtcp(garbage) is None
     assert sum(counters(unprotector)) == 2
 
 
 def test_garbage_between() -> None:
-    """Forged packets of the same stream with far numbers do not keep a later true one from being taken."""
+    """Forged packets of the same stream with distant numbers do not prevent a later authentic one."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     assert unprotector.unprotect(protector.protect(packet(1))) is not None
     for sequence in range(0, 2**16, 97):
@@ -154,24 +154,24 @@ def test_garbage_between() -> None:
 
 
 def test_control() -> None:
-    """RTCP packets come out as they were, encrypted on the way, each once, and a changed bit anywhere is refused."""
+    """RTCP packets are encrypted, accepted once each, and rejected if any bit is changed."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
-    first, second = protector.protect_control(CONTROL), protector.protect_control(CONTROL)
+    first, second = protector.protect_rtcp(CONTROL), protector.protect_rtcp(CONTROL)
     assert len(first) == len(CONTROL) + 20
-    assert first != second  # each has a number of its own
+    assert first != second  # each has its own index
     assert CONTROL[8:] not in first
-    for place in range(8 * len(first)):
+    for bit in range(8 * len(first)):
         changed = bytearray(first)
-        changed[place // 8] ^= 1 << place % 8
-        assert unprotector.unprotect_control(bytes(changed)) is None
-    assert [unprotector.unprotect_control(each) for each in (second, first)] == [CONTROL, CONTROL]
+        changed[bit // 8] ^= 1 << bit % 8
+        assert unprotector.unprotect_rtcp(bytes(changed)) is None
+    assert [unprotector.unprotect_rtcp(each) for each in (second, first)] == [CONTROL, CONTROL]
     assert counters(unprotector) == (8 * len(first), 0)
-    assert unprotector.unprotect_control(first) is None
+    assert unprotector.unprotect_rtcp(first) is None
     assert counters(unprotector) == (8 * len(first), 1)
 
 
 def test_two_streams_under_one_key() -> None:
-    """Media and repair packets of the same number under one key both come out, encrypted differently."""
+    """Media and repair packets with the same number and key are encrypted differently, and both are accepted."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     streams = [packet(sequence, bytes(40), ssrc) for sequence in range(5) for ssrc in (MEDIA_SSRC, REPAIR_SSRC)]
     protected = [protector.protect(each) for each in streams]
@@ -179,8 +179,8 @@ def test_two_streams_under_one_key() -> None:
     assert [unprotector.unprotect(each) for each in protected] == streams
 
 
-def test_packet_from_one_stream_in_another() -> None:
-    """A packet whose SSRC was changed to that of the other stream is refused."""
+def test_changed_ssrc() -> None:
+    """A packet whose SSRC was changed to that of the other stream is rejected."""
     protector, unprotector = Protector(KEY), Unprotector(KEY)
     protected = protector.protect(packet(1))
     moved = protected[:8] + REPAIR_SSRC.to_bytes(4, "big") + protected[12:]
@@ -189,28 +189,28 @@ def test_packet_from_one_stream_in_another() -> None:
 
 
 def test_never_twice_under_one_number() -> None:
-    """A packet is not protected a second time, since two texts under one number would help to forge others."""
+    """A second packet with the same number is not protected, since two texts under one number allow forgeries."""
     protector = Protector(KEY)
     protector.protect(packet(1, b"one"))
-    with pytest.raises(WorkError, match="cannot be encrypted: replay check failed"):
+    with pytest.raises(WorkError, match="replay"):
         protector.protect(packet(1, b"two"))
 
 
-def test_what_cannot_be_protected() -> None:
-    """A key of the wrong length and a packet that is too long are said in a sentence."""
+def test_invalid_keys_and_packets() -> None:
+    """A key of the wrong length and a packet that is too long or is not RTP are rejected."""
     for key in (b"", bytes(KEY_BYTES - 1), bytes(KEY_BYTES + 1)):
-        with pytest.raises(UserError, match=f"has 28 bytes, not {len(key)}"):
+        with pytest.raises(UserError, match=f"28 bytes.* {len(key)}"):
             Protector(key)
-        with pytest.raises(UserError, match=f"has 28 bytes, not {len(key)}"):
+        with pytest.raises(UserError, match=f"28 bytes.* {len(key)}"):
             Unprotector(key)
-    with pytest.raises(UserError, match="1352 bytes, not 1353"):
+    with pytest.raises(UserError, match=r"1352 .*1353"):
         Protector(KEY).protect(packet(1, bytes(MAX_PACKET_BYTES - 11)))
-    with pytest.raises(WorkError, match="cannot be encrypted"):
+    with pytest.raises(WorkError):
         Protector(KEY).protect(b"no packet")
 
 
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pylibsrtp a sentence says what to install."""
+    """Without pylibsrtp the error names the extra to install."""
     monkeypatch.setitem(sys.modules, "pylibsrtp", None)
     with pytest.raises(UserError, match=r"pip install 'lavt\[secure\]'"):
         Protector(KEY)

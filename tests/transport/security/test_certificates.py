@@ -12,14 +12,18 @@ NOW_NS = 1_800_000_000 * NS_PER_S
 
 
 def test_expired_authority() -> None:
-    """An authority signs until the second it expires, and then no more."""
+    """An authority signs certificates until the second it expires, and is rejected afterwards."""
     authority = certificates.new_authority(NOW_NS, 10)
     last = NOW_NS + 10 * certificates.NS_PER_DAY
     for now_ns in (NOW_NS, last - NS_PER_S):
-        pair = certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=now_ns, days=30)
-        assert certificates.described(pair.shown, "") == certificates.Described("one", "operator", (), "2027-01-25")
+        pair = certificates.new_certificate(
+            authority, "one", "operator", server_hosts=None, now_wall_ns=now_ns, days=30
+        )
+        assert certificates.summarize(pair.public, "") == certificates.CertificateSummary(
+            "one", "operator", (), "2027-01-25"
+        )
     with pytest.raises(UserError, match="2027-01-25"):
-        certificates.new_certificate(authority, "one", "operator", dialled_at=None, now_wall_ns=last, days=30)
+        certificates.new_certificate(authority, "one", "operator", server_hosts=None, now_wall_ns=last, days=30)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +44,6 @@ def test_expired_authority() -> None:
         (".".join(["a" * 60] * 5), False),
     ],
 )
-def test_hosts(text: str, expected: bool) -> None:
-    """A host is an IP address or a name of the DNS, and nothing around it."""
+def test_is_host(text: str, expected: bool) -> None:
+    """A host is an IP address or a DNS name, without brackets, port or line break."""
     assert certificates.is_host(text) is expected

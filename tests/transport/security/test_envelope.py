@@ -1,4 +1,4 @@
-# ruff: noqa: D102 (a helper of tests: short methods say themselves what they do)
+# ruff: noqa: D102 (test helpers with self-explanatory methods)
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.envelope import (
     TRAILER_BYTES,
-    NoVehicleAuthenticator,
+    NullVehicleAuthenticator,
     OperatorAuthenticator,
     VehicleAuthenticator,
     VerifiedReply,
@@ -27,8 +27,8 @@ from lavt.transport.security.envelope import (
 )
 from lavt.transport.security.keys import PrivateKey
 
-KEPT, LONGEST_BYTES = 8, 1280
-"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+KEPT, MAX_ENVELOPE_BYTES = 8, 1280
+"""The design's limits, repeated here so that a change in the code fails a test."""
 COMMAND = Command(77, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0)
 TOKEN = bytes(range(16))
 GRANTED = SessionReply(True, "", 77, TOKEN, 5600, "kernel", 0)
@@ -43,7 +43,7 @@ OPERATORS = {"alice": ALICE.public, "bob": BOB.public}
 
 
 class Pair:
-    """A vehicle and an operator, and nothing between them but bytes."""
+    """A vehicle's and an operator's authenticator that exchange bytes."""
 
     def __init__(
         self, who: str = "alice", key: PrivateKey = ALICE, vehicle: VehicleAuthenticator | None = None
@@ -52,25 +52,25 @@ class Pair:
         self.vehicle = vehicle or VehicleAuthenticator("car", VEHICLE, OPERATORS)
         self.operator = OperatorAuthenticator("car", who, key, VEHICLE.public)
 
-    def request(self, operation: str = "hold", number: int = 0) -> bytes:
+    def signed_request(self, operation: str = "hold", number: int = 0) -> bytes:
         request = SessionRequest(operation, self.who, 5, number)  # type: ignore[arg-type]
         return self.operator.sign_request("session", encode(request))
 
-    def ask(self, data: bytes, reply: SessionReply = GRANTED) -> tuple[bytes, bytes | None]:
-        """Let the vehicle take a request: its reply's bytes, and what the operator reads in it."""
-        request = self.vehicle.open_request("session", data)
+    def exchange(self, data: bytes, reply: SessionReply = GRANTED) -> tuple[bytes, bytes | None]:
+        """Deliver a request and its reply; return the reply's envelope, and its body or the retry."""
+        request = self.vehicle.verify_request("session", data)
         assert request is not None
         signed = self.vehicle.sign_reply(request, b"" if request.is_stale else encode(reply))
-        opened = self.operator.open_reply("session", signed)
-        return signed, opened.again if request.is_stale else opened.body
+        verified = self.operator.verify_reply("session", signed)
+        return signed, verified.retry if request.is_stale else verified.body
 
-    def hold(self) -> None:
-        _, again = self.ask(self.request())
-        assert again is not None
-        _, body = self.ask(again)
+    def acquire_control(self) -> None:
+        _, retry = self.exchange(self.signed_request())
+        assert retry is not None
+        _, body = self.exchange(retry)
         assert body == encode(GRANTED)
 
-    def command(self, command: Command = COMMAND) -> bytes:
+    def signed_command(self, command: Command = COMMAND) -> bytes:
         return self.operator.sign_command(encode(command))
 
 
@@ -79,317 +79,319 @@ def pair() -> Pair:
     return Pair()
 
 
-def test_the_first_request_is_requested_again_and_then_granted(pair: Pair) -> None:
-    """A server that has just started takes no request but with a place of its own, which its reply tells."""
-    request = pair.vehicle.open_request("session", pair.request())
+def test_the_first_request_must_be_retried(pair: Pair) -> None:
+    """A server that has just started accepts a request only with its own replay counter, which its reply contains."""
+    request = pair.vehicle.verify_request("session", pair.signed_request())
     assert request is not None
     assert request.is_stale
-    pair.hold()
+    pair.acquire_control()
 
 
-def test_a_command_of_the_active_operator_is_opened(pair: Pair) -> None:
-    """What the holder has signed comes out as it went in, and its code says cheaply that it is the holder's."""
-    pair.hold()
-    assert pair.vehicle.is_from_active_operator(pair.command())
-    assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
+def test_a_command_of_the_active_operator_is_accepted(pair: Pair) -> None:
+    """The active operator's command has a valid MAC and is returned unchanged."""
+    pair.acquire_control()
+    assert pair.vehicle.is_from_active_operator(pair.signed_command())
+    assert pair.vehicle.verify_command(pair.signed_command()) == encode(COMMAND)
 
 
-def test_nobody_but_the_active_operator_commands(pair: Pair) -> None:
-    """Another operator's command is refused, though his key is known; so is that of a key nobody knows."""
-    pair.hold()
+def test_a_command_of_another_operator_is_rejected(pair: Pair) -> None:
+    """A command of another known operator, or signed with an unknown key, is rejected."""
+    pair.acquire_control()
     for other in (Pair("bob", BOB), Pair("alice", MALLORY)):
-        assert not pair.vehicle.is_from_active_operator(other.command())
-        assert pair.vehicle.open_command(other.command()) is None
+        assert not pair.vehicle.is_from_active_operator(other.signed_command())
+        assert pair.vehicle.verify_command(other.signed_command()) is None
     assert pair.vehicle.counts["commands_forged"] == 2
 
 
-def test_any_operator_stops_the_vehicle(pair: Pair) -> None:
-    """An emergency stop in a command is heard from every operator whose key is known, and from nobody else."""
-    pair.hold()
+def test_any_known_operator_may_send_an_emergency_stop(pair: Pair) -> None:
+    """A command with an emergency stop is accepted from every known operator, and from nobody else."""
+    pair.acquire_control()
     stop = replace(COMMAND, emergency_stop=9)
-    assert pair.vehicle.open_command(Pair("bob", BOB).command(stop)) == encode(stop)
-    assert pair.vehicle.open_command(Pair("bob", MALLORY).command(stop)) is None
-    assert pair.vehicle.open_command(Pair("bob", BOB).operator.sign_command(b"garbage")) is None
+    assert pair.vehicle.verify_command(Pair("bob", BOB).signed_command(stop)) == encode(stop)
+    assert pair.vehicle.verify_command(Pair("bob", MALLORY).signed_command(stop)) is None
+    assert pair.vehicle.verify_command(Pair("bob", BOB).operator.sign_command(b"garbage")) is None
 
 
-def test_before_a_session_no_command_has_a_valid_code(pair: Pair) -> None:
-    """Before there is a session its codes are zeros, and the vehicle accepts no zeros as a code."""
-    assert pair.command()[-TRAILER_BYTES:-64] == bytes(16)
-    assert not pair.vehicle.is_from_active_operator(pair.command())
-    assert not pair.vehicle.is_next_of_active_operator("session", pair.request())
+def test_without_a_session_no_mac_is_valid(pair: Pair) -> None:
+    """Before a session starts MACs are zeros, and zeros are not a valid MAC."""
+    assert pair.signed_command()[-TRAILER_BYTES:-64] == bytes(16)
+    assert not pair.vehicle.is_from_active_operator(pair.signed_command())
+    assert not pair.vehicle.is_next_of_active_operator("session", pair.signed_request())
     assert not pair.operator.is_next_state(pair.vehicle.sign_state(b"state"))
 
 
-def test_after_a_release_nobody_commands(pair: Pair) -> None:
-    """When the holder has released the vehicle his commands are no longer his to give."""
-    pair.hold()
-    pair.ask(pair.request("release"), SessionReply(True, "", 0, b"", 5600, "kernel", 0))
-    assert not pair.vehicle.is_from_active_operator(pair.command())
-    assert pair.vehicle.open_command(pair.command()) is None
+def test_after_a_release_commands_are_rejected(pair: Pair) -> None:
+    """After the active operator has released the vehicle, its commands are rejected."""
+    pair.acquire_control()
+    pair.exchange(pair.signed_request("release"), SessionReply(True, "", 0, b"", 5600, "kernel", 0))
+    assert not pair.vehicle.is_from_active_operator(pair.signed_command())
+    assert pair.vehicle.verify_command(pair.signed_command()) is None
 
 
 def test_an_altered_command_is_rejected(pair: Pair) -> None:
-    """A change of any byte of a command, its code or its signature makes it a forgery; the code shows it cheaply."""
-    pair.hold()
-    signed = pair.command()
+    """A command with one altered byte fails its MAC check, its signature check, or both."""
+    pair.acquire_control()
+    signed = pair.signed_command()
     for at in range(len(signed)):
         altered = signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]
-        within = at < len(signed) - 64
-        assert not (within and pair.vehicle.is_from_active_operator(altered))
-        in_the_code = len(signed) - 80 <= at < len(signed) - 64
-        assert (pair.vehicle.open_command(altered) is None) != in_the_code
+        before_signature = at < len(signed) - 64
+        assert not (before_signature and pair.vehicle.is_from_active_operator(altered))
+        in_mac = len(signed) - 80 <= at < len(signed) - 64
+        assert (pair.vehicle.verify_command(altered) is None) != in_mac
 
 
-def test_the_code_of_one_kind_serves_for_no_other(pair: Pair) -> None:
-    """What the holder has sent as one kind of message is cheaply told from another, as is the next from one before."""
-    pair.hold()
-    request = pair.request()
+def test_a_mac_is_valid_for_one_channel_and_one_message(pair: Pair) -> None:
+    """The cheap checks reject a message on another channel, and a request or state that was accepted before."""
+    pair.acquire_control()
+    request = pair.signed_request()
     assert pair.vehicle.is_next_of_active_operator("session", request)
     assert not pair.vehicle.is_next_of_active_operator("netem", request)
     assert not pair.vehicle.is_from_active_operator(request)
-    pair.ask(request)
+    pair.exchange(request)
     assert not pair.vehicle.is_next_of_active_operator("session", request)
     state = pair.vehicle.sign_state(b"state")
     assert pair.operator.is_next_state(state)
-    assert pair.operator.open_state(state).body == b"state"
+    assert pair.operator.verify_state(state).body == b"state"
     assert not pair.operator.is_next_state(state)
 
 
 def test_a_command_for_another_vehicle_is_rejected(pair: Pair) -> None:
-    """A signature serves for one vehicle only."""
-    pair.hold()
-    elsewhere = OperatorAuthenticator("truck", "alice", ALICE, VEHICLE.public)
-    assert pair.vehicle.open_command(elsewhere.sign_command(encode(COMMAND))) is None
+    """A command signed for another vehicle is rejected."""
+    pair.acquire_control()
+    truck_operator = OperatorAuthenticator("truck", "alice", ALICE, VEHICLE.public)
+    assert pair.vehicle.verify_command(truck_operator.sign_command(encode(COMMAND))) is None
 
 
-def test_a_replayed_request_is_not_looked_at(pair: Pair) -> None:
-    """The same bytes once more are stale: nothing is decided on them, and nobody else can read what is answered."""
-    pair.hold()
-    data = pair.request("release")
-    pair.ask(data)
-    again = pair.vehicle.open_request("session", data)
-    assert again is not None
-    assert again.is_stale
+def test_a_replayed_request_is_stale(pair: Pair) -> None:
+    """A request that is sent a second time is stale and is counted."""
+    pair.acquire_control()
+    data = pair.signed_request("release")
+    pair.exchange(data)
+    replayed = pair.vehicle.verify_request("session", data)
+    assert replayed is not None
+    assert replayed.is_stale
     assert pair.vehicle.counts["session_requests_of_another_time"] == 2
 
 
-def test_a_request_to_another_process_of_the_server_is_not_looked_at(pair: Pair) -> None:
-    """What was asked of a server before it was started anew is stale after it."""
-    pair.hold()
-    data = pair.request("hold")
-    anew = VehicleAuthenticator("car", VEHICLE, OPERATORS).open_request("session", data)
-    assert anew is not None
-    assert anew.is_stale
+def test_a_request_to_an_earlier_process_of_the_server_is_stale(pair: Pair) -> None:
+    """A request that was signed for the server before its restart is stale afterwards."""
+    pair.acquire_control()
+    data = pair.signed_request("hold")
+    request = VehicleAuthenticator("car", VEHICLE, OPERATORS).verify_request("session", data)
+    assert request is not None
+    assert request.is_stale
 
 
-def test_an_emergency_stop_is_not_requested_twice(pair: Pair) -> None:
-    """An emergency stop counts at once, whatever its place: its own number refuses a replay."""
-    request = pair.vehicle.open_request("session", pair.request("emergency_stop", 7))
+def test_an_emergency_stop_needs_no_retry(pair: Pair) -> None:
+    """A request for an emergency stop is never stale, whatever its replay counter."""
+    request = pair.vehicle.verify_request("session", pair.signed_request("emergency_stop", 7))
     assert request is not None
     assert not request.is_stale
 
 
-def test_a_request_without_a_body_only_asks_for_the_place(pair: Pair) -> None:
-    """An empty request is never decided on, though its place is the next, and is not counted as a replay."""
-    pair.hold()
+def test_an_empty_request_only_asks_for_the_replay_counter(pair: Pair) -> None:
+    """An empty request is stale even with the next replay counter, and is not counted as a replay."""
+    pair.acquire_control()
     before = pair.vehicle.counts["session_requests_of_another_time"]
-    request = pair.vehicle.open_request("session", pair.operator.sign_request("session", b""))
+    request = pair.vehicle.verify_request("session", pair.operator.sign_request("session", b""))
     assert request is not None
     assert request.is_stale
     assert pair.vehicle.counts["session_requests_of_another_time"] == before
 
 
 def test_a_request_with_an_impossible_key_is_rejected(pair: Pair) -> None:
-    """A request whose X25519 key gives no secret is counted as a forgery, whoever has signed it."""
+    """A signed request with an invalid X25519 key is counted as a forgery."""
     pair.operator._agreement.public = bytes(32)
-    assert pair.vehicle.open_request("session", pair.request()) is None
+    assert pair.vehicle.verify_request("session", pair.signed_request()) is None
     assert pair.vehicle.counts["session_requests_forged"] == 1
 
 
-def test_a_reply_without_a_token_leaves_the_codes_as_they_are(pair: Pair) -> None:
-    """A request that is granted without a token, as an emergency stop is, does not end the holder's session."""
-    pair.hold()
-    pair.ask(pair.request("emergency_stop", 7), SessionReply(True, "", 0, b"", 5600, "kernel", 7))
-    assert pair.vehicle.is_from_active_operator(pair.command())
-    assert pair.vehicle.open_command(pair.command()) == encode(COMMAND)
+def test_a_reply_without_a_token_does_not_end_the_session(pair: Pair) -> None:
+    """After a request that is granted without a token, such as an emergency stop, commands are still accepted."""
+    pair.acquire_control()
+    pair.exchange(pair.signed_request("emergency_stop", 7), SessionReply(True, "", 0, b"", 5600, "kernel", 7))
+    assert pair.vehicle.is_from_active_operator(pair.signed_command())
+    assert pair.vehicle.verify_command(pair.signed_command()) == encode(COMMAND)
 
 
 def test_a_request_in_another_name_is_rejected(pair: Pair) -> None:
-    """Nobody asks in the name of another operator, nor without a name that is known."""
+    """A request in the name of another or an unknown operator is rejected."""
     for name, key in (("alice", BOB), ("alice", MALLORY), ("mallory", MALLORY)):
-        assert pair.vehicle.open_request("session", Pair(name, key).request()) is None
+        assert pair.vehicle.verify_request("session", Pair(name, key).signed_request()) is None
     forged = pair.operator.sign_request("session", encode(SessionRequest("hold", "bob", 5, 0)))
-    assert pair.vehicle.open_request("session", forged) is None
+    assert pair.vehicle.verify_request("session", forged) is None
     assert pair.vehicle.counts["session_requests_forged"] == 4
 
 
 @pytest.mark.parametrize("channel", ["session", "netem"])
-def test_a_signed_request_that_is_no_message_is_rejected(pair: Pair, channel: str) -> None:
-    """A request that an operator has signed, but that cannot be decoded, is counted and raises nothing."""
-    pair.hold()
-    assert pair.vehicle.open_request(channel, pair.operator.sign_request(channel, b"garbage")) is None
+def test_a_signed_request_that_cannot_be_decoded_is_rejected(pair: Pair, channel: str) -> None:
+    """A signed request that cannot be decoded is counted as a forgery and raises nothing."""
+    pair.acquire_control()
+    assert pair.vehicle.verify_request(channel, pair.operator.sign_request(channel, b"garbage")) is None
     assert pair.vehicle.counts[f"{channel}_requests_forged"] == 1
 
 
-def test_the_token_is_read_by_who_requested_only(pair: Pair) -> None:
-    """A reply holds the token encrypted, for whoever has asked and nobody else."""
-    _, again = pair.ask(pair.request())
-    assert again is not None
-    signed, _ = pair.ask(again)
+def test_only_the_client_that_requested_can_read_the_token(pair: Pair) -> None:
+    """A reply contains the token encrypted, and another client of the same operator cannot read it."""
+    _, retry = pair.exchange(pair.signed_request())
+    assert retry is not None
+    signed, _ = pair.exchange(retry)
     assert TOKEN not in signed
-    assert Pair().operator.open_reply("session", signed).body is None
+    assert Pair().operator.verify_reply("session", signed).body is None
 
 
-def test_a_reply_counts_once(pair: Pair) -> None:
-    """A reply of the vehicle is taken once; one to no request of ours, altered or of another vehicle never."""
-    pair.hold()
-    signed, body = pair.ask(pair.request())
+def test_a_reply_is_accepted_once(pair: Pair) -> None:
+    """A reply is accepted once; an altered reply, another vehicle's, or one on the wrong channel is rejected."""
+    pair.acquire_control()
+    signed, body = pair.exchange(pair.signed_request())
     assert body is not None
-    assert pair.operator.open_reply("session", signed).body is None
-    data = pair.request()
-    request = pair.vehicle.open_request("session", data)
+    assert pair.operator.verify_reply("session", signed).body is None
+    data = pair.signed_request()
+    request = pair.vehicle.verify_request("session", data)
     assert request is not None
     signed = pair.vehicle.sign_reply(request, encode(GRANTED))
     for at in range(len(signed)):
         assert (
-            pair.operator.open_reply("session", signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]).body is None
+            pair.operator.verify_reply("session", signed[:at] + bytes([signed[at] ^ 1]) + signed[at + 1 :]).body is None
         )
     other = VehicleAuthenticator("car", MALLORY, OPERATORS)
-    requested = other.open_request("session", data)
-    assert requested is not None
-    assert pair.operator.open_reply("session", other.sign_reply(requested, b"")).again is None
-    assert pair.operator.open_reply("netem", signed).body is None
-    assert pair.operator.open_reply("session", signed).body == encode(GRANTED)
+    other_request = other.verify_request("session", data)
+    assert other_request is not None
+    assert pair.operator.verify_reply("session", other.sign_reply(other_request, b"")).retry is None
+    assert pair.operator.verify_reply("netem", signed).body is None
+    assert pair.operator.verify_reply("session", signed).body == encode(GRANTED)
 
 
 @pytest.mark.parametrize("changes", [{"secret": bytes(32)}, {"public": bytes(32)}], ids=["secret", "key"])
 def test_a_reply_that_cannot_be_decrypted_is_a_forgery(pair: Pair, changes: dict[str, Any]) -> None:
-    """A signed reply that the operator cannot decrypt is counted, and the request goes on waiting for its reply."""
-    pair.hold()
-    request = pair.vehicle.open_request("session", pair.request())
+    """A signed reply that cannot be decrypted is counted as a forgery, and the request stays pending."""
+    pair.acquire_control()
+    request = pair.vehicle.verify_request("session", pair.signed_request())
     assert request is not None
     unreadable = pair.vehicle.sign_reply(replace(request, **changes), encode(GRANTED))
-    assert pair.operator.open_reply("session", unreadable) == VerifiedReply(None, None)
+    assert pair.operator.verify_reply("session", unreadable) == VerifiedReply(None, None)
     assert pair.operator.counts["session_replies_forged"] == 1
-    assert pair.operator.open_reply("session", pair.vehicle.sign_reply(request, encode(GRANTED))).body is not None
+    assert pair.operator.verify_reply("session", pair.vehicle.sign_reply(request, encode(GRANTED))).body is not None
 
 
-def test_a_reply_from_before_another_is_not_taken(pair: Pair) -> None:
-    """A reply that comes after that to a later query says what is no longer so: it is dropped."""
-    pair.hold()
+def test_a_reply_to_an_earlier_request_is_rejected(pair: Pair) -> None:
+    """A reply that arrives after the reply to a later request is rejected."""
+    pair.acquire_control()
     replies = []
     for number in range(2):
-        request = pair.vehicle.open_request("session", pair.request("hold", number))
+        request = pair.vehicle.verify_request("session", pair.signed_request("hold", number))
         assert request is not None
         replies.append(pair.vehicle.sign_reply(request, b"" if request.is_stale else encode(GRANTED)))
-    assert pair.operator.open_reply("session", replies[1]).again is not None
-    assert pair.operator.open_reply("session", replies[0]) == VerifiedReply(None, None)
-    assert pair.operator.open_reply("session", replies[1]) == VerifiedReply(None, None)
+    assert pair.operator.verify_reply("session", replies[1]).retry is not None
+    assert pair.operator.verify_reply("session", replies[0]) == VerifiedReply(None, None)
+    assert pair.operator.verify_reply("session", replies[1]) == VerifiedReply(None, None)
 
 
-def test_states_are_the_vehicles_and_grow_newer(pair: Pair) -> None:
-    """A state is shown once, in order, and only where the vehicle has signed it; any other causes no query."""
-    pair.hold()
+def test_replayed_and_forged_states_are_rejected(pair: Pair) -> None:
+    """A state that is not newer than the last, or not signed by the vehicle, is rejected and causes no request."""
+    pair.acquire_control()
     first, second = pair.vehicle.sign_state(b"first"), pair.vehicle.sign_state(b"second")
-    assert pair.operator.open_state(second).body == b"second"
+    assert pair.operator.verify_state(second).body == b"second"
     for old in (second, first):
-        assert pair.operator.open_state(old) == VerifiedState(None, ask=False)
+        assert pair.operator.verify_state(old) == VerifiedState(None, needs_request=False)
     assert pair.operator.counts["states_replayed"] == 2
     forged = VehicleAuthenticator("car", MALLORY, OPERATORS)
     forged._instance = pair.vehicle._instance
     forged._states = 100
-    assert pair.operator.open_state(forged.sign_state(b"forged")) == VerifiedState(None, ask=False)
+    assert pair.operator.verify_state(forged.sign_state(b"forged")) == VerifiedState(None, needs_request=False)
     assert pair.operator.counts["states_forged"] == 1
 
 
-def test_a_reply_makes_no_old_state_new(pair: Pair) -> None:
-    """After a reply of the same process of the server, states from before are still replays."""
-    pair.hold()
+def test_after_a_reply_old_states_are_still_replays(pair: Pair) -> None:
+    """After a reply of the same process of the server, earlier states are still rejected as replays."""
+    pair.acquire_control()
     state = pair.vehicle.sign_state(b"state")
-    assert pair.operator.open_state(state).body == b"state"
-    pair.ask(pair.request())
+    assert pair.operator.verify_state(state).body == b"state"
+    pair.exchange(pair.signed_request())
     assert not pair.operator.is_next_state(state)
-    assert pair.operator.open_state(state) == VerifiedState(None, ask=False)
+    assert pair.operator.verify_state(state) == VerifiedState(None, needs_request=False)
     assert pair.operator.counts["states_replayed"] == 1
 
 
-def test_states_of_a_server_started_anew_are_shown_when_it_has_answered(pair: Pair) -> None:
-    """A state of a server's process that has not answered a request may be a recorded one: it is asked first."""
-    pair.hold()
-    anew = VehicleAuthenticator("car", VEHICLE, OPERATORS)
-    opened = pair.operator.open_state(anew.sign_state(b"new"))
-    assert opened.body is None
-    assert opened.ask
+def test_states_of_a_restarted_server_are_accepted_after_its_first_reply(pair: Pair) -> None:
+    """A state of a server process that has not answered yet needs a request; after the reply states are accepted."""
+    pair.acquire_control()
+    restarted = VehicleAuthenticator("car", VEHICLE, OPERATORS)
+    state = pair.operator.verify_state(restarted.sign_state(b"new"))
+    assert state.body is None
+    assert state.needs_request
     assert pair.operator.counts["states_of_another_time"] == 1
-    pair.vehicle = anew
-    pair.ask(pair.operator.sign_request("session", b""))
-    assert pair.operator.open_state(anew.sign_state(b"newer")).body == b"newer"
+    pair.vehicle = restarted
+    pair.exchange(pair.operator.sign_request("session", b""))
+    assert pair.operator.verify_state(restarted.sign_state(b"newer")).body == b"newer"
 
 
-def test_each_kind_of_query_has_its_own_order(pair: Pair) -> None:
-    """Requests for a condition do not make those of the session stale."""
-    pair.hold()
-    session = pair.request()
+def test_each_channel_has_its_own_replay_counter(pair: Pair) -> None:
+    """A request on the netem channel does not make a session request stale."""
+    pair.acquire_control()
+    session = pair.signed_request()
     netem = encode(NetemRequest("alice", 5, "L4", 0, 0.0, 0.0, 0.0, "uniform", 0.0, 1.0, 0, 0.0, 0.0))
-    requested = pair.vehicle.open_request("netem", pair.operator.sign_request("netem", netem))
-    assert requested is not None
-    again = pair.operator.open_reply("netem", pair.vehicle.sign_reply(requested, b"")).again
-    assert again is not None
-    requested = pair.vehicle.open_request("netem", again)
-    assert requested is not None
-    reply = pair.operator.open_reply("netem", pair.vehicle.sign_reply(requested, encode(NetemReply(True, ""))))
+    request = pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", netem))
+    assert request is not None
+    retry = pair.operator.verify_reply("netem", pair.vehicle.sign_reply(request, b"")).retry
+    assert retry is not None
+    request = pair.vehicle.verify_request("netem", retry)
+    assert request is not None
+    reply = pair.operator.verify_reply("netem", pair.vehicle.sign_reply(request, encode(NetemReply(True, ""))))
     assert decode(NetemReply, reply.body or b"").granted
-    request = pair.vehicle.open_request("session", session)
+    request = pair.vehicle.verify_request("session", session)
     assert request is not None
     assert not request.is_stale
 
 
-def test_requests_without_replies_are_bounded(pair: Pair) -> None:
-    """Of requests that wait for a reply only the newest are kept: their replies are accepted, those before are not."""
-    pair.hold()
-    requests = [pair.vehicle.open_request("netem", pair.operator.sign_request("netem", b""))]
-    requests += [pair.vehicle.open_request("session", pair.request("hold", number)) for number in range(3 * KEPT)]
-    assert len(pair.operator._requested) == KEPT
+def test_pending_requests_are_bounded(pair: Pair) -> None:
+    """The operator keeps the newest 8 pending requests and rejects replies to earlier ones."""
+    pair.acquire_control()
+    requests = [pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))]
+    requests += [
+        pair.vehicle.verify_request("session", pair.signed_request("hold", number)) for number in range(3 * KEPT)
+    ]
+    assert len(pair.operator._pending) == KEPT
     replies = [pair.vehicle.sign_reply(request, encode(GRANTED)) for request in requests if request is not None]
-    assert pair.operator.open_reply("netem", replies[0]) == VerifiedReply(None, None)
-    assert pair.operator.open_reply("session", replies[-KEPT - 1]) == VerifiedReply(None, None)
-    assert len(pair.operator._requested) == KEPT
-    assert pair.operator.open_reply("session", replies[-KEPT]) != VerifiedReply(None, None)
+    assert pair.operator.verify_reply("netem", replies[0]) == VerifiedReply(None, None)
+    assert pair.operator.verify_reply("session", replies[-KEPT - 1]) == VerifiedReply(None, None)
+    assert len(pair.operator._pending) == KEPT
+    assert pair.operator.verify_reply("session", replies[-KEPT]) != VerifiedReply(None, None)
 
 
-def test_agreements_with_clients_are_bounded(pair: Pair) -> None:
-    """Of clients that come and go the vehicle remembers the newest, and what it has agreed on with them."""
-    requests = [Pair().request() for _ in range(3 * KEPT)]
-    publics = [request.public for each in requests if (request := pair.vehicle.open_request("session", each))]
+def test_key_agreements_are_bounded(pair: Pair) -> None:
+    """The vehicle keeps the key agreements with the newest 8 clients."""
+    requests = [Pair().signed_request() for _ in range(3 * KEPT)]
+    publics = [request.public for each in requests if (request := pair.vehicle.verify_request("session", each))]
     assert len(set(publics)) == 3 * KEPT
     assert len(pair.vehicle._agreements) == KEPT
-    remembered = pair.vehicle.open_request("session", requests[-KEPT])
+    remembered = pair.vehicle.verify_request("session", requests[-KEPT])
     assert remembered is not None
     assert remembered.public == publics[-KEPT]
-    forgotten = pair.vehicle.open_request("session", requests[0])
+    forgotten = pair.vehicle.verify_request("session", requests[0])
     assert forgotten is not None
     assert forgotten.public != publics[0]
 
 
 @pytest.mark.parametrize(("more_bytes", "accepted"), [(0, True), (1, False)])
-def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted: bool) -> None:
-    """An envelope of the largest size is opened; one that is a byte longer is a forgery, whoever has signed it."""
-    pair.hold()
-    command = bytes(LONGEST_BYTES - TRAILER_BYTES + more_bytes)
+def test_envelopes_have_a_maximum_size(pair: Pair, more_bytes: int, *, accepted: bool) -> None:
+    """A signed envelope of the maximum size is accepted; one that is a byte longer is counted as a forgery."""
+    pair.acquire_control()
+    command = bytes(MAX_ENVELOPE_BYTES - TRAILER_BYTES + more_bytes)
     signed = pair.operator.sign_command(command)
-    assert len(signed) == LONGEST_BYTES + more_bytes
-    assert pair.vehicle.body(signed) == (command if accepted else b"")
+    assert len(signed) == MAX_ENVELOPE_BYTES + more_bytes
+    assert pair.vehicle.unverified_body(signed) == (command if accepted else b"")
     assert pair.vehicle.is_from_active_operator(signed) == accepted
-    assert pair.vehicle.open_command(signed) == (command if accepted else None)
-    state = bytes(LONGEST_BYTES - TRAILER_BYTES - 16 + more_bytes)
+    assert pair.vehicle.verify_command(signed) == (command if accepted else None)
+    state = bytes(MAX_ENVELOPE_BYTES - TRAILER_BYTES - 16 + more_bytes)
     signed = pair.vehicle.sign_state(state)
     assert pair.operator.is_next_state(signed) == accepted
-    assert pair.operator.open_state(signed).body == (state if accepted else None)
-    request = pair.vehicle.open_request("netem", pair.operator.sign_request("netem", b""))
+    assert pair.operator.verify_state(signed).body == (state if accepted else None)
+    request = pair.vehicle.verify_request("netem", pair.operator.sign_request("netem", b""))
     assert request is not None
-    reply = bytes(LONGEST_BYTES - len(pair.vehicle.sign_reply(request, b"")) + more_bytes)
+    reply = bytes(MAX_ENVELOPE_BYTES - len(pair.vehicle.sign_reply(request, b"")) + more_bytes)
     fresh = replace(request, is_stale=False)
-    assert pair.operator.open_reply("netem", pair.vehicle.sign_reply(fresh, reply)).body == (
+    assert pair.operator.verify_reply("netem", pair.vehicle.sign_reply(fresh, reply)).body == (
         reply if accepted else None
     )
     rejected = 0 if accepted else 1
@@ -398,25 +400,25 @@ def test_envelopes_have_a_largest_size(pair: Pair, more_bytes: int, *, accepted:
 
 
 @given(st.binary(max_size=1400))
-def test_any_bytes_are_counted_and_raise_nothing(data: bytes) -> None:
-    """Whatever comes in at any of the openings is refused without an error."""
+def test_arbitrary_bytes_are_rejected(data: bytes) -> None:
+    """Arbitrary bytes are rejected as command, request, reply or state and raise nothing."""
     pair = Pair()
     assert not pair.vehicle.is_from_active_operator(data)
-    assert pair.vehicle.open_command(data) is None
-    assert pair.vehicle.open_request("session", data) is None
-    assert pair.vehicle.open_request("netem", data) is None
-    assert pair.operator.open_reply("session", data).body is None
-    assert pair.operator.open_state(data) == VerifiedState(None, ask=False)
+    assert pair.vehicle.verify_command(data) is None
+    assert pair.vehicle.verify_request("session", data) is None
+    assert pair.vehicle.verify_request("netem", data) is None
+    assert pair.operator.verify_reply("session", data).body is None
+    assert pair.operator.verify_state(data) == VerifiedState(None, needs_request=False)
 
 
-def test_without_keys_everything_is_as_it_is() -> None:
-    """Where nothing is signed, bytes go in and out unchanged."""
-    authenticator = NoVehicleAuthenticator()
-    request = authenticator.open_request("session", b"request")
+def test_without_keys_messages_are_unchanged() -> None:
+    """Without keys messages are accepted and sent unchanged."""
+    authenticator = NullVehicleAuthenticator()
+    request = authenticator.verify_request("session", b"request")
     assert request is not None
     assert {
-        authenticator.body(b"x"),
-        authenticator.open_command(b"x"),
+        authenticator.unverified_body(b"x"),
+        authenticator.verify_command(b"x"),
         authenticator.sign_state(b"x"),
         authenticator.sign_reply(request, b"x"),
     } == {b"x"}

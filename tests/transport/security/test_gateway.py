@@ -10,7 +10,7 @@ from lavt.domain import NS_PER_S, PATH_POINTS, Command, Now, SessionReply, Sessi
 from lavt.node import Send
 from lavt.transport import zenoh_link
 from lavt.transport.messages import encode
-from lavt.transport.security.envelope import NoVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
+from lavt.transport.security.envelope import NullVehicleAuthenticator, OperatorAuthenticator, VehicleAuthenticator
 from lavt.transport.security.gateway import ClientGateway, OpenClientGateway, ServerGateway
 
 pytest.importorskip("cryptography", reason="an extra: pip install 'lavt[secure]'")
@@ -19,249 +19,251 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from lavt.transport.security.keys import PrivateKey
 
-OTHERS_PER_S, QUERIES_PER_S, STATES_PER_S, QUERIES_KEPT = 200, 100, 500, 64
-"""The design's limits, in numbers of our own: whoever changes the code's must change these."""
+OTHER_COMMANDS_PER_S, QUERIES_PER_S, STATES_PER_S, MAX_PENDING_QUERIES = 200, 100, 500, 64
+"""The design's limits, repeated here so that a change in the code fails a test."""
 HOLD = encode(SessionRequest("hold", "alice", 5, 0))
 GRANTED = encode(SessionReply(True, "", 7, bytes(range(16)), 5600, "kernel", 0))
 COMMAND = encode(Command(7, 3, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
 NEXT_COMMAND = encode(Command(7, 4, 1, 2, 3, 0.1, 0.2, 0.0, (0.0,) * PATH_POINTS, "drive", 0))
 
 
-class Both:
-    """Two doors with a wire between them: what goes out of one comes to the other, when the test says so."""
+class GatewayPair:
+    """A server's and a client's gateway; messages between them wait in `in_flight` until the test delivers them."""
 
     def __init__(self) -> None:
         vehicle, alice = PrivateKey(Ed25519PrivateKey.generate()), PrivateKey(Ed25519PrivateKey.generate())
-        self.outside: list[Send] = []
-        self.in_the_car: list[tuple[str, bytes, Any]] = []
-        self.at_the_desk: list[tuple[str, bytes]] = []
-        self.car = ServerGateway(
-            lambda channel, payload, _arrived, peer: self.in_the_car.append((channel, payload, peer)),
-            lambda *sends: self.outside.extend(sends),
+        self.in_flight: list[Send] = []
+        self.server_received: list[tuple[str, bytes, Any]] = []
+        self.client_received: list[tuple[str, bytes]] = []
+        self.server = ServerGateway(
+            lambda channel, payload, _arrived, peer: self.server_received.append((channel, payload, peer)),
+            lambda *sends: self.in_flight.extend(sends),
             lambda: (7, 2),
             VehicleAuthenticator("car", vehicle, {"alice": alice.public}),
         )
-        self.desk = ClientGateway(
-            lambda channel, payload, _arrived, _peer: self.at_the_desk.append((channel, payload)),
-            lambda *sends: self.outside.extend(sends),
+        self.client = ClientGateway(
+            lambda channel, payload, _arrived, _peer: self.client_received.append((channel, payload)),
+            lambda *sends: self.in_flight.extend(sends),
             OperatorAuthenticator("car", "alice", alice, vehicle.public),
         )
-        self.desk._send_soon = lambda send: self.outside.append(send)  # type: ignore[method-assign]  # no thread
+        self.client._send_in_thread = lambda send: self.in_flight.append(send)  # type: ignore[method-assign]
 
-    def carry(self, mono_ns: int = 0) -> None:
-        """Carry everything that is outside, and what that leads to."""
-        while self.outside:
-            send = self.outside.pop(0)
-            gateway = self.desk if send.channel in ("state", "session_reply", "netem_reply") else self.car
+    def deliver_all(self, mono_ns: int = 0) -> None:
+        """Deliver all messages in flight, and those sent in response."""
+        while self.in_flight:
+            send = self.in_flight.pop(0)
+            gateway = self.client if send.channel in ("state", "session_reply", "netem_reply") else self.server
             gateway.receive(send.channel, send.payload, Now(mono_ns, 0), send.peer or "query")
 
-    def hold(self) -> None:
-        """Get the vehicle for the one at the desk."""
-        self.desk.send(Send("session", HOLD))
-        self.carry()
-        self.car.send(Send("session_reply", GRANTED, "query"))
-        self.carry()
+    def acquire_control(self) -> None:
+        """Make the client the active operator."""
+        self.client.send(Send("session", HOLD))
+        self.deliver_all()
+        self.server.send(Send("session_reply", GRANTED, "query"))
+        self.deliver_all()
 
 
 @pytest.fixture
-def both() -> Both:
-    doors = Both()
-    doors.hold()
-    return doors
+def pair() -> GatewayPair:
+    made = GatewayPair()
+    made.acquire_control()
+    return made
 
 
-def test_behind_the_doors_messages_are_what_was_meant(both: Both) -> None:
-    """A request that had to be made twice arrives once, and is answered as if there were no doors."""
-    both.desk.send(Send("control", COMMAND))
-    both.car.send(Send("state", b"state"))
-    both.carry()
-    assert both.in_the_car == [("session", HOLD, "query"), ("control", COMMAND, "query")]
-    assert both.at_the_desk == [("session_reply", GRANTED), ("state", b"state")]
+def test_gateways_deliver_each_message_once_and_unchanged(pair: GatewayPair) -> None:
+    """A request that needed a retry is delivered once, and its reply, a command and a state arrive unchanged."""
+    pair.client.send(Send("control", COMMAND))
+    pair.server.send(Send("state", b"state"))
+    pair.deliver_all()
+    assert pair.server_received == [("session", HOLD, "query"), ("control", COMMAND, "query")]
+    assert pair.client_received == [("session_reply", GRANTED), ("state", b"state")]
 
 
-def test_a_replayed_message_does_not_get_in(both: Both) -> None:
-    """What was recorded outside and comes a second time is counted and goes no further, but for old commands."""
+def test_replayed_requests_replies_and_states_are_rejected(pair: GatewayPair) -> None:
+    """Replayed requests, replies and states are rejected and counted; a replayed command is left to the safety gate."""
     recorded = []
     for channel, payload in (("session", HOLD), ("control", COMMAND)):
-        both.desk.send(Send(channel, payload))
-        recorded += both.outside
-        both.carry()
-    both.car.send(Send("session_reply", GRANTED, "query"))
-    both.carry()
-    both.car.send(Send("state", b"state"))
-    recorded += both.outside
-    both.carry()
-    inside, shown = list(both.in_the_car), list(both.at_the_desk)
-    both.outside = list(recorded)
-    both.carry()
-    assert both.in_the_car[len(inside) :] == [("control", COMMAND, "query")]  # its sequence is refused by the gate
-    assert both.at_the_desk == shown
-    assert both.car.counts["session_requests_of_another_time"] == 2  # the very first one, and the replayed one
-    assert both.desk.counts["states_replayed"] == 1
+        pair.client.send(Send(channel, payload))
+        recorded += pair.in_flight
+        pair.deliver_all()
+    pair.server.send(Send("session_reply", GRANTED, "query"))
+    pair.deliver_all()
+    pair.server.send(Send("state", b"state"))
+    recorded += pair.in_flight
+    pair.deliver_all()
+    server_received, client_received = list(pair.server_received), list(pair.client_received)
+    pair.in_flight = list(recorded)
+    pair.deliver_all()
+    assert pair.server_received[len(server_received) :] == [
+        ("control", COMMAND, "query")
+    ]  # the gate rejects its sequence
+    assert pair.client_received == client_received
+    assert pair.server.counts["session_requests_of_another_time"] == 2  # the very first one, and the replayed one
+    assert pair.client.counts["states_replayed"] == 1
 
 
-def test_a_command_that_the_vehicle_rejected_is_no_flood(both: Both) -> None:
-    """Sent again by somebody ten thousand times it gets in as seldom as an old one, and what the holder says next does.
+def test_replays_of_a_rejected_command_are_rate_limited(pair: GatewayPair) -> None:
+    """Ten thousand replays of a command that the vehicle rejected are rate-limited, and the next command passes.
 
-    The vehicle does not count a command that it refused, so its sequence stays newer than that of the last one obeyed.
+    The sequence of a rejected command stays newer than that of the last accepted one.
     """
-    both.desk.send(Send("control", COMMAND))
-    rejected, before = both.outside.pop().payload, len(both.in_the_car)
+    pair.client.send(Send("control", COMMAND))
+    rejected, before = pair.in_flight.pop().payload, len(pair.server_received)
     for _ in range(10_000):
-        both.car.receive("control", rejected, Now(2 * NS_PER_S, 0), None)
-    assert len(both.in_the_car) - before == 1 + OTHERS_PER_S
-    both.desk.send(Send("control", NEXT_COMMAND))
-    both.carry(2 * NS_PER_S)
-    assert both.in_the_car[-1] == ("control", NEXT_COMMAND, "query")
+        pair.server.receive("control", rejected, Now(2 * NS_PER_S, 0), None)
+    assert len(pair.server_received) - before == 1 + OTHER_COMMANDS_PER_S
+    pair.client.send(Send("control", NEXT_COMMAND))
+    pair.deliver_all(2 * NS_PER_S)
+    assert pair.server_received[-1] == ("control", NEXT_COMMAND, "query")
 
 
-def test_a_command_under_a_broken_signature_hides_no_true_one(both: Both) -> None:
-    """Who is faster than the holder's own command, with its code but not its signature, does not make it an old one."""
+def test_a_forged_signature_does_not_displace_the_true_command(pair: GatewayPair) -> None:
+    """A copy of a command with its MAC but a broken signature does not make the true command a replay."""
     for command in (COMMAND, NEXT_COMMAND):
-        both.desk.send(Send("control", command))
-    first, following = (both.outside.pop(0).payload for _ in range(2))
-    inside = len(both.in_the_car)
-    both.car.receive("control", following[:-1] + bytes([following[-1] ^ 1]), Now(0, 0), None)
-    for _ in range(1000):  # nothing is left of what old commands may take
-        both.car.receive("control", first, Now(0, 0), None)
-    both.car.receive("control", following, Now(0, 0), None)
-    assert len(both.in_the_car) - inside == 1 + OTHERS_PER_S + 1
-    assert both.in_the_car[-1] == ("control", NEXT_COMMAND, None)
+        pair.client.send(Send("control", command))
+    first, following = (pair.in_flight.pop(0).payload for _ in range(2))
+    before = len(pair.server_received)
+    pair.server.receive("control", following[:-1] + bytes([following[-1] ^ 1]), Now(0, 0), None)
+    for _ in range(1000):  # exhaust the rate limit for replays
+        pair.server.receive("control", first, Now(0, 0), None)
+    pair.server.receive("control", following, Now(0, 0), None)
+    assert len(pair.server_received) - before == 1 + OTHER_COMMANDS_PER_S + 1
+    assert pair.server_received[-1] == ("control", NEXT_COMMAND, None)
 
 
-def test_a_server_started_anew_is_requested_once_a_second(both: Both) -> None:
-    """States of an unknown process of the server are not shown before it has answered, and do not cause a flood."""
-    anew = Both()
-    anew.desk, both.desk = both.desk, anew.desk
-    ours, theirs = vars(anew.car._authenticator), vars(both.car._authenticator)
+def test_states_of_a_restarted_server_cause_one_request_a_second(pair: GatewayPair) -> None:
+    """States of a restarted server are rejected until it has answered a request, which is sent once a second."""
+    restarted = GatewayPair()
+    restarted.client, pair.client = pair.client, restarted.client
+    ours, theirs = vars(restarted.server._authenticator), vars(pair.server._authenticator)
     ours["_key"], ours["_operators"] = theirs["_key"], theirs["_operators"]
     requested, times = [], []
     for number in range(100):
-        anew.car.send(Send("state", b"state"))
-        state = anew.outside.pop()
-        both.outside.clear()
-        anew.desk.receive("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
-        requested += both.outside
-        times += [number] * len(both.outside)
+        restarted.server.send(Send("state", b"state"))
+        state = restarted.in_flight.pop()
+        pair.in_flight.clear()
+        restarted.client.receive("state", state.payload, Now(number * NS_PER_S // 50, 0), None)
+        requested += pair.in_flight
+        times += [number] * len(pair.in_flight)
     assert [each.channel for each in requested] == ["session", "session"]
     assert times == [0, 50]
-    assert ("state", b"state") not in both.at_the_desk
-    anew.car.receive("session", requested[-1].payload, Now(0, 0), "query")
-    anew.desk.receive("session_reply", anew.outside.pop().payload, Now(0, 0), None)
-    anew.car.send(Send("state", b"state"))
-    anew.desk.receive("state", anew.outside.pop().payload, Now(0, 0), None)
-    assert both.at_the_desk[-1] == ("state", b"state")
+    assert ("state", b"state") not in pair.client_received
+    restarted.server.receive("session", requested[-1].payload, Now(0, 0), "query")
+    restarted.client.receive("session_reply", restarted.in_flight.pop().payload, Now(0, 0), None)
+    restarted.server.send(Send("state", b"state"))
+    restarted.client.receive("state", restarted.in_flight.pop().payload, Now(0, 0), None)
+    assert pair.client_received[-1] == ("state", b"state")
 
 
-def test_states_of_a_known_server_cause_no_query(both: Both) -> None:
-    """A state of the server's process that has answered is delivered, and nothing is asked because of it."""
-    both.car.send(Send("state", b"state"))
-    both.desk.receive("state", both.outside.pop().payload, Now(0, 0), None)
-    assert both.at_the_desk[-1] == ("state", b"state")
-    assert both.outside == []
+def test_states_of_a_known_server_cause_no_query(pair: GatewayPair) -> None:
+    """A state of a server process that has answered before is delivered and causes no query."""
+    pair.server.send(Send("state", b"state"))
+    pair.client.receive("state", pair.in_flight.pop().payload, Now(0, 0), None)
+    assert pair.client_received[-1] == ("state", b"state")
+    assert pair.in_flight == []
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_a_flood_of_queries_is_screened(both: Both, signed: bool) -> None:
-    """Of ten thousand queries in a second as many are looked at as one client could ever ask."""
-    heard: list[bytes] = []
+def test_queries_are_rate_limited(pair: GatewayPair, signed: bool) -> None:
+    """Of 10000 queries in a second 100 are verified and the others are counted."""
+    received: list[bytes] = []
     gateway = (
-        both.car
+        pair.server
         if signed
         else ServerGateway(
-            lambda _channel, payload, _arrived, _peer: heard.append(payload),
+            lambda _channel, payload, _arrived, _peer: received.append(payload),
             lambda *_: None,
             lambda: (7, 2),
-            NoVehicleAuthenticator(),
+            NullVehicleAuthenticator(),
         )
     )
     for number in range(10_000):
         gateway.receive("session", b"garbage", Now(2 * NS_PER_S, 0), number)
     assert gateway.counts["session_requests_screened_out"] == 10_000 - QUERIES_PER_S
-    assert len(heard) == (0 if signed else QUERIES_PER_S)
+    assert len(received) == (0 if signed else QUERIES_PER_S)
 
 
-def test_nobody_waits_at_the_gateway_for_the_link(both: Both) -> None:
-    """While the link carries something out, the answer to a stale request too, the door can be used by others."""
-    free: list[bool] = []
+def test_the_gateway_is_unlocked_while_the_link_sends(pair: GatewayPair) -> None:
+    """A gateway does not hold its lock while the link sends, not even for the reply to a stale request."""
+    unlocked: list[bool] = []
 
     def carry(*sends: Send) -> None:
-        free.append(not both.car._turn.locked() and not both.desk._turn.locked())
-        both.outside.extend(sends)
+        unlocked.append(not pair.server._lock.locked() and not pair.client._lock.locked())
+        pair.in_flight.extend(sends)
 
-    both.car._carry = both.desk._carry = carry
-    both.outside.append(Send("session", both.desk._authenticator.sign_request("session", b"")))
-    both.carry()
-    both.hold()
-    both.car.send(Send("state", b"state"))
-    assert (len(free), all(free)) == (4, True)
+    pair.server._carry = pair.client._carry = carry
+    pair.in_flight.append(Send("session", pair.client._authenticator.sign_request("session", b"")))
+    pair.deliver_all()
+    pair.acquire_control()
+    pair.server.send(Send("state", b"state"))
+    assert (len(unlocked), all(unlocked)) == (4, True)
 
 
-def test_a_delivered_message_is_answered_in_another_thread() -> None:
-    """A query that a reply asks for again is sent in a thread of its own, since Zenoh sends none while it delivers."""
-    both = Both()
-    del both.desk._send_soon
-    both.desk.send(Send("session", HOLD))
-    both.car.receive("session", both.outside.pop().payload, Now(0, 0), "query")
+def test_a_retry_is_sent_in_another_thread() -> None:
+    """The retry of a request is sent from a daemon thread, because Zenoh sends nothing in the thread that delivers."""
+    pair = GatewayPair()
+    del pair.client._send_in_thread
+    pair.client.send(Send("session", HOLD))
+    pair.server.receive("session", pair.in_flight.pop().payload, Now(0, 0), "query")
     sent: queue.SimpleQueue[tuple[threading.Thread, tuple[Send, ...]]] = queue.SimpleQueue()
-    both.desk._carry = lambda *sends: sent.put((threading.current_thread(), sends))
-    both.desk.receive("session_reply", both.outside.pop().payload, Now(0, 0), None)
+    pair.client._carry = lambda *sends: sent.put((threading.current_thread(), sends))
+    pair.client.receive("session_reply", pair.in_flight.pop().payload, Now(0, 0), None)
     thread, sends = sent.get(timeout=10)
     assert thread is not threading.current_thread()
     assert thread.daemon
     assert [each.channel for each in sends] == ["session"]
 
 
-def test_a_flood_of_states_is_screened(both: Both) -> None:
-    """Of a flood of states no more signatures are verified than a few vehicles could make."""
+def test_states_are_rate_limited(pair: GatewayPair) -> None:
+    """Of 10000 forged states in a second 500 are verified and the others are counted."""
     for _ in range(10_000):
-        both.desk.receive("state", bytes(200), Now(2 * NS_PER_S, 0), None)
-    assert both.desk.counts["states_screened_out"] == 10_000 - STATES_PER_S
-    assert both.desk.counts["states_forged"] == STATES_PER_S
-    assert not [each for each in both.at_the_desk if each[0] == "state"]
+        pair.client.receive("state", bytes(200), Now(2 * NS_PER_S, 0), None)
+    assert pair.client.counts["states_screened_out"] == 10_000 - STATES_PER_S
+    assert pair.client.counts["states_forged"] == STATES_PER_S
+    assert not [each for each in pair.client_received if each[0] == "state"]
 
 
-def test_a_flood_does_not_hide_what_is_the_holders(both: Both) -> None:
-    """In a flood of forged and old states and queries, the vehicle's next state and the holder's next query go on."""
+def test_a_flood_does_not_displace_authentic_messages(pair: GatewayPair) -> None:
+    """During a flood of forged and replayed states and queries, the next authentic state and query are delivered."""
     now = Now(2 * NS_PER_S, 0)
-    both.car.send(Send("state", b"old"))
-    both.desk.send(Send("session", HOLD))
-    state, query = both.outside
-    both.carry()
-    both.car.send(Send("session_reply", GRANTED, "query"))
-    both.carry()
-    for flooded in (both.desk, both.car):
-        channel, true = ("state", state.payload) if flooded is both.desk else ("session", query.payload)
+    pair.server.send(Send("state", b"old"))
+    pair.client.send(Send("session", HOLD))
+    state, query = pair.in_flight
+    pair.deliver_all()
+    pair.server.send(Send("session_reply", GRANTED, "query"))
+    pair.deliver_all()
+    for flooded in (pair.client, pair.server):
+        channel, true = ("state", state.payload) if flooded is pair.client else ("session", query.payload)
         for number in range(2_000):
             flooded.receive(channel, true if number % 2 else true[:-80] + bytes(80), now, number)
-    both.outside.clear()
-    both.car.send(Send("state", b"new"))
-    both.desk.send(Send("session", HOLD))
-    inside = len(both.in_the_car)
-    for send in both.outside:
-        (both.desk if send.channel == "state" else both.car).receive(send.channel, send.payload, now, "next")
-    assert both.at_the_desk[-1] == ("state", b"new")
-    assert both.in_the_car[inside:] == [("session", HOLD, "next")]
-    assert both.car.counts["session_requests_screened_out"] > 1_000
-    assert both.desk.counts["states_screened_out"] > 1_000
+    pair.in_flight.clear()
+    pair.server.send(Send("state", b"new"))
+    pair.client.send(Send("session", HOLD))
+    before = len(pair.server_received)
+    for send in pair.in_flight:
+        (pair.client if send.channel == "state" else pair.server).receive(send.channel, send.payload, now, "next")
+    assert pair.client_received[-1] == ("state", b"new")
+    assert pair.server_received[before:] == [("session", HOLD, "next")]
+    assert pair.server.counts["session_requests_screened_out"] > 1_000
+    assert pair.client.counts["states_screened_out"] > 1_000
 
 
-def test_requests_that_are_never_answered_are_forgotten() -> None:
-    """The door remembers the newest requests, as many as a link keeps queries, and answers each of them once."""
+def test_pending_requests_are_bounded() -> None:
+    """The gateway keeps as many pending requests as the link keeps queries, and each gets one reply."""
     carried: list[Send] = []
     gateway = ServerGateway(
-        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NoVehicleAuthenticator()
+        lambda *_: None, lambda *sends: carried.extend(sends), lambda: (7, 2), NullVehicleAuthenticator()
     )
     for number in range(1000):
         gateway.receive("session", b"request", Now(number * NS_PER_S, 0), number)
     for _ in range(2):
         gateway.send(*(Send("session_reply", b"reply", number) for number in range(1000)))
-    assert zenoh_link.QUERIES_KEPT == QUERIES_KEPT
-    assert carried == [Send("session_reply", b"reply", number) for number in range(1000 - QUERIES_KEPT, 1000)]
+    assert zenoh_link.MAX_PENDING_QUERIES == MAX_PENDING_QUERIES
+    assert carried == [Send("session_reply", b"reply", number) for number in range(1000 - MAX_PENDING_QUERIES, 1000)]
 
 
 def test_an_open_gateway_changes_nothing() -> None:
-    """Where nothing is signed the operator's door is none."""
+    """Where nothing is signed, the operator's gateway passes messages unchanged."""
     delivered: list[Any] = []
     sent: list[Send] = []
     gateway = OpenClientGateway(lambda *message: delivered.append(message), lambda *sends: sent.extend(sends))

@@ -8,24 +8,24 @@ from hypothesis import strategies as st
 from lavt.domain import Lane, Picture, SeenLane
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
 from lavt.transport.rtp.rtp import AccessUnit, Depacketizer, Packetizer, parse_packet
-from lavt.transport.video.frame_codec import KEPT_PICTURES, InMemoryFrameCodec, LaneReceiver, LaneSender
+from lavt.transport.video.frame_codec import MAX_STORED_PICTURES, InMemoryFrameCodec, LaneReceiver, LaneSender
 
 numbers = st.floats(allow_nan=False)
 STAMP_NS = 1_790_000_000_123_456_789
 
 
 def through_rtp(access_units: list[bytes], lost: int | None = None) -> list[AccessUnit]:
-    """Send access units as packets, one of which may be lost, and give what arrives."""
-    packetizer, reorder, depacketizer = Packetizer(7, 65_530), JitterBuffer(), Depacketizer()
+    """Send access units as packets, of which one may be lost, and return the access units that arrive."""
+    packetizer, jitter_buffer, depacketizer = Packetizer(7, 65_530), JitterBuffer(), Depacketizer()
     packets = [each for number, unit in enumerate(access_units) for each in packetizer.packetize(unit, number)]
     assert len(packets) == len(access_units), "one packet each"
     ordered = [
         pair
         for number, packet in enumerate(packets)
         if number != lost
-        for pair in reorder.push(parse_packet(packet), number)
+        for pair in jitter_buffer.push(parse_packet(packet), number)
     ]
-    ordered += reorder.expire(10**9)
+    ordered += jitter_buffer.expire(10**9)
     return [unit for packet, lost_before in ordered for unit in depacketizer.push(packet, lost_before)]
 
 
@@ -35,7 +35,7 @@ def picture(number: int) -> Picture:
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.lists(numbers, min_size=7, max_size=7))
 def test_a_lane_arrives_as_it_was_sent(stamp_ns: int, at_ns: int, values: list[float]) -> None:
-    """A lane goes through RTP bit for bit, with its stamp."""
+    """A lane and its stamp arrive through RTP bit for bit."""
     c0, c1, c2, *rest = values
     sender, receiver = LaneSender(), LaneReceiver()
     stamped = sender.write_stamp(SeenLane(0, at_ns, Lane((c0, c1, c2), *rest)), stamp_ns)
@@ -46,8 +46,8 @@ def test_a_lane_arrives_as_it_was_sent(stamp_ns: int, at_ns: int, values: list[f
     assert receiver.read_stamp(received) == stamp_ns
 
 
-def test_two_lanes_of_a_standing_car_differ() -> None:
-    """The checksum holds the time, so that a car that stands is not taken for a camera that hangs."""
+def test_two_lanes_of_a_stationary_car_differ() -> None:
+    """The checksum of a lane depends on its time, so a stationary car is not taken for a frozen camera."""
     lane = Lane((0.0, 0.0, 0.0), 3.5, 3.6, 20.0, 1.0)
     one, same, later = (LaneSender().prepare(SeenLane(0, at_ns, lane))[1] for at_ns in (1, 1, 2))
     assert one == same
@@ -55,41 +55,41 @@ def test_two_lanes_of_a_standing_car_differ() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65", b"\x00\x00\x00\x01\x65abc"])
-def test_what_is_no_picture_gives_none(data: bytes) -> None:
-    """Access units of something else give no picture, and raise nothing."""
+def test_foreign_access_units_give_no_picture(data: bytes) -> None:
+    """Access units with other contents give no picture and raise nothing."""
     assert LaneReceiver().decode(data) is None
     assert InMemoryFrameCodec().decode(data) is None
 
 
 def test_pixels_arrive_as_they_were_rendered() -> None:
-    """A picture handed over has every pixel that it had when it was encoded, its stamp can be read, once."""
-    between = InMemoryFrameCodec()
-    shown = between.write_stamp(picture(1), STAMP_NS)
-    (unit,) = through_rtp([between.encode(shown, keyframe=False)])
-    expected = shown.copy()
-    shown[:] = 0  # the camera uses its buffer again
-    received = between.decode(unit.data)
+    """A received picture has the pixels and the stamp that it had when it was encoded, and can be decoded once."""
+    codec = InMemoryFrameCodec()
+    stamped = codec.write_stamp(picture(1), STAMP_NS)
+    (unit,) = through_rtp([codec.encode(stamped, keyframe=False)])
+    expected = stamped.copy()
+    stamped[:] = 0  # the camera reuses its buffer
+    received = codec.decode(unit.data)
     assert received is not None
     assert np.array_equal(received.picture, expected)
-    assert between.read_stamp(received) == STAMP_NS
-    assert between.decode(unit.data) is None
+    assert codec.read_stamp(received) == STAMP_NS
+    assert codec.decode(unit.data) is None
 
 
-def test_a_lost_picture_spoils_no_other() -> None:
-    """Each access unit stands alone: after a loss the next one is complete, and the lost picture is let go."""
-    between = InMemoryFrameCodec()
-    units = through_rtp([between.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
+def test_a_lost_picture_damages_no_other() -> None:
+    """Access units are independent: after a loss the next one is complete, and the lost picture is dropped."""
+    codec = InMemoryFrameCodec()
+    units = through_rtp([codec.encode(picture(number), keyframe=False) for number in range(4)], lost=1)
     assert [unit.complete for unit in units] == [True, True, True]
-    received = [between.decode(unit.data) for unit in units]
+    received = [codec.decode(unit.data) for unit in units]
     assert [
         np.array_equal(each.picture, picture(number)) for each, number in zip(received, (0, 2, 3), strict=True) if each
     ]
-    assert not between._pictures
+    assert not codec._pictures
 
 
 def test_pictures_that_never_arrive_fill_no_memory() -> None:
-    """When nothing arrives, only so many pictures are kept, the newest."""
-    between = InMemoryFrameCodec()
-    units = [between.encode(picture(0)[:1], keyframe=False) for _ in range(KEPT_PICTURES + 5)]
-    assert between.decode(units[4]) is None
-    assert between.decode(units[5]) is not None
+    """If no picture arrives, only the newest 300 are stored."""
+    codec = InMemoryFrameCodec()
+    units = [codec.encode(picture(0)[:1], keyframe=False) for _ in range(MAX_STORED_PICTURES + 5)]
+    assert codec.decode(units[4]) is None
+    assert codec.decode(units[5]) is not None

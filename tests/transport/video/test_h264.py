@@ -43,24 +43,24 @@ def access_units(pictures: list[Picture]) -> list[bytes]:
     return [encode(picture) for picture in pictures]
 
 
-def kinds(access_unit: bytes) -> list[int]:
+def nal_types(access_unit: bytes) -> list[int]:
     return [unit[0] & 0x1F for unit in split_nal_units(access_unit)]
 
 
 def test_no_hidden_frame(pictures: list[Picture]) -> None:
-    """One picture in gives one access unit out, and that one picture out, at once, with the stamp it was given."""
+    """Each picture gives one access unit, which decodes to that picture with its stamp, without a frame of delay."""
     sender, receiver = encoder(), Decoder()
     for number, picture in enumerate(pictures):
         access_unit = sender.encode(picture)
-        assert sum(kind in {1, 5} for kind in kinds(access_unit)) == 1
+        assert sum(nal_type in {1, 5} for nal_type in nal_types(access_unit)) == 1
         decoded = receiver.decode(access_unit)
         assert decoded is not None
         assert read_stamp(decoded.luma) == START_NS + number * FRAME_NS
         assert not decoded.corrupt
 
 
-def test_picture_is_the_picture(pictures: list[Picture], access_units: list[bytes]) -> None:
-    """What comes out looks like what went in: same size, blue green red, a few grey levels off."""
+def test_decoded_picture_resembles_the_original(pictures: list[Picture], access_units: list[bytes]) -> None:
+    """A decoded picture has the size and channel order of the original and differs by a few grey levels."""
     decoded = Decoder().decode(access_units[0])
     assert decoded is not None
     assert decoded.picture.shape == (HEIGHT, WIDTH, 3)
@@ -78,13 +78,13 @@ def test_picture_is_the_picture(pictures: list[Picture], access_units: list[byte
 
 
 def test_same_pictures_same_bytes(pictures: list[Picture], access_units: list[bytes]) -> None:
-    """Encoding is deterministic: another encoder makes the same bytes of the same pictures."""
+    """Encoding is byte-for-byte reproducible by another encoder."""
     encode = encoder().encode
     assert [encode(picture) for picture in pictures] == access_units
 
 
 def test_pictures_stay_as_they_are(pictures: list[Picture]) -> None:
-    """The encoder does not keep or change the picture it is given, and a decoded one is nobody else's."""
+    """A decoded picture is not overwritten when later pictures are encoded and decoded."""
     sender, receiver = encoder(), Decoder()
     first = receiver.decode(sender.encode(pictures[0]))
     assert first is not None
@@ -98,15 +98,15 @@ def test_pictures_stay_as_they_are(pictures: list[Picture]) -> None:
 def test_keyframes(access_units: list[bytes]) -> None:
     """A keyframe comes every `gop_frames` frames and carries its parameter sets in band."""
     for number, access_unit in enumerate(access_units):
-        assert ({7, 8, 5} <= set(kinds(access_unit))) == (number % 15 == 0)
+        assert ({7, 8, 5} <= set(nal_types(access_unit))) == (number % 15 == 0)
 
 
 def test_keyframe_on_request(pictures: list[Picture]) -> None:
-    """A requested keyframe is that very frame, and decoding can begin with it."""
+    """A keyframe is sent with the frame for which it was requested, and decoding can begin with it."""
     sender = encoder(gop_frames=300)
     units = [sender.encode(picture, keyframe=number == 7) for number, picture in enumerate(pictures[:10])]
-    assert [number for number, unit in enumerate(units) if 5 in kinds(unit)] == [0, 7]
-    assert kinds(units[7])[:2] == [7, 8]
+    assert [number for number, unit in enumerate(units) if 5 in nal_types(unit)] == [0, 7]
+    assert nal_types(units[7])[:2] == [7, 8]
     receiver = Decoder()
     for number in range(7, 10):
         decoded = receiver.decode(units[number])
@@ -115,7 +115,7 @@ def test_keyframe_on_request(pictures: list[Picture]) -> None:
 
 
 def test_bit_rate(pictures: list[Picture], access_units: list[bytes]) -> None:
-    """The decoder buffer holds: the stream keeps to its rate, and a smaller buffer means a smaller largest frame."""
+    """The stream keeps to its bit rate, and a smaller decoder buffer gives a smaller largest frame."""
     bits = 8 * sum(len(unit) for unit in access_units)
     assert 0.5e6 < bits / (len(access_units) / 30) < 1.3e6
     encode = encoder(buffer_s=1 / 30).encode
@@ -132,14 +132,14 @@ def test_empty_access_unit(access_units: list[bytes]) -> None:
 
 
 def test_no_keyframe_yet(access_units: list[bytes]) -> None:
-    """Before the first keyframe there is no picture."""
+    """Access units before the first keyframe give no picture."""
     receiver = Decoder()
     assert [receiver.decode(unit) for unit in access_units[1:4]] == [None, None, None]
     assert receiver.decode(access_units[15]) is not None
 
 
 def test_truncated_access_unit(access_units: list[bytes]) -> None:
-    """A picture of which a part is missing is given with the rest made up, and says so."""
+    """A truncated access unit gives a concealed picture that is marked corrupt."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     decoded = receiver.decode(access_units[1][: len(access_units[1]) // 2])
@@ -148,7 +148,7 @@ def test_truncated_access_unit(access_units: list[bytes]) -> None:
 
 
 def test_keyframe_after_damage(access_units: list[bytes]) -> None:
-    """Nothing of a damaged picture, wherever it was cut off, is left in the keyframe after it."""
+    """A keyframe after a truncated picture decodes without any trace of the damage."""
     clean = Decoder().decode(access_units[15])
     assert clean is not None
     for kept in range(100, len(access_units[14]), 97):
@@ -161,7 +161,7 @@ def test_keyframe_after_damage(access_units: list[bytes]) -> None:
 
 
 def test_lost_access_units(access_units: list[bytes]) -> None:
-    """After two lost pictures in a row the next ones come out all the same, and the next keyframe at once."""
+    """After two consecutive lost pictures each later access unit still gives a picture, and the keyframe its own."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     for number in range(3, 15):
@@ -173,7 +173,7 @@ def test_lost_access_units(access_units: list[bytes]) -> None:
 
 
 def test_other_size_on_the_way(access_units: list[bytes]) -> None:
-    """The decoder follows a sender that begins anew with another size."""
+    """The decoder follows a sender that restarts with another picture size."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     other = Encoder(128, 96, rate_hz=30, bit_rate_bps=500_000, gop_frames=15)
@@ -185,7 +185,7 @@ def test_other_size_on_the_way(access_units: list[bytes]) -> None:
 @settings(max_examples=60)
 @given(st.binary(max_size=200), st.booleans())
 def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> None:
-    """No bytes make the decoder raise, nor keep the next keyframe from being decoded."""
+    """No bytes make the decoder raise or prevent it from decoding the next keyframe."""
     receiver = Decoder()
     receiver.decode(access_units[0])
     receiver.decode(b"\x00\x00\x00\x01" * start_code + data)
@@ -197,7 +197,7 @@ def test_any_bytes(access_units: list[bytes], data: bytes, start_code: bool) -> 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 14), st.integers(0, 10**6), st.integers(1, 255)), min_size=1, max_size=12))
 def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[int, int, int]]) -> None:
-    """What is made of a damaged stream is the same every time: made-up parts come from no stray memory."""
+    """Decoding a damaged stream is reproducible: concealment does not depend on uninitialized memory."""
     units = [bytearray(unit) for unit in access_units[:15]]
     for number, at, flip in damage:
         units[number][at % len(units[number])] ^= flip
@@ -212,7 +212,7 @@ def test_damage_is_deterministic(access_units: list[bytes], damage: list[tuple[i
 
 @pytest.mark.parametrize("size", [(321, 240), (320, 241), (62, 240), (320, 62), (8192, 8192)])
 def test_bad_sizes(size: tuple[int, int]) -> None:
-    """Odd sizes, sizes below the stamp's and sizes beyond the decoder's are refused with a sentence."""
+    """Odd sizes, sizes smaller than the stamp and sizes beyond the decoder's limit are rejected."""
     with pytest.raises(UserError, match="choose"):
         Encoder(*size, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15)
 
@@ -222,27 +222,27 @@ def test_bad_sizes(size: tuple[int, int]) -> None:
     [{"rate_hz": 0}, {"rate_hz": float("nan")}, {"bit_rate_bps": 0}, {"gop_frames": 0}, {"buffer_s": 0.0}],
 )
 def test_bad_rates(change: dict[str, float]) -> None:
-    """Rates of nothing are refused with a sentence."""
+    """Rates, keyframe intervals and buffers of zero are rejected."""
     with pytest.raises(UserError, match="choose"):
         encoder(**change)
 
 
 def test_bad_preset() -> None:
-    """A preset that libx264 does not have is refused, and the sentence names those it has."""
+    """A preset that libx264 does not have is rejected, and the error names the valid ones."""
     with pytest.raises(UserError, match="ultrafast, superfast"):
         Encoder(WIDTH, HEIGHT, rate_hz=30, bit_rate_bps=1_000_000, gop_frames=15, preset="fastest")
 
 
 def test_picture_of_another_size() -> None:
-    """A picture that does not fit the encoder is refused."""
-    with pytest.raises(UserError, match="was made for"):
+    """A picture of another size than the encoder's is rejected."""
+    with pytest.raises(UserError, match="shape"):
         encoder().encode(np.zeros((WIDTH, HEIGHT, 3), np.uint8))
 
 
-def test_silence(
+def test_nothing_is_printed(
     capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, access_units: list[bytes]
 ) -> None:
-    """Neither a damaged stream nor the end of an encoder prints anything."""
+    """Neither a damaged stream nor the end of an encoder prints or logs anything."""
     receiver = Decoder()
     receiver.decode(access_units[1])
     receiver.decode(access_units[0][:500])

@@ -42,7 +42,7 @@ def new_server(token: bytes | None = TOKEN) -> PathServer:
 
 
 def answer_for(server: PathServer, address: tuple[str, int], now_ns: int = T0, token: bytes = TOKEN) -> bytes:
-    """Give what the client answers to the challenge that its hello from `address` brings."""
+    """Return the client's answer to the challenge that its hello from `address` gets."""
     client = PathClient(token)
     challenge = server.receive(client.hello(now_ns), address, now_ns)
     assert challenge is not None
@@ -51,37 +51,37 @@ def answer_for(server: PathServer, address: tuple[str, int], now_ns: int = T0, t
     return answer
 
 
-def opened(address: tuple[str, int] = HOME, now_ns: int = T0) -> PathServer:
+def server_with_open_path(address: tuple[str, int] = HOME, now_ns: int = T0) -> PathServer:
     server = new_server()
     assert server.receive(answer_for(server, address, now_ns), address, now_ns) is None
     assert server.open_address(now_ns) == address
     return server
 
 
-def rejected(server: PathServer) -> dict[str, int]:
+def rejections(server: PathServer) -> dict[str, int]:
     names = ("malformed", "wrong_token", "wrong_address", "stale", "foreign_reports")
     return {name: getattr(server, name) for name in names if getattr(server, name)}
 
 
 def test_opening() -> None:
-    """Hello, challenge and answer open the path to where they came from, and not before the answer is there."""
+    """Hello, challenge and answer open the path to the client's address, and not before the answer arrives."""
     server, client = new_server(), PathClient(TOKEN)
     assert server.open_address(T0) is None
     challenge = server.receive(client.hello(T0), HOME, T0)
     assert challenge is not None
     assert server.open_address(T0) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
     answer = client.answer(challenge)
     assert answer is not None
     assert server.receive(answer, HOME, T0 + 1) is None
     assert server.open_address(T0 + 1) == HOME
-    assert server.rtcp_admitted(HOME)
-    assert not server.rtcp_admitted(OTHER_PORT)
-    assert rejected(server) == {}
+    assert server.accepts_rtcp_from(HOME)
+    assert not server.accepts_rtcp_from(OTHER_PORT)
+    assert rejections(server) == {}
 
 
 def test_no_amplification() -> None:
-    """What the server sends to an unproven address is never longer than what came from there."""
+    """The server's reply to an unvalidated address is not longer than the datagram it replies to."""
     server, client = new_server(), PathClient(TOKEN)
     hello = client.hello(T0)
     challenge = server.receive(hello, HOME, T0)
@@ -89,8 +89,8 @@ def test_no_amplification() -> None:
     assert len(challenge) <= len(hello)
 
 
-def test_told_from_video() -> None:
-    """The datagrams of the path are neither RTP nor RTCP."""
+def test_path_datagrams_are_neither_rtp_nor_rtcp() -> None:
+    """The datagrams of the path validation are neither RTP nor RTCP."""
     server, client = new_server(), PathClient(TOKEN)
     hello = client.hello(T0)
     challenge = server.receive(hello, HOME, T0)
@@ -102,7 +102,7 @@ def test_told_from_video() -> None:
 
 
 def test_wrong_token() -> None:
-    """Whoever does not know the token gets no challenge, and no answer of theirs opens the path."""
+    """A peer with a wrong token gets no challenge, and an answer without a valid MAC does not open the path."""
     server = new_server()
     stranger = PathClient(OTHER_TOKEN)
     assert server.receive(stranger.hello(T0), HOME, T0) is None
@@ -113,19 +113,19 @@ def test_wrong_token() -> None:
     assert right is not None
     server.receive(right[:-32] + bytes(32), HOME, T0)
     assert server.open_address(T0) is None
-    assert rejected(server) == {"wrong_token": 2}
+    assert rejections(server) == {"wrong_token": 2}
 
 
 def test_no_session() -> None:
-    """Without a session there is no token, and nothing opens the path."""
+    """Without a session there is no token, and a hello is rejected."""
     server = new_server(None)
     assert server.receive(PathClient(TOKEN).hello(T0), HOME, T0) is None
-    assert rejected(server) == {"wrong_token": 1}
+    assert rejections(server) == {"wrong_token": 1}
 
 
 @pytest.mark.parametrize("address", [ELSEWHERE, OTHER_PORT])
 def test_answer_from_another_address(address: tuple[str, int]) -> None:
-    """An answer that was overheard and is sent from another address opens and moves nothing."""
+    """A copied answer that is sent from another address neither opens nor moves the path."""
     server = new_server()
     answer = answer_for(server, HOME)
     server.receive(answer, address, T0)
@@ -133,11 +133,11 @@ def test_answer_from_another_address(address: tuple[str, int]) -> None:
     server.receive(answer, HOME, T0)
     server.receive(answer, address, T0)
     assert server.open_address(T0) == HOME
-    assert rejected(server) == {"wrong_address": 2}
+    assert rejections(server) == {"wrong_address": 2}
 
 
 def test_third_party() -> None:
-    """Even who holds the token cannot aim the video at an address that does not itself receive a challenge."""
+    """A peer with the token cannot open the path to an address with an answer to another address's challenge."""
     server = new_server()
     answer = answer_for(server, ELSEWHERE)
     server.receive(answer, HOME, T0)
@@ -145,47 +145,47 @@ def test_third_party() -> None:
 
 
 def test_stale_challenge() -> None:
-    """A challenge is worth something for 2 s and not longer."""
+    """A challenge is valid for 2 s and not longer."""
     server = new_server()
     answer = answer_for(server, HOME, T0)
     server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS + 1)
     assert server.open_address(T0 + CHALLENGE_LIFETIME_NS + 1) is None
-    assert rejected(server) == {"stale": 1}
+    assert rejections(server) == {"stale": 1}
     server.receive(answer, HOME, T0 + CHALLENGE_LIFETIME_NS)
     assert server.open_address(T0 + CHALLENGE_LIFETIME_NS) == HOME
 
 
 def test_spoofed_hello() -> None:
-    """A hello from anywhere, proven or not, leaves an open path where it is."""
-    server = opened()
+    """A hello from another address, with or without the token, does not move an open path."""
+    server = server_with_open_path()
     server.receive(PathClient(TOKEN).hello(T0), ELSEWHERE, T0)
     server.receive(PathClient(OTHER_TOKEN).hello(T0), ELSEWHERE, T0)
     assert server.open_address(T0) == HOME
 
 
 def test_new_address() -> None:
-    """A client that comes from a new address is challenged there, and its answer moves the path."""
-    server = opened()
+    """A client with a new address is challenged there, and its answer moves the path."""
+    server = server_with_open_path()
     answer = answer_for(server, ELSEWHERE, T0 + 1)
     assert server.open_address(T0 + 1) == HOME
     server.receive(answer, ELSEWHERE, T0 + 1)
     assert server.open_address(T0 + 1) == ELSEWHERE
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
 
 
 def test_replay_after_a_move() -> None:
-    """An answer that opened the path once does not bring it back, not even from its own address."""
+    """An answer that opened the path once does not move it back, not even from its own address."""
     server = new_server()
     first = answer_for(server, HOME, T0)
     server.receive(first, HOME, T0)
     server.receive(answer_for(server, ELSEWHERE, T0 + 1), ELSEWHERE, T0 + 1)
     server.receive(first, HOME, T0 + 2)
     assert server.open_address(T0 + 2) == ELSEWHERE
-    assert rejected(server) == {"stale": 1}
+    assert rejections(server) == {"stale": 1}
 
 
-def test_replay_keeps_nothing_open() -> None:
-    """Repeating the answer does not stand in for receiver reports."""
+def test_replay_does_not_keep_the_path_open() -> None:
+    """A repeated answer does not replace receiver reports."""
     server = new_server()
     answer = answer_for(server, HOME, T0)
     server.receive(answer, HOME, T0)
@@ -194,35 +194,35 @@ def test_replay_keeps_nothing_open() -> None:
 
 
 def test_no_reports() -> None:
-    """A path without receiver reports for 2 s is closed, and one that had them stays open as long."""
-    server = opened()
+    """A path stays open for 2 s after the last receiver report, and is then closed."""
+    server = server_with_open_path()
     server.report(HOME, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS) == HOME
     assert server.open_address(T0 + 2 * REPORT_TIMEOUT_NS + 1) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
 
 
 def test_report_too_late() -> None:
-    """A report does not open a path again that has been closed; another challenge does."""
-    server = opened()
+    """A report does not reopen a closed path; an answer to a new challenge does."""
+    server = server_with_open_path()
     late_ns = T0 + REPORT_TIMEOUT_NS + 1
     server.report(HOME, late_ns)
     assert server.open_address(late_ns) is None
-    assert rejected(server) == {"foreign_reports": 1}
+    assert rejections(server) == {"foreign_reports": 1}
     server.receive(answer_for(server, HOME, late_ns), HOME, late_ns)
     assert server.open_address(late_ns) == HOME
 
 
 def test_report_from_elsewhere() -> None:
-    """Reports from where the path does not go keep nothing open."""
-    server = opened()
+    """Reports from another address do not keep the path open."""
+    server = server_with_open_path()
     server.report(ELSEWHERE, T0 + REPORT_TIMEOUT_NS)
     assert server.open_address(T0 + REPORT_TIMEOUT_NS + 1) is None
-    assert rejected(server) == {"foreign_reports": 1}
+    assert rejections(server) == {"foreign_reports": 1}
 
 
-def test_a_challenge_of_nobody_is_not_answered() -> None:
-    """The client answers challenges of who knows the token, each newer than the one before, and no others."""
+def test_forged_and_old_challenges_are_not_answered() -> None:
+    """The client answers a challenge only if its MAC is valid and it is newer than all before."""
     server, client = new_server(), PathClient(TOKEN)
     challenge = server.receive(client.hello(T0), HOME, T0)
     newer = server.receive(client.hello(T0 + 1), HOME, T0 + 1)
@@ -242,7 +242,7 @@ def encrypted() -> tuple[PathServer, PathClient]:
     return server, PathClient(TOKEN, partial(SrtpCipher, "client"))
 
 
-def reopened(server: PathServer, client: PathClient, address: tuple[str, int], now_ns: int) -> None:
+def open_path(server: PathServer, client: PathClient, address: tuple[str, int], now_ns: int) -> None:
     challenge = server.receive(client.hello(now_ns), address, now_ns)
     assert challenge is not None
     server.receive(client.answer(challenge) or b"", address, now_ns)
@@ -254,76 +254,76 @@ RTCP = bytes.fromhex("80c900010000000b")
 
 
 def test_an_encrypted_path_carries_video_down_and_reports_up() -> None:
-    """What either end seals the other opens, and nothing of a picture can be read in between."""
+    """Each end unprotects the packets that the other protects, and their payload is encrypted."""
     server, client = encrypted()
-    reopened(server, client, HOME, T0)
-    signed = server.cipher.authenticator(RTP)
-    assert b"a picture" not in signed
-    assert client.open(signed) == RTP
-    assert client.open(signed) is None
-    assert client.open(RTP) is None
-    assert client.open_control(server.cipher.protect_control(RTCP)) == RTCP
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
-    assert server.cipher.open_control(RTCP) is None
+    open_path(server, client, HOME, T0)
+    protected = server.cipher.protect(RTP)
+    assert b"a picture" not in protected
+    assert client.unprotect(protected) == RTP
+    assert client.unprotect(protected) is None
+    assert client.unprotect(RTP) is None
+    assert client.unprotect_rtcp(server.cipher.protect_rtcp(RTCP)) == RTCP
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
+    assert server.cipher.unprotect_rtcp(RTCP) is None
 
 
 def test_each_opening_has_keys_of_its_own() -> None:
-    """After a new challenge packets are sealed otherwise; those still on their way are opened, those after it too."""
+    """After a new challenge the keys are new, and the client still unprotects packets under the previous keys."""
     server, client = encrypted()
-    reopened(server, client, HOME, T0)
-    before = server.cipher.authenticator(RTP)
-    late = server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
-    reopened(server, client, ELSEWHERE, T0 + 1)
-    after = server.cipher.authenticator(RTP)
+    open_path(server, client, HOME, T0)
+    before = server.cipher.protect(RTP)
+    late = server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    open_path(server, client, ELSEWHERE, T0 + 1)
+    after = server.cipher.protect(RTP)
     assert after != before
-    assert client.open(after) == RTP
-    assert client.open(late) is not None
-    assert client.open(before) == RTP
-    assert client.open(before) is None
-    assert server.cipher.open_control(client.protect_control(RTCP)) is None  # the last that came was under the old keys
-    server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
-    assert client.open(server.cipher.authenticator(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
+    assert client.unprotect(after) == RTP
+    assert client.unprotect(late) is not None
+    assert client.unprotect(before) == RTP
+    assert client.unprotect(before) is None
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) is None  # the last received packet had the old keys
+    server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x02", 1))
+    assert client.unprotect(server.cipher.protect(RTP.replace(b"\x00\x01", b"\x00\x03", 1))) is not None
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
 
 
-def test_answers_that_are_lost_do_no_harm() -> None:
-    """A client whose newer answers never arrive still opens what comes under the keys of an older one."""
+def test_lost_answers_do_no_harm() -> None:
+    """A client whose newer answers are lost still unprotects packets under the keys of an older answer."""
     server, client = encrypted()
-    reopened(server, client, HOME, T0)
+    open_path(server, client, HOME, T0)
     for later_ns in range(1, 4):
         challenge = server.receive(client.hello(T0 + later_ns), HOME, T0 + later_ns)
         assert client.answer(challenge or b"") is not None
-    assert client.open(server.cipher.authenticator(RTP)) == RTP
-    assert server.cipher.open_control(client.protect_control(RTCP)) == RTCP
+    assert client.unprotect(server.cipher.protect(RTP)) == RTP
+    assert server.cipher.unprotect_rtcp(client.protect_rtcp(RTCP)) == RTCP
 
 
 @pytest.mark.parametrize("token", [OTHER_TOKEN, TOKEN, None])
 def test_new_token(token: bytes | None) -> None:
-    """A new token closes the path, and challenges from before it are worth nothing."""
-    server = opened()
+    """A new token closes the path and invalidates older challenges."""
+    server = server_with_open_path()
     before = answer_for(server, HOME, T0 + 1)
     server.set_token(token)
     assert server.open_address(T0 + 1) is None
-    assert not server.rtcp_admitted(HOME)
+    assert not server.accepts_rtcp_from(HOME)
     server.receive(before, HOME, T0 + 1)
     assert server.open_address(T0 + 1) is None
 
 
 def test_bad_token() -> None:
-    """A token that is not 16 bytes long is refused on both sides."""
+    """A token that is not 16 bytes long is rejected at both ends."""
     with pytest.raises(UserError, match="16 bytes"):
         PathClient(b"short")
     with pytest.raises(UserError, match="16 bytes"):
         new_server(b"")
 
 
-def test_a_lost_path_is_requested_for_long_before_the_vehicle_misses_a_command() -> None:
-    """A hello comes within half of the 300 ms after which a vehicle without a newer picture's command is degraded."""
+def test_a_lost_path_is_requested_long_before_the_command_timeout() -> None:
+    """A hello follows a lost video within half of the 300 ms command timeout after which a vehicle is degraded."""
     assert HELLO_AGAIN_NS <= 300_000_000 // 2
 
 
-def test_when_to_say_hello() -> None:
-    """The client says hello at once, then every 500 ms; once video came, whenever none has come for 150 ms."""
+def test_times_of_hellos() -> None:
+    """A hello is due immediately, then every 500 ms; after the first video, whenever none has arrived for 150 ms."""
     client = PathClient(TOKEN)
     assert client.next_hello_ns() == 0
     client.hello(T0)
@@ -336,20 +336,20 @@ def test_when_to_say_hello() -> None:
 
 @given(st.binary(max_size=80), st.sampled_from([b"", b"LAVT", b"LAVT\x01\x02", b"LAVT\x02\x02", b"LAVT\x03\x02"]))
 def test_any_bytes(data: bytes, head: bytes) -> None:
-    """No bytes make the server answer, open or raise, and every such datagram is counted once."""
-    server = opened()
+    """Arbitrary bytes get no reply, open no path and raise nothing, and each datagram is counted once."""
+    server = server_with_open_path()
     assert server.receive(head + data, ELSEWHERE, T0) is None
     assert server.open_address(T0) == HOME
-    assert sum(rejected(server).values()) == 1
+    assert sum(rejections(server).values()) == 1
     assert PathClient(TOKEN).answer(head + data) is None
 
 
 @given(st.integers(0, 61), st.integers(1, 255))
 def test_any_change(at: int, flip: int) -> None:
-    """An answer with any one byte changed opens nothing."""
+    """An answer with any byte changed does not open the path."""
     server = new_server()
     answer = bytearray(answer_for(server, HOME))
     answer[at] ^= flip
     server.receive(bytes(answer), HOME, T0)
     assert server.open_address(T0) is None
-    assert sum(rejected(server).values()) == 1
+    assert sum(rejections(server).values()) == 1

@@ -10,7 +10,7 @@ from lavt.errors import BadPacket, UserError
 from lavt.streams import stream
 from lavt.transport.video.stamp import (
     STAMP_PX,
-    holds_stamp,
+    has_stamp,
     read_clear_stamp,
     read_stamp,
     rtp_timestamp,
@@ -25,7 +25,7 @@ STAMPS = st.integers(min_value=0, max_value=2**64 - 1)
 
 @given(STAMPS)
 def test_round_trip(stamp_ns: int) -> None:
-    """Every 64-bit time that is written into a picture is read back from it."""
+    """A 64-bit time that is written into a picture is read back from it."""
     picture = np.full((STAMP_PX, STAMP_PX + 16, 3), 90, np.uint8)
     write_stamp(picture, stamp_ns)
     assert read_stamp(picture[..., 0]) == stamp_ns
@@ -33,7 +33,7 @@ def test_round_trip(stamp_ns: int) -> None:
 
 @given(STAMPS, st.integers(min_value=0, max_value=100))
 def test_noise(stamp_ns: int, seed: int) -> None:
-    """The stamp is read through noise of 40 grey levels on video range luma."""
+    """The stamp is read despite noise of 40 grey levels on limited-range luma."""
     picture = np.zeros((STAMP_PX, STAMP_PX, 3), np.uint8)
     write_stamp(picture, stamp_ns)
     luma = 16 + picture[..., 0].astype(np.float64) * 219 / 255
@@ -52,7 +52,7 @@ def test_layout() -> None:
 
 
 def test_rest_of_the_picture() -> None:
-    """Nothing outside the corner of 64 x 64 pixels changes."""
+    """The stamp changes nothing outside the corner of 64 x 64 pixels."""
     picture = np.full((96, 112, 3), 90, np.uint8)
     write_stamp(picture, 2**64 - 1)
     picture[:STAMP_PX, :STAMP_PX] = 90
@@ -60,14 +60,14 @@ def test_rest_of_the_picture() -> None:
 
 
 def test_part_of_a_larger_array() -> None:
-    """A stamp goes in place into a picture that is a view of another array."""
+    """A stamp is written in place into a picture that is a view of another array."""
     array = np.zeros((200, 300, 3), np.uint8)
     write_stamp(array[50:, 100:], 0xFFFF_0000_FFFF_0000)
     assert read_stamp(array[50:, 100:, 2]) == 0xFFFF_0000_FFFF_0000
 
 
 def test_centre_of_the_cells() -> None:
-    """Only the centre half of each cell counts, so what a filter does to the edges does not matter."""
+    """Only the centre half of each cell is read, so changes of the edges by a filter do not matter."""
     picture = np.zeros((64, 64, 3), np.uint8)
     write_stamp(picture, 0x0123_4567_89AB_CDEF)
     luma = picture[..., 0].copy()
@@ -86,7 +86,7 @@ def test_threshold() -> None:
 
 @given(STAMPS, st.sampled_from([(64, 64), (66, 130), (98, 134), (128, 160)]), st.integers(min_value=0, max_value=100))
 def test_i420(stamp_ns: int, size: tuple[int, int], seed: int) -> None:
-    """A stamp written into I420 gives the bytes that writing it into BGR and converting gives, at every even size."""
+    """A stamp in I420 is byte-for-byte the same as one written into BGR and converted, at every even size."""
     picture = stream(seed, "picture").integers(0, 256, (*size, 3), dtype=np.uint8)
     planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
     write_stamp_i420(planes, stamp_ns)
@@ -97,7 +97,7 @@ def test_i420(stamp_ns: int, size: tuple[int, int], seed: int) -> None:
 
 
 def test_luma_alone() -> None:
-    """A stamp goes in place into a luma plane with gaps between its rows, 16 and 235, and changes only its corner."""
+    """A stamp is written in place, as 16 and 235, into a luma plane with gaps between its rows."""
     array = np.full((100, 200), 90, np.uint8)
     write_stamp_luma(array[10:, 20:130], 1 << 63 | 1)
     assert read_stamp(array[10:, 20:]) == 1 << 63 | 1
@@ -107,13 +107,13 @@ def test_luma_alone() -> None:
 
 
 def test_i420_with_gaps() -> None:
-    """An I420 array with gaps is refused rather than left without neutral chroma."""
+    """An I420 array with gaps is rejected, since its chroma could not be made neutral."""
     with pytest.raises(ValueError, match="one block"):
         write_stamp_i420(np.zeros((96, 160), np.uint8)[:, :128], 1)
 
 
 def test_too_small() -> None:
-    """A picture without room for the stamp is the user's error when written and the peer's when read."""
+    """A picture without room for the stamp raises `UserError` when written and `BadPacket` when read."""
     with pytest.raises(UserError, match="64 x 64"):
         write_stamp(np.zeros((64, 63, 3), np.uint8), 1)
     with pytest.raises(UserError, match="64 x 64"):
@@ -129,7 +129,7 @@ SHAPES = st.lists(st.sampled_from([0, 1, 2, 63, 64, 65, 128]), max_size=4)
 
 @given(SHAPES)
 def test_any_shape(shape: list[int]) -> None:
-    """An array of any shape is read as a stamp or is a bad packet, and nothing else."""
+    """An array of any shape is read as a stamp or raises `BadPacket`, and nothing else."""
     readable = len(shape) == 2 and min(shape) >= STAMP_PX
     for read in (read_stamp, read_clear_stamp):
         try:
@@ -141,7 +141,7 @@ def test_any_shape(shape: list[int]) -> None:
 
 
 def test_clear_stamp() -> None:
-    """A clear stamp has each cell in the outer thirds between black and white; one in the middle makes it none."""
+    """A stamp is clear if each cell is in the outer thirds between black and white; else reading raises `BadPacket`."""
     luma = np.zeros((64, 80), np.uint8)
     write_stamp_luma(luma, 0x0123_4567_89AB_CDEF)
     assert read_clear_stamp(luma) == 0x0123_4567_89AB_CDEF
@@ -164,21 +164,21 @@ def test_rtp_timestamp() -> None:
 
 @given(STAMPS, st.integers(min_value=0, max_value=63))
 def test_agreement(stamp_ns: int, bit: int) -> None:
-    """A stamp agrees with its own timestamp, and one with a wrong bit above the lowest 13 does not."""
+    """A stamp agrees with its own timestamp, and does not with a wrong bit above the lowest 14."""
     assert stamp_agrees(stamp_ns, rtp_timestamp(stamp_ns))
     if bit > 13:
         assert not stamp_agrees(stamp_ns ^ 1 << bit, rtp_timestamp(stamp_ns))
 
 
 def off_ns(read_ns: int, true_ns: int) -> float:
-    """How far a stamp is off, where wraps of the RTP timestamp (2^32 ticks, 13.3 h) count as nothing."""
+    """Return the error of a stamp, modulo the wrap of the RTP timestamp (2^32 ticks, 13.3 h)."""
     ninths = abs(read_ns - true_ns) * 9 % (2**32 * 100_000)
     return min(ninths, 2**32 * 100_000 - ninths) / 9
 
 
 @given(st.binary(min_size=64, max_size=64), st.integers(min_value=0, max_value=100), st.integers(-60_000, 60_000))
 def test_any_picture(greys: bytes, seed: int, away_ns: int) -> None:
-    """Whatever the pixels are, and whatever was sent, a stamp that is accepted is within 12 us of the one sent."""
+    """For any pixels and any sent stamp, an accepted stamp is within 12 us of the one sent."""
     cells = np.frombuffer(greys, np.uint8).reshape(8, 8).repeat(8, axis=0).repeat(8, axis=1)
     noise = stream(seed, "noise").integers(0, 256, cells.shape, dtype=np.uint8)
     for luma in (cells, noise, cells // 2 + noise // 2):
@@ -189,7 +189,7 @@ def test_any_picture(greys: bytes, seed: int, away_ns: int) -> None:
 
 @given(STAMPS, st.lists(st.integers(min_value=0, max_value=63), max_size=4), st.integers(min_value=0, max_value=2**14))
 def test_any_damage(stamp_ns: int, wrong_bits: list[int], low_bits: int) -> None:
-    """Whichever cells of a stamp a decoder got wrong, one that is accepted is within 12 us of the one that was sent."""
+    """Whichever cells of a stamp are damaged, an accepted stamp is within 12 us of the one sent."""
     damaged_ns = stamp_ns ^ low_bits
     for bit in wrong_bits:
         damaged_ns ^= 1 << bit
@@ -200,17 +200,17 @@ def test_any_damage(stamp_ns: int, wrong_bits: list[int], low_bits: int) -> None
 
 @given(STAMPS, st.integers(min_value=0, max_value=2**32 - 1))
 def test_any_timestamp(stamp_ns: int, timestamp: int) -> None:
-    """No stamp agrees with two timestamps."""
+    """A stamp agrees with exactly one timestamp."""
     assert stamp_agrees(stamp_ns, timestamp) == (timestamp == rtp_timestamp(stamp_ns))
 
 
-def test_a_picture_with_a_stamp_is_told_from_one_without() -> None:
-    """A corner of black and white cells is a stamp; plain, grey or noisy corners and tiny pictures hold none."""
+def test_stamped_pictures_are_recognized() -> None:
+    """A corner of black and white cells is a stamp; plain and grey corners and tiny pictures have none."""
     picture = np.full((128, 160, 3), 90, dtype=np.uint8)
-    assert not holds_stamp(picture)
-    assert not holds_stamp(np.zeros_like(picture))
-    assert not holds_stamp(np.zeros((40, 40, 3), dtype=np.uint8))
+    assert not has_stamp(picture)
+    assert not has_stamp(np.zeros_like(picture))
+    assert not has_stamp(np.zeros((40, 40, 3), dtype=np.uint8))
     write_stamp(picture, 1_700_000_000_123_456_789)
-    assert holds_stamp(picture)
+    assert has_stamp(picture)
     picture[:64, :64] = picture[:64, :64] // 3 + 80
-    assert not holds_stamp(picture)
+    assert not has_stamp(picture)

@@ -5,9 +5,9 @@ from tests.nodes.stand_ins import at
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Now
 from lavt.transport.rtp.fec import RepairSender
-from lavt.transport.rtp.ntp_time import ntp_of_elapsed, short_time
+from lavt.transport.rtp.ntp_time import elapsed_to_ntp, ntp_to_short
 from lavt.transport.rtp.rtcp import BitRateLimit, Feedback, ReceptionReport, parse_announcement
-from lavt.transport.rtp.rtcp_xr import ReferenceTime, answered_round_trip_ns
+from lavt.transport.rtp.rtcp_xr import ReferenceTime, round_trip_of_answer_ns
 from lavt.transport.rtp.rtp import Packetizer
 from lavt.transport.video.stamp import rtp_timestamp
 from lavt.transport.video.stream_sender import StreamSender
@@ -20,81 +20,83 @@ def stream(repair_packets: int | None = None) -> StreamSender:
     return StreamSender(Packetizer(SSRC, 65_000), RepairSender(7, 0), repair_packets)
 
 
-def repairs(sender: StreamSender, at_ns: int) -> int:
+def count_repairs(sender: StreamSender, at_ns: int) -> int:
     return len(sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns)).repair)
 
 
-def hear(sender: StreamSender, highest: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
-    sender.hear(Feedback((ReceptionReport(ssrc, highest, 0.0, lost, 0),)), at(at_ns).mono_ns)
+def report_loss(sender: StreamSender, highest: int, lost: int, at_ns: int, ssrc: int = SSRC) -> None:
+    sender.receive_feedback(Feedback((ReceptionReport(ssrc, highest, 0.0, lost, 0),)), at(at_ns).mono_ns)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_a_fixed_number_of_repair_packets(count: int) -> None:
-    """A number that is configured is kept to, whatever is reported."""
+    """A configured number of repair packets does not depend on the reported loss."""
     sender = stream(count)
-    hear(sender, 100, 0, 0)
-    hear(sender, 200, 50, 1)
-    assert repairs(sender, 2) == count
+    report_loss(sender, 100, 0, 0)
+    report_loss(sender, 200, 50, 1)
+    assert count_repairs(sender, 2) == count
 
 
 def test_repair_packets_by_the_reported_loss() -> None:
-    """Without loss there are none; one after a loss; two while it is heavy; none again after a quiet half minute."""
+    """A block gets no repair packet without loss, one after a loss, two during heavy loss, and none 30 s after it."""
     sender = stream()
-    hear(sender, 10_000, 0, 0)
-    assert repairs(sender, 1) == 0
-    hear(sender, 10_300, 1, NS_PER_S)
-    assert repairs(sender, NS_PER_S + 1) == 1
-    hear(sender, 10_400, 21, 2 * NS_PER_S)
-    assert repairs(sender, 2 * NS_PER_S + 1) == 2
-    assert repairs(sender, 8 * NS_PER_S) == 1
-    assert repairs(sender, 33 * NS_PER_S) == 0
+    report_loss(sender, 10_000, 0, 0)
+    assert count_repairs(sender, 1) == 0
+    report_loss(sender, 10_300, 1, NS_PER_S)
+    assert count_repairs(sender, NS_PER_S + 1) == 1
+    report_loss(sender, 10_400, 21, 2 * NS_PER_S)
+    assert count_repairs(sender, 2 * NS_PER_S + 1) == 2
+    assert count_repairs(sender, 8 * NS_PER_S) == 1
+    assert count_repairs(sender, 33 * NS_PER_S) == 0
 
 
 def test_losses_are_those_between_two_reports() -> None:
-    """Losses before the first report, of another stream or in a report out of order say nothing; a wrap is none."""
+    """Losses before the first report, of another stream or in an old report are ignored; a wrap is not a loss."""
     sender = stream()
-    hear(sender, 2**32 - 100, 5000, 0)
-    assert repairs(sender, 1) == 0, "before the first report"
-    hear(sender, 50, 5000, 2)
-    hear(sender, 1000, 7000, 3, ssrc=OTHER)
-    hear(sender, 20, 9000, 4)
-    assert repairs(sender, 5) == 0, "no loss after a wrap, another stream, an old report"
-    hear(sender, 150, 5001, 6)
-    assert repairs(sender, 7) == 1
+    report_loss(sender, 2**32 - 100, 5000, 0)
+    assert count_repairs(sender, 1) == 0, "before the first report"
+    report_loss(sender, 50, 5000, 2)
+    report_loss(sender, 1000, 7000, 3, ssrc=OTHER)
+    report_loss(sender, 20, 9000, 4)
+    assert count_repairs(sender, 5) == 0, "no loss after a wrap, another stream, an old report"
+    report_loss(sender, 150, 5001, 6)
+    assert count_repairs(sender, 7) == 1
 
 
-def test_another_receiver_begins_anew() -> None:
-    """Losses and wishes of a receiver end with it."""
+def test_forget_receiver_resets_the_feedback() -> None:
+    """Losses and the bit rate limit of a receiver are discarded when another one begins."""
     sender = stream()
-    hear(sender, 100, 0, 0)
-    hear(sender, 200, 50, 1)
-    sender.hear(Feedback(limits=(BitRateLimit(SSRC, 10**6, 0),)), at(1).mono_ns)
+    report_loss(sender, 100, 0, 0)
+    report_loss(sender, 200, 50, 1)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 0),)), at(1).mono_ns)
     sender.forget_receiver()
-    hear(sender, 100, 60, 2)
-    assert repairs(sender, 3) == 0
+    report_loss(sender, 100, 60, 2)
+    assert count_repairs(sender, 3) == 0
     assert sender.bit_rate_limit_bps is None
 
 
 def test_a_limit_is_of_this_stream_and_of_its_payload() -> None:
-    """A limit on another stream is not ours; headers that a limit counts are taken off."""
+    """A limit of another stream is ignored; the headers that a limit includes are subtracted."""
     sender = stream()
-    sender.hear(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(OTHER, 10**6, 0),)), 0)
     assert sender.bit_rate_limit_bps is None
-    sender.hear(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
+    sender.receive_feedback(Feedback(limits=(BitRateLimit(SSRC, 10**6, 40),)), 0)
     assert sender.bit_rate_limit_bps == 10**6 * 1188 // 1228
 
 
 def test_the_first_frame_has_a_report() -> None:
-    """A sender report is due with the first frame, even when the monotonic clock is at its origin."""
+    """A sender report is due with the first frame, even if the monotonic clock is at 0."""
     assert len(stream().packets(UNIT, 0, Now(0, 0)).report) == 1
 
 
 def test_sender_reports() -> None:
-    """A report every 500 ms says what was sent by then and answers the last reference time once."""
+    """A sender report every 500 ms counts the packets sent until then and answers the last reference time once."""
     sender = stream()
     requested_ns = 7 * NS_PER_S
-    sender.hear(Feedback(reference_times=(ReferenceTime(9, short_time(ntp_of_elapsed(requested_ns))),)), at(0).mono_ns)
-    told = []
+    sender.receive_feedback(
+        Feedback(reference_times=(ReferenceTime(9, ntp_to_short(elapsed_to_ntp(requested_ns))),)), at(0).mono_ns
+    )
+    reports = []
     for at_ns in range(0, 1_300 * NS_PER_MS, 100 * NS_PER_MS):
         packets = sender.packets(UNIT, at(at_ns).wall_ns, at(at_ns))
         for datagram in packets.report:
@@ -103,7 +105,7 @@ def test_sender_reports() -> None:
             assert (report.ssrc, report.rtp_timestamp) == (SSRC, rtp_timestamp(at(at_ns).wall_ns))
             payload_bytes = sum(len(each) - 12 for each in packets.media)
             assert report.octets == payload_bytes * report.packets // len(packets.media)
-            told.append((at_ns // NS_PER_MS, report.packets // len(packets.media), announcement.answers))
-    assert [(ms, frames, len(answers)) for ms, frames, answers in told] == [(0, 1, 1), (500, 6, 0), (1000, 11, 0)]
-    (answer,) = told[0][2]
-    assert answered_round_trip_ns(answer, requested_ns + 80 * NS_PER_MS) == pytest.approx(80 * NS_PER_MS, abs=50_000)
+            reports.append((at_ns // NS_PER_MS, report.packets // len(packets.media), announcement.answers))
+    assert [(ms, frames, len(answers)) for ms, frames, answers in reports] == [(0, 1, 1), (500, 6, 0), (1000, 11, 0)]
+    (answer,) = reports[0][2]
+    assert round_trip_of_answer_ns(answer, requested_ns + 80 * NS_PER_MS) == pytest.approx(80 * NS_PER_MS, abs=50_000)

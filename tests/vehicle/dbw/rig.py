@@ -1,4 +1,4 @@
-"""The adapter, a software car and the time: frames go both ways at once; what reaches the wheels is written down."""
+"""A test rig: the adapter drives a software car over a lossless bus without delay, and the actuation is recorded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lavt.vehicle.software_car.kit import Kit
 
 START_NS = 77_000_000_123
 COARSE_MS = 5
-"""A step of the rig's time where nothing is measured; elsewhere it is 1 ms, and nothing is measured finer."""
+"""Time step in ms where nothing is measured; elsewhere it is 1 ms, the resolution of all measurements."""
 
 
 @cache
@@ -37,20 +37,20 @@ def road() -> Road:
 
 @dataclass(frozen=True)
 class Moment:
-    """What a car was and what reached its wheels at a time."""
+    """The state and the actuation of a car at a time."""
 
     at_ns: int
     wheels: Actuation
-    is_requested: bool
-    """Something commanded reaches the wheels: an axis is enabled."""
+    is_enabled: bool
+    """An axis is enabled, so that commands reach the wheels."""
     state: str
 
 
-class Rig:
-    """An adapter that drives a software car; every `tick_ns` it is told `actuation`.
+class AdapterRig:
+    """An adapter that drives a software car and gets `actuation` every `tick_ns`.
 
-    `spoil` may change what the adapter sends on its way to the car, or lose it (None); `lose_report` loses what the car
-    sends; `is_cut` loses both.
+    `spoil` may change a frame to the car, or drop it (None); `lose_report` drops frames from the car; `is_cut` drops
+    both.
     """
 
     def __init__(self, generation: int, *, start_frames: bool = True, **keys: Any) -> None:
@@ -74,20 +74,20 @@ class Rig:
         if start_frames:
             self.run_ms(400)
 
-    def copy(self) -> Rig:
-        """Return a rig in the same state that shares only what never changes."""
+    def copy(self) -> AdapterRig:
+        """Return a rig in the same state that shares only immutable objects."""
         constants = (self.profile, self.profile.codec, road(), *self.moments)
         return deepcopy(self, {id(each): each for each in constants})
 
     def run_ms(self, duration_ms: int, *, step_ms: int = 1) -> None:
-        """Let time pass, in coarser steps where nothing is measured."""
+        """Run for a time, in coarser steps where nothing is measured."""
         end_ns = self.now_ns + duration_ms * NS_PER_MS
         while self.now_ns < end_ns:
             self.now_ns = min(self.now_ns + step_ms * NS_PER_MS, end_ns)
             self._step()
 
-    def run_until(self, condition: Callable[[Rig], bool], limit_ms: int = 5000, *, step_ms: int = 1) -> int:
-        """Let time pass until something is so; gives how many milliseconds it took."""
+    def run_until(self, condition: Callable[[AdapterRig], bool], limit_ms: int = 5000, *, step_ms: int = 1) -> int:
+        """Run until a condition is met, and return the time taken in ms."""
         for passed_ms in range(0, limit_ms, step_ms):
             if condition(self):
                 return passed_ms
@@ -100,7 +100,7 @@ class Rig:
                 self.adapter.receive(frame, self.now_ns)
         if self.is_ticking and self.now_ns >= self._next_tick_ns:
             self._next_tick_ns = self.now_ns + self.tick_ns
-            self.adapter.ask(self.actuation, self.now_ns)
+            self.adapter.set_actuation(self.actuation, self.now_ns)
         for frame in self.adapter.frames_due(self.now_ns):
             self.sent.append((self.now_ns, frame))
             if not self.is_cut and (spoiled := self.spoil(frame)) is not None:
@@ -111,54 +111,54 @@ class Rig:
         )
 
     def enabled(self) -> set[str]:
-        """Axes of the kit that obey."""
+        """Return the enabled axes of the kit."""
         return {axis for axis, actuator in self.kit.state.actuators.items() if actuator.is_enabled}
 
     @property
     def state(self) -> str:
-        """Of the adapter."""
+        """The adapter's state."""
         return self.adapter._state
 
     @property
     def speed_mps(self) -> float:
-        """Of the car."""
+        """The car's speed."""
         return self.simulator.state().speed_mps
 
     def engage(self) -> None:
-        """Get to where the car obeys, as the gate does: brake on."""
+        """Engage the kit with the brake on, as the gate does."""
         self.actuation = Actuation(self.simulator.state().steering_rad, 0.0, 1.0)
         self.adapter.engage(True, self.now_ns)
         self.run_until(lambda rig: rig.state == "engaged")
 
     def release_ms(self, since_ns: int, limit_ms: int = 1000) -> int:
-        """Let time pass until nothing commanded reaches the wheels any more; how long after `since_ns` that was."""
+        """Run until no axis is enabled, and return the time since `since_ns` in ms."""
         self.run_until(lambda rig: not rig.enabled(), limit_ms)
         return (self.now_ns - since_ns) // NS_PER_MS
 
 
-def started(generation: int) -> Rig:
-    """Return a car at rest whose reports have all come."""
+def started(generation: int) -> AdapterRig:
+    """Return a stationary car whose reports have all been received."""
     return _started(generation).copy()
 
 
-def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> Rig:
-    """Return a car that goes at 5 m/s or a little more, steered a little to the left."""
-    rig = _accelerated(Rig(generation, **keys)) if keys else _driving(generation).copy()
+def driving(generation: int, *, tick_ms: int = 20, **keys: Any) -> AdapterRig:
+    """Return a car that drives at slightly more than 5 m/s, steered slightly to the left."""
+    rig = _accelerated(AdapterRig(generation, **keys)) if keys else _driving(generation).copy()
     rig.tick_ns = tick_ms * NS_PER_MS
     return rig
 
 
 @cache
-def _started(generation: int) -> Rig:
-    return Rig(generation)
+def _started(generation: int) -> AdapterRig:
+    return AdapterRig(generation)
 
 
 @cache
-def _driving(generation: int) -> Rig:
+def _driving(generation: int) -> AdapterRig:
     return _accelerated(started(generation))
 
 
-def _accelerated(rig: Rig) -> Rig:
+def _accelerated(rig: AdapterRig) -> AdapterRig:
     rig.engage()
     rig.actuation = Actuation(0.01, 0.5, 0.0)
     rig.run_until(lambda rig: rig.speed_mps > 5.0, 10_000, step_ms=COARSE_MS)
@@ -169,7 +169,7 @@ def _accelerated(rig: Rig) -> Rig:
 
 
 def with_limits(generation: int, **limits: float) -> Profile:
-    """A profile with other limits."""
+    """Return a profile with other limits."""
     found = profile(f"dataspeed_gen{generation}")
     return replace(found, limits=replace(found.limits, **limits))
 

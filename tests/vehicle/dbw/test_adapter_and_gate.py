@@ -1,9 +1,9 @@
-"""The safety gate, the adapter and a software car together: who has the car after a stop."""
+"""The safety gate, the adapter and a software car together: control of the car after a stop."""
 
 from __future__ import annotations
 
 from tests.safety.rig import new_limiter
-from tests.vehicle.dbw.rig import Rig, both, started
+from tests.vehicle.dbw.rig import AdapterRig, both, started
 
 from lavt.domain import SessionRequest
 from lavt.safety.gate import SafetyGate
@@ -16,19 +16,19 @@ def new_gate() -> SafetyGate:
     return SafetyGate(LIMITS, new_limiter(), new_epoch=lambda: next(epochs), new_token=lambda: b"token")
 
 
-def decide(rig: Rig, gate: SafetyGate) -> None:
-    """Have the gate say what the car shall do, as the actuator node does."""
+def decide(rig: AdapterRig, gate: SafetyGate) -> None:
+    """Apply the gate's decision, as the actuator node does."""
     state = rig.adapter.state()
-    rig.actuation = gate.actuation(state, rig.now_ns)
-    rig.adapter.engage(gate.needs(state), rig.now_ns)
+    rig.actuation = gate.watchdog.actuation(state, rig.now_ns)
+    rig.adapter.engage(gate.watchdog.should_engage(state), rig.now_ns)
 
 
 @both
 def test_a_driver_who_drives_off_after_an_emergency_stop_is_left_alone(generation: int) -> None:
-    """After an emergency stop, at rest and parked, a driver drives off by hand: the kit is not engaged again."""
+    """The kit is not engaged again if a driver drives off by hand after an emergency stop, from standstill and PARK."""
     rig, gate = started(generation), new_gate()
     rig.engage()
-    assert gate.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
+    assert gate.session.answer(SessionRequest("emergency_stop", "alice", 1, 7), rig.adapter.state(), rig.now_ns).granted
     for _ in range(2000):
         decide(rig, gate)
         rig.run_ms(1)

@@ -1,4 +1,4 @@
-"""Which steering commands the kit is seen to have: reports with a command in them that each test chooses.
+"""Which steering commands the adapter takes as reached, with reported commands that each test chooses.
 
 The reports are those of generation 1: a command in bytes 2 and 3, in steps of 0.1 degrees.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tests.vehicle.dbw.rig import Rig, driving, started
+from tests.vehicle.dbw.rig import AdapterRig, driving, started
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.vehicle import ReachedCommand
@@ -20,9 +20,9 @@ OTHER = bytes([0x77, 0x01])
 
 
 class ChosenReports:
-    """A car whose steering reports have the command that was chosen last, at first the one that they had before."""
+    """A car whose steering reports contain the command that was chosen last, at first the one before the test."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: AdapterRig) -> None:
         self.rig = rig
         self._data, self._command = b"", b""
         rig.lose_report = self._replace
@@ -40,14 +40,14 @@ class ChosenReports:
 
     @property
     def wheel(self) -> bytes:
-        """Where the wheel was reported to be."""
+        """The reported angle of the wheel."""
         return self._data[:2]
 
     def _report(self) -> CanFrame:
         return CanFrame(REPORT, self._data[:2] + self._command + self._data[4:])
 
     def steer(self, steering_rad: float) -> tuple[int, bytes]:
-        """Let a tick ask for an angle; gives when that was, and the angle on the bus."""
+        """Request an angle, and return the time of the tick and the angle on the bus."""
         self.rig.actuation = replace(self.rig.actuation, steering_rad=steering_rad)
         self.rig.run_until(lambda rig: rig.adapter._requested == rig.actuation)
         return self.rig.now_ns, next(
@@ -55,7 +55,7 @@ class ChosenReports:
         )
 
     def choose(self, command: bytes) -> list[ReachedCommand]:
-        """Report a command now; gives what has reached the kit by that. The same report again is no news."""
+        """Report a command and return the reached commands; the same report again reaches none."""
         self._command = command
         self.rig.adapter.receive(self._report(), self.rig.now_ns)
         reached = self.rig.adapter.take_reached()
@@ -66,7 +66,7 @@ class ChosenReports:
 
 @pytest.mark.parametrize(("age_ms", "is_known"), [(0, True), (180, True), (200, True), (220, False), (500, False)])
 def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool) -> None:
-    """A command counts as reached where it is reported within 200 ms; later it is forgotten, even if repeated."""
+    """A command is reached if it is reported within 200 ms; later reports of it are ignored, also if it is repeated."""
     car = ChosenReports(driving(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(age_ms)
@@ -74,7 +74,7 @@ def test_a_command_that_is_not_reported_is_forgotten(age_ms: int, is_known: bool
 
 
 def test_only_old_commands_are_forgotten() -> None:
-    """Where a command is forgotten a younger one is not."""
+    """Discarding an expired command keeps the later ones."""
     car = ChosenReports(driving(1))
     _, first = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
@@ -85,7 +85,7 @@ def test_only_old_commands_are_forgotten() -> None:
 
 
 def test_all_old_commands_are_forgotten() -> None:
-    """Where two commands became too old before the next set of frames both are forgotten."""
+    """Two commands that expire before the next set of frames are both discarded."""
     car = ChosenReports(driving(1))
     car.steer(FIRST_RAD)
     _, second = car.steer(SECOND_RAD)
@@ -98,8 +98,8 @@ def test_all_old_commands_are_forgotten() -> None:
     assert car.choose(second) == []
 
 
-def test_a_command_that_is_given_again_reaches_the_kit_again() -> None:
-    """To and fro: each of three commands is reached at its own report, also where the last is as the first."""
+def test_a_repeated_angle_is_reached_again() -> None:
+    """Each of three commands is reached at its own report, even if the last one equals the first."""
     car = ChosenReports(driving(1))
     requested = [car.steer(angle_rad) for angle_rad in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     for requested_ns, command in requested:
@@ -107,8 +107,8 @@ def test_a_command_that_is_given_again_reaches_the_kit_again() -> None:
         assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
-def test_reordered_commands_reach_nothing() -> None:
-    """Where the kit reports a command those before it were overtaken; those after it are still expected."""
+def test_superseded_commands_are_not_reached() -> None:
+    """A report of a command discards the earlier ones; later ones are still awaited."""
     car = ChosenReports(driving(1))
     (_, first), (second_ns, second), (third_ns, _) = [car.steer(each) for each in (FIRST_RAD, SECOND_RAD, FIRST_RAD)]
     assert car.choose(second) == [ReachedCommand(second_ns, car.rig.now_ns)]
@@ -116,16 +116,16 @@ def test_reordered_commands_reach_nothing() -> None:
     assert car.choose(second) == []
 
 
-def test_a_command_that_was_not_sent_changes_nothing() -> None:
-    """A report of a command that was not sent has reached nothing, and what was sent is still expected."""
+def test_a_command_that_was_not_sent_is_ignored() -> None:
+    """A report of a command that was not sent reaches nothing, and commands that were sent are still awaited."""
     car = ChosenReports(driving(1))
     requested_ns, command = car.steer(FIRST_RAD)
     assert car.choose(OTHER) == []
     assert car.choose(command) == [ReachedCommand(requested_ns, car.rig.now_ns)]
 
 
-def test_a_repeated_command_is_expected_once() -> None:
-    """A command that is repeated, or that the kit has already, is no change and reaches nothing."""
+def test_a_repeated_command_is_reached_once() -> None:
+    """A command that is repeated, or that the kit already reports, is reached only once."""
     car = ChosenReports(driving(1))
     requested_ns, command = car.steer(FIRST_RAD)
     car.rig.run_ms(100)
@@ -136,8 +136,8 @@ def test_a_repeated_command_is_expected_once() -> None:
     assert car.choose(command) == []
 
 
-def test_nothing_is_expected_of_a_wheel_that_was_let_go_of() -> None:
-    """A command that was sent before the driver took over is not reached by a report of after that."""
+def test_an_override_discards_awaited_commands() -> None:
+    """A command sent before an override by the driver is not reached by a report after it."""
     car = ChosenReports(driving(1))
     _, command = car.steer(FIRST_RAD)
     car.rig.kit.driver_brakes(0.3, car.rig.now_ns)
@@ -148,14 +148,14 @@ def test_nothing_is_expected_of_a_wheel_that_was_let_go_of() -> None:
 
 
 def enable(car: ChosenReports) -> None:
-    """Let a car at rest be driven until its steering is commanded: first to where the wheel is."""
+    """Engage a stationary car until its steering is commanded, first to the reported angle."""
     car.rig.adapter.engage(True, car.rig.now_ns)
     car.rig.run_until(lambda rig: rig.state == "enabling")
     car.rig.run_ms(10)
 
 
-def test_the_first_command_is_expected_where_the_kit_has_another() -> None:
-    """The first command, to where the wheel is, is expected where the kit reports another one, and only there."""
+def test_the_first_command_is_awaited_if_it_differs() -> None:
+    """The first command, which has the reported angle, is awaited only if the kit reports another command."""
     car = ChosenReports(started(1))
     enable(car)
     assert car.choose(OTHER) == []

@@ -1,4 +1,4 @@
-"""Getting a kit to obey, driving by it, and letting go of it in order."""
+"""Engaging a kit, driving by it, and disengaging it in order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from tests.vehicle.dbw.rig import COARSE_MS, START_NS, Rig, both, driving, profile, road, started
+from tests.vehicle.dbw.rig import COARSE_MS, START_NS, AdapterRig, both, driving, profile, road, started
 
 from lavt.domain import NS_PER_MS, Actuation
 from lavt.vehicle.can_frame import CanFrame
@@ -23,15 +23,15 @@ from lavt.vehicle.software_car.state import AXES, Gear
 ALL = set(AXES)
 
 
-def names(rig: Rig) -> list[str]:
-    """Messages that were sent, by their names in the DBC."""
+def names(rig: AdapterRig) -> list[str]:
+    """Return the DBC's names of the messages that were sent."""
     known = {facts.identifier: name for name, facts in rig.profile.codec.messages.items()}
     return [known[frame.identifier] for _, frame in rig.sent]
 
 
 @both
 def test_idle_is_silent(generation: int) -> None:
-    """Until driving is wanted nothing is sent, and nothing hinders: the car can be engaged, and is not."""
+    """In `idle` nothing is sent, there is no inhibit reason, and the car is not engaged."""
     rig = started(generation)
     rig.run_ms(1000)
     state = rig.adapter.state()
@@ -41,16 +41,16 @@ def test_idle_is_silent(generation: int) -> None:
 
 
 @both
-def test_before_reports(generation: int) -> None:
-    """Before every report has come once, their absence hinders, each by its name."""
-    rig = Rig(generation, start_frames=False)
+def test_missing_reports_inhibit(generation: int) -> None:
+    """Until every report has arrived once, each missing one is an inhibit reason by name."""
+    rig = AdapterRig(generation, start_frames=False)
     inhibit_reason = rig.adapter.state().inhibit_reason
     assert inhibit_reason == "; ".join(f"no {message} yet" for message in rig.profile.reports)
 
 
 @both
 def test_engaging(generation: int) -> None:
-    """CLEAR for 120 ms, all axes with the brake on, then DRIVE: the car obeys in the time of two gear reports."""
+    """Engaging takes CLEAR for 120 ms, all axes with the brake on, then DRIVE, and at most two gear reports' time."""
     rig = started(generation)
     rig.adapter.engage(True, rig.now_ns)
     passed_ms = rig.run_until(lambda rig: rig.state == "engaged")
@@ -66,8 +66,8 @@ def test_engaging(generation: int) -> None:
 
 
 @both
-def test_drive_waits_for_the_brake(generation: int) -> None:
-    """Where no brake is asked for, the holding brake is on when DRIVE is asked for; so the shift is not refused."""
+def test_drive_is_requested_with_the_brake(generation: int) -> None:
+    """DRIVE is requested with the holding brake on, even if no brake is requested, so that it is not rejected."""
     rig = started(generation)
     rig.actuation = Actuation(0.0, 0.9, 0.0)
     rig.adapter.engage(True, rig.now_ns)
@@ -79,7 +79,7 @@ def test_drive_waits_for_the_brake(generation: int) -> None:
 
 
 def test_clearing_frames_of_generation_1() -> None:
-    """Generation 1 is cleared with frames of four bytes at 20 Hz, and the gearbox with its one byte."""
+    """Generation 1 is cleared with frames of four bytes at 20 Hz, and its gearbox with a frame of one byte."""
     rig = started(1)
     rig.adapter.engage(True, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "enabling")
@@ -97,7 +97,7 @@ def test_clearing_frames_of_generation_1() -> None:
 
 @both
 def test_counters(generation: int) -> None:
-    """Counters go up by one with each frame that has one, also over a pause."""
+    """Counters increase by one with each frame, also across a pause."""
     rig = driving(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
@@ -112,8 +112,8 @@ def test_counters(generation: int) -> None:
 
 
 @both
-def test_new_commands_go_at_once(generation: int) -> None:
-    """A tick that brings something new sends it in the same millisecond, but no two sets are closer than 5 ms."""
+def test_new_commands_are_sent_immediately(generation: int) -> None:
+    """A tick with a new command sends it in the same millisecond, but sets are at least 5 ms apart."""
     rig = driving(generation, tick_ms=1)
     rig.run_ms(500)
     rig.sent.clear()
@@ -130,8 +130,8 @@ def test_new_commands_go_at_once(generation: int) -> None:
 
 
 @both
-def test_old_commands_are_repeated(generation: int) -> None:
-    """What stays the same is sent again every 20 ms."""
+def test_unchanged_commands_are_repeated(generation: int) -> None:
+    """An unchanged command is sent every 20 ms."""
     rig = driving(generation, tick_ms=4)
     rig.run_ms(1000)
     rig.sent.clear()
@@ -143,7 +143,7 @@ def test_old_commands_are_repeated(generation: int) -> None:
 
 @both
 def test_steering_and_speed(generation: int) -> None:
-    """The wheels turn as far as they were asked to, left positive, and the state says so, with the speed's own time."""
+    """The wheels follow the requested angle, left positive, and the state reports it with the speed and its time."""
     rig = driving(generation)
     rig.actuation = Actuation(0.05, 0.1, 0.0)
     rig.run_ms(1000)
@@ -157,7 +157,7 @@ def test_steering_and_speed(generation: int) -> None:
 
 @both
 def test_parking(generation: int) -> None:
-    """A car that is not wanted any more brakes, is put into PARK once it stands, and only then let go of."""
+    """A car that is no longer wanted brakes, shifts to PARK once it is stationary, and only then is disengaged."""
     rig = driving(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.0)
     rig.adapter.engage(False, rig.now_ns)
@@ -178,8 +178,8 @@ def test_parking(generation: int) -> None:
 
 
 @both
-def test_no_park_by_one_report(generation: int) -> None:
-    """PARK is asked for after 300 ms of standing: not because a report or two of a rolling car say that it stands."""
+def test_park_needs_300_ms_of_standstill(generation: int) -> None:
+    """PARK is requested after 300 ms of standstill, not after single reports of standstill from a rolling car."""
     rig = driving(generation)
     speed = {1: 0x065, 2: 0x107}[generation]
     lost: list[CanFrame] = []
@@ -191,12 +191,12 @@ def test_no_park_by_one_report(generation: int) -> None:
     rig.lose_report = lose
     rig.run_ms(50)
     moving = lost[-1].data
-    standing = moving[:4] + bytes(2) + moving[6:] if generation == 1 else bytes(2) + moving[2:]
+    stationary = moving[:4] + bytes(2) + moving[6:] if generation == 1 else bytes(2) + moving[2:]
     if generation == 2:
-        standing = standing[:-1] + bytes([frame_crc8(speed, standing[:-1])])
+        stationary = stationary[:-1] + bytes([frame_crc8(speed, stationary[:-1])])
     rig.adapter.engage(False, rig.now_ns)
     for _ in range(10):
-        rig.adapter.receive(CanFrame(speed, standing), rig.now_ns)
+        rig.adapter.receive(CanFrame(speed, stationary), rig.now_ns)
         rig.run_ms(20)
     assert rig.adapter.state().speed_mps == 0.0
     assert rig.speed_mps > 3.0
@@ -208,8 +208,8 @@ def test_no_park_by_one_report(generation: int) -> None:
 
 
 @both
-def test_again(generation: int) -> None:
-    """After it was parked the car can be engaged again."""
+def test_a_parked_car_can_be_engaged_again(generation: int) -> None:
+    """A car that was parked can be engaged again."""
     rig = driving(generation)
     rig.adapter.engage(False, rig.now_ns)
     rig.run_until(lambda rig: rig.state == "idle", 20_000, step_ms=COARSE_MS)
@@ -218,8 +218,8 @@ def test_again(generation: int) -> None:
 
 
 @both
-def test_not_wanted_while_enabling(generation: int) -> None:
-    """What was begun is taken back in order where it is not wanted any more, at whatever moment."""
+def test_engaging_can_be_cancelled(generation: int) -> None:
+    """Engaging that is cancelled at any moment leaves the car in PARK, disengaged, without a watchdog trip."""
     begun = started(generation)
     begun.adapter.engage(True, begun.now_ns)
     for after_ms in range(0, 220, 7):
@@ -233,7 +233,7 @@ def test_not_wanted_while_enabling(generation: int) -> None:
 
 @both
 def test_not_engaged_while_rolling(generation: int) -> None:
-    """A car that moves is not engaged."""
+    """A moving car is not engaged."""
     rig = driving(generation)
     rig.adapter = ByWireAdapter(rig.profile, start_ns=rig.now_ns)
     rig.is_ticking = False
@@ -243,28 +243,28 @@ def test_not_engaged_while_rolling(generation: int) -> None:
     assert rig.state == "idle"
 
 
-def test_installation() -> None:
-    """An installation that must not drive says why, and never engages."""
-    rig = Rig(2, inhibit_reason="55 signals of dataspeed_gen2 are unverified")
+def test_an_inhibited_installation_is_not_engaged() -> None:
+    """An installation with an inhibit reason reports it and is never engaged."""
+    rig = AdapterRig(2, inhibit_reason="55 signals of dataspeed_gen2 are unverified")
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
     assert rig.adapter.state().inhibit_reason == "55 signals of dataspeed_gen2 are unverified"
 
 
-def test_unknown_sign() -> None:
-    """Where nobody knows which sign of the steering is left, the car is not engaged."""
+def test_an_unknown_steering_sign_inhibits() -> None:
+    """A car whose steering sign is not known is not engaged."""
     known = profile("dataspeed_gen1")
-    rig = Rig(1, profile=replace(known, car=replace(known.car, steering_sign=None)))
+    rig = AdapterRig(1, profile=replace(known, car=replace(known.car, steering_sign=None)))
     rig.adapter.engage(True, rig.now_ns)
     rig.run_ms(1000)
     assert rig.sent == []
-    assert rig.adapter.state().inhibit_reason == "the steering's sign is not known: set vehicle.dbw.steering_sign"
+    assert "steering_sign" in rig.adapter.state().inhibit_reason
 
 
 @both
-def test_other_sign(generation: int) -> None:
-    """With the other sign both what is sent and what is reported are turned."""
+def test_negative_steering_sign(generation: int) -> None:
+    """With the negative steering sign, sent and reported angles are inverted."""
     known = profile(f"dataspeed_gen{generation}")
     rig = driving(generation, profile=replace(known, car=replace(known.car, steering_sign=-1)))
     rig.actuation = Actuation(0.05, 0.1, 0.0)
@@ -273,21 +273,21 @@ def test_other_sign(generation: int) -> None:
     assert rig.adapter.state().steering_rad == pytest.approx(0.05, abs=1e-3)
 
 
-def test_users_commands() -> None:
-    """Generation 2 is driven by the user's set of commands too, and by no other than the kit hears."""
-    rig = Rig(2, profile=profile("dataspeed_gen2:user"), commands="user")
+def test_user_commands() -> None:
+    """Generation 2 can be driven with its user commands, but only if the kit accepts them."""
+    rig = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="user")
     rig.engage()
     assert {frame.identifier for _, frame in rig.sent} == {0x210, 0x211, 0x212, 0x213, 0x216}
-    deaf = Rig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
-    deaf.adapter.engage(True, deaf.now_ns)
-    deaf.run_ms(1000)
-    assert deaf.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
-    assert deaf.sent == []
+    other = AdapterRig(2, profile=profile("dataspeed_gen2:user"), commands="remote")
+    other.adapter.engage(True, other.now_ns)
+    other.run_ms(1000)
+    assert other.adapter.state().inhibit_reason == "RemoteReport has STATE remote"
+    assert other.sent == []
 
 
 @both
 def test_reached(generation: int) -> None:
-    """What the kit reports to steer by is told once, with when it was asked for, within 16 ms."""
+    """A reported steering command is returned once as reached, with the time of its request, within 16 ms."""
     rig = driving(generation)
     rig.run_ms(500)
     rig.adapter.take_reached()
@@ -302,8 +302,8 @@ def test_reached(generation: int) -> None:
 
 
 @both
-def test_reached_of_a_weave(generation: int) -> None:
-    """While the wheel goes to and fro nothing is told to have reached it before it was asked for, or late."""
+def test_reached_while_weaving(generation: int) -> None:
+    """While the wheel turns to and fro, no command is reached before its request or later than 16 ms after it."""
     rig = driving(generation, tick_ms=4)
     for index in range(1000):
         rig.actuation = Actuation(0.02 * math.sin(index / 20), 0.2, 0.0)
@@ -316,7 +316,7 @@ def test_reached_of_a_weave(generation: int) -> None:
 
 @both
 def test_drives_as_the_simulator(generation: int) -> None:
-    """What is asked over CAN moves the car as what is asked of the simulator itself: to 0.1 m after 5 s."""
+    """Actuation over CAN moves the car like actuation of the simulator itself: to 0.1 m after 5 s."""
     rig = driving(generation)
     same = Simulator(road=road(), seed=1, start_mono_ns=START_NS)
     same._car, same._index = deepcopy(rig.simulator._car), rig.simulator._index
@@ -333,7 +333,7 @@ def test_drives_as_the_simulator(generation: int) -> None:
 
 
 def test_wake() -> None:
-    """The adapter is never asleep longer than 100 ms, nor over what it has to do."""
+    """The adapter's next wake time is at most 100 ms away and never later than its next frames."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     assert adapter.next_wake_ns() == START_NS + 100 * NS_PER_MS
     rig = driving(1)
@@ -345,23 +345,23 @@ def test_wake() -> None:
 
 @both
 def test_wake_when_overdue(generation: int) -> None:
-    """A set of frames that is overdue wakes the adapter in the next nanosecond, not in the past."""
+    """An overdue set of frames makes the next wake time the next nanosecond, not a time in the past."""
     rig = driving(generation)
     rig.run_until(lambda rig: rig.now_ns - rig.sent[-1][0] >= LEAST_GAP_NS if rig.sent else False)
-    rig.adapter.ask(Actuation(0.1, 0.0, 0.0), rig.now_ns)
+    rig.adapter.set_actuation(Actuation(0.1, 0.0, 0.0), rig.now_ns)
     assert rig.adapter.next_wake_ns() == rig.now_ns + 1
 
 
-def test_table_is_whole() -> None:
-    """Every state but idle can be left without wanting anything, and every state can be reached."""
+def test_every_state_is_reachable() -> None:
+    """Every state can be entered and left."""
     sources = {source for row in TABLE for source in row.sources}
     targets = {row.target for row in TABLE}
     assert sources == targets == {"idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"}
 
 
 @both
-def test_no_number_is_no_tick(generation: int) -> None:
-    """An actuation that is no number is dropped and counted, and keeps nothing alive."""
+def test_a_non_finite_actuation_is_no_tick(generation: int) -> None:
+    """A non-finite actuation is dropped and counted, and does not count as a tick."""
     rig = driving(generation)
     rig.actuation = Actuation(math.nan, 0.1, 0.0)
     stopped_ns = rig.now_ns

@@ -1,4 +1,4 @@
-"""The profile's limits: the last thing before the bytes, whatever is asked and however often."""
+"""The profile's limits are the last stage before encoding and hold for every request."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.vehicle.dbw.rig import COARSE_MS, Rig, both, driving, profile, started, with_limits
+from tests.vehicle.dbw.rig import COARSE_MS, AdapterRig, both, driving, profile, started, with_limits
 
 from lavt.domain import NS_PER_MS, NS_PER_S, Actuation
 from lavt.vehicle.dbw.profile import LEAST_GAP_NS, PERIOD_NS, TICK_LIMIT_NS, ByWireLimits
-from lavt.vehicle.dbw.sending import DriveCommand, limited
+from lavt.vehicle.dbw.sending import DriveCommand, apply_limits
 from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 
 LIMITS = ByWireLimits(400.0, 300.0, 0.6, 0.8, 2.0, 5.0, 0.3)
 STEERING = {1: 0x064, 2: 0x200}
 
 
-def angles_deg(rig: Rig) -> list[tuple[int, float]]:
-    """What the steering was told, read by hand from bytes 0 and 1, with when."""
+def angles_deg(rig: AdapterRig) -> list[tuple[int, float]]:
+    """Return the times and steering angles that were sent, decoded from bytes 0 and 1."""
     identifier = STEERING[rig.generation]
     return [
         (at_ns, int.from_bytes(frame.data[:2], "little", signed=True) / 10)
@@ -32,7 +32,7 @@ def angles_deg(rig: Rig) -> list[tuple[int, float]]:
 
 @both
 def test_angle(generation: int) -> None:
-    """The steering wheel is asked for no more than the limit on either side; that it was more is counted."""
+    """The commanded steering angle stays within the limit on either side, and each limited command is counted."""
     rig = driving(generation, profile=with_limits(generation, steering_wheel_deg=30.0))
     rig.actuation = Actuation(0.5, 0.0, 0.2)
     rig.run_ms(500)
@@ -45,7 +45,7 @@ def test_angle(generation: int) -> None:
 
 @both
 def test_rate(generation: int) -> None:
-    """The steering wheel is asked to turn no faster than the limit, and the kit is told that limit, cut to a step."""
+    """The commanded steering rate stays within the limit, which is sent to the kit, rounded down to a step."""
     rig = driving(generation, profile=with_limits(generation, steering_wheel_rate_degps=100.0))
     rig.actuation = Actuation(0.2, 0.0, 0.0)
     rig.run_ms(400)
@@ -56,9 +56,9 @@ def test_rate(generation: int) -> None:
 
 
 @both
-def test_what_is_behind_follows_soon(generation: int) -> None:
-    """While a limit keeps the wheel from where it is asked to be a set leaves every 5 ms, and then every 20 ms."""
-    rig = Rig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
+def test_a_limited_command_is_sent_faster(generation: int) -> None:
+    """While the steering rate limits the angle, a set is sent every 5 ms, and then every 20 ms."""
+    rig = AdapterRig(generation, profile=with_limits(generation, steering_wheel_rate_degps=50.0))
     rig.engage()
     rig.run_ms(300, step_ms=COARSE_MS)
     rig.tick_ns = 50 * NS_PER_MS
@@ -72,9 +72,9 @@ def test_what_is_behind_follows_soon(generation: int) -> None:
 
 
 @both
-def test_without_a_tick_nothing_leaves(generation: int) -> None:
-    """Before the first tick nothing leaves, also where driving is wanted; that there was none is counted once."""
-    rig = Rig(generation, start_frames=False)
+def test_nothing_is_sent_before_the_first_tick(generation: int) -> None:
+    """Before the first tick nothing is sent, even if driving is wanted, and the missing tick is counted once."""
+    rig = AdapterRig(generation, start_frames=False)
     rig.is_ticking = False
     rig.run_ms(400, step_ms=COARSE_MS)
     rig.adapter.engage(True, rig.now_ns)
@@ -87,20 +87,20 @@ def test_without_a_tick_nothing_leaves(generation: int) -> None:
 
 
 def test_rate_of_the_kit() -> None:
-    """The kit is told the greatest rate in its own steps: 452 deg/s are 113 of 4 deg/s, in both generations."""
+    """The largest rate is sent in the kit's steps: 452 deg/s are 113 steps of 4 deg/s, in both generations."""
     for name, place in (("dataspeed_gen1", 3), ("dataspeed_gen2", 3)):
         rig = started(int(name[-1]))
         rig.engage()
-        told = {
+        rates = {
             frame.data[place] for _, frame in rig.sent if frame.identifier in (0x064, 0x200) and len(frame.data) > 4
         }
-        assert 113 in told
-        assert told <= {0, 113}
+        assert 113 in rates
+        assert rates <= {0, 113}
 
 
 @both
 def test_pedals(generation: int) -> None:
-    """Pedals are pressed no further and no faster than the limits, and let go of at once."""
+    """Pedals are pressed no further and no faster than the limits, and released at once."""
     known = with_limits(generation, throttle=0.4, brake=0.5, throttle_rate_per_s=1.0, brake_rate_per_s=2.0)
     rig = driving(generation, profile=known)
     rig.actuation = Actuation(0.0, 1.0, 0.0)
@@ -119,8 +119,8 @@ def test_pedals(generation: int) -> None:
 
 
 @both
-def test_begins_where_the_wheel_is(generation: int) -> None:
-    """The first angle after enabling is at most a set's turn from where the wheel is."""
+def test_steering_starts_at_the_reported_angle(generation: int) -> None:
+    """The first angle after enabling differs from the reported one by at most one set's turn."""
     rig = driving(generation)
     rig.actuation = Actuation(0.2, 0.0, 1.0)
     rig.run_until(lambda rig: rig.speed_mps == 0.0, step_ms=COARSE_MS)
@@ -144,9 +144,9 @@ allowed = st.builds(DriveCommand, st.floats(-400, 400), st.floats(0, 0.6), st.fl
 
 
 @given(requested, allowed, st.integers(0, 10 * NS_PER_S))
-def test_never_more(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
-    """Whatever is asked, what is allowed is in range and no faster than the rates over at most 60 ms."""
-    found = limited(LIMITS, wanted, before, passed_ns)
+def test_limits_hold_for_any_request(wanted: DriveCommand, before: DriveCommand, passed_ns: int) -> None:
+    """For any request the limited command is in range and no faster than the rates over at most 60 ms."""
+    found = apply_limits(LIMITS, wanted, before, passed_ns)
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     assert abs(found.wheel_deg) <= 400.0
     assert abs(found.wheel_deg - before.wheel_deg) <= 300.0 * passed_s + 1e-9
@@ -155,15 +155,15 @@ def test_never_more(wanted: DriveCommand, before: DriveCommand, passed_ns: int) 
 
 
 @given(allowed)
-def test_as_requested(wanted: DriveCommand) -> None:
-    """What is within the limits is not changed, but that there is no throttle while the brake is asked for."""
-    found = limited(LIMITS, wanted, wanted, 0)
+def test_requests_within_the_limits_are_unchanged(wanted: DriveCommand) -> None:
+    """A request within the limits is unchanged, except that a brake request zeroes the throttle."""
+    found = apply_limits(LIMITS, wanted, wanted, 0)
     assert found == (replace(wanted, throttle=0.0) if wanted.brake > 0 else wanted)
 
 
 @both
 def test_one_pedal(generation: int) -> None:
-    """Throttle and brake asked for at once are the brake alone: whoever asks for both wants to stop."""
+    """A request for throttle and brake together becomes the brake alone."""
     rig = driving(generation)
     rig.actuation = Actuation(0.0, 0.5, 0.2)
     rig.run_ms(50)
@@ -174,7 +174,7 @@ def test_one_pedal(generation: int) -> None:
 
 @pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2"])
 def test_limits_are_the_simulators(name: str) -> None:
-    """By the shipped profiles the software car is driven as the simulator is: its lengths, angles and pedals."""
+    """With the shipped profiles the software car has the simulator's dimensions, angles and pedals."""
     known = profile(name)
     assert known.car.wheelbase_m == LINCOLN_MKZ.wheelbase_m
     assert known.car.max_braking_mps2 == LINCOLN_MKZ.max_braking_mps2

@@ -1,4 +1,4 @@
-"""What holds whatever comes from the bus, and for all that a profile can send."""
+"""Properties for any frames from the bus, and for all commands that a profile can send."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from lavt.vehicle.dbw.profile import AXES
 from lavt.vehicle.dbw.sending import FrameSender
 from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
-from lavt.vehicle.software_car.state import Order
+from lavt.vehicle.software_car.state import AxisOrder
 
 names = pytest.mark.parametrize("name", ["dataspeed_gen1", "dataspeed_gen2", "dataspeed_gen2:user"])
 
 
-def heard(name: str, frame: CanFrame) -> Order:
-    """What the software car, which shares no code with the adapter, takes a frame for."""
-    read = generation_1.read if name == "dataspeed_gen1" else generation_2.read
-    order = read(frame, Mechanics(), not name.endswith(":user"))
-    assert isinstance(order, Order)
+def order_of(name: str, frame: CanFrame) -> AxisOrder:
+    """Return the order that the software car, which shares no code with the adapter, parses from a frame."""
+    parse_order = generation_1.parse_order if name == "dataspeed_gen1" else generation_2.parse_order
+    order = parse_order(frame, Mechanics(), not name.endswith(":user"))
+    assert isinstance(order, AxisOrder)
     return order
 
 
 @names
 @given(data=st.data())
-def test_all_that_can_be_sent(name: str, data: st.DataObject) -> None:
-    """Whatever the limits allow is heard by the kit as it was meant, to half a step, valid and enabling."""
+def test_all_commands_are_understood(name: str, data: st.DataObject) -> None:
+    """The kit parses every command within the limits as it was sent, to half a step, valid and enabling."""
     known, sender = profile(name), FrameSender(profile(name), START_NS)
     axis = data.draw(st.sampled_from(AXES))
-    sender._numbers[known.axes[axis].message] = data.draw(st.integers(0, 1000))
+    sender._frame_counts[known.axes[axis].message] = data.draw(st.integers(0, 1000))
     if axis == "steering":
         most = known.limits.steering_wheel_deg
         angle_deg = data.draw(st.floats(-most, most))
-        order = heard(name, sender.axis_frame(axis, angle_deg, is_enabled=True))
+        order = order_of(name, sender.axis_frame(axis, angle_deg, is_enabled=True))
         assert order.target * 57.29577951308232 == pytest.approx(angle_deg, abs=0.05 + 1e-9)
         assert order.rate_radps * 57.29577951308232 == pytest.approx(452.0)
     else:
         fraction = data.draw(st.floats(0, 1))
-        order = heard(name, sender.axis_frame(axis, fraction, is_enabled=True))
+        order = order_of(name, sender.axis_frame(axis, fraction, is_enabled=True))
         assert order.target == pytest.approx(fraction, abs=0.000126)
     assert (order.axis, order.is_valid, order.is_enabling, order.is_clearing, order.ignores_driver) == (
         axis,
@@ -57,8 +57,8 @@ def test_all_that_can_be_sent(name: str, data: st.DataObject) -> None:
 
 @names
 @given(data=st.data())
-def test_reports_come_back(name: str, data: st.DataObject) -> None:
-    """Any angle and speed that a report can hold is read as it was written, to half a step."""
+def test_all_reports_are_understood(name: str, data: st.DataObject) -> None:
+    """The adapter reads every angle and speed that a report can hold, to half a step."""
     known = profile(name)
     adapter = ByWireAdapter(known, start_ns=START_NS)
     angle = data.draw(st.integers(-5500, 5500))
@@ -67,11 +67,11 @@ def test_reports_come_back(name: str, data: st.DataObject) -> None:
         adapter.receive(CanFrame(0x065, raw + bytes(6)), START_NS)
     else:
         fourteen = (angle & 0x3FFF).to_bytes(2, "little")
-        adapter.receive(generation_2_sealed(0x100, fourteen + bytes(6)), START_NS)
+        adapter.receive(frame_with_crc(0x100, fourteen + bytes(6)), START_NS)
     assert adapter.state().steering_rad == pytest.approx(known.road_rad(angle / 10), abs=1e-12)
 
 
-def generation_2_sealed(identifier: int, data: bytes) -> CanFrame:
+def frame_with_crc(identifier: int, data: bytes) -> CanFrame:
     from lavt.vehicle.software_car.frames import with_crc
 
     return CanFrame(identifier, with_crc(identifier, data))
@@ -92,14 +92,14 @@ steps = st.lists(st.tuples(any_frame, st.integers(0, 200 * NS_PER_MS), st.intege
 @names
 @given(steps)
 @settings(max_examples=150)
-def test_random_bus(name: str, happening: list[tuple[CanFrame, int, int]]) -> None:
-    """Whatever comes from the bus nothing is raised, and without all the reports the car is never engaged."""
+def test_any_frames_raise_nothing(name: str, happening: list[tuple[CanFrame, int, int]]) -> None:
+    """Any frames from the bus raise nothing, and without all reports the car is never engaged."""
     adapter = ByWireAdapter(profile(name), start_ns=START_NS)
     now_ns = START_NS
     for frame, passed_ns, kind in happening:
         now_ns += passed_ns
         adapter.receive(frame, now_ns)
-        adapter.ask(Actuation(0.1, 0.5, 0.0), now_ns)
+        adapter.set_actuation(Actuation(0.1, 0.5, 0.0), now_ns)
         if kind:
             adapter.engage(kind > 1, now_ns)
         adapter.frames_due(now_ns)
@@ -112,7 +112,7 @@ def test_random_bus(name: str, happening: list[tuple[CanFrame, int, int]]) -> No
 
 @cache
 def reports_of(generation: int) -> tuple[CanFrame, ...]:
-    """A driving kit's reports of 100 ms."""
+    """Return the reports that a driving kit sends in 100 ms."""
     rig, found = driving(generation), []
     receive = rig.adapter.receive
 
@@ -128,8 +128,8 @@ def reports_of(generation: int) -> tuple[CanFrame, ...]:
 @pytest.mark.parametrize("generation", [1, 2])
 @given(st.lists(st.tuples(any_frame, st.integers(0, 30)), min_size=1, max_size=20))
 @settings(max_examples=25)
-def test_garbage_beside_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
-    """Garbage between the reports of a car that only stands there never makes it engaged while nobody wants it."""
+def test_garbage_between_reports(generation: int, garbage: list[tuple[CanFrame, int]]) -> None:
+    """Garbage between the reports of a stationary car never engages it while driving is not wanted."""
     rig = started(generation)
     for frame, wait_ms in garbage:
         rig.adapter.receive(frame, rig.now_ns)
@@ -141,8 +141,8 @@ def test_garbage_beside_reports(generation: int, garbage: list[tuple[CanFrame, i
 @pytest.mark.parametrize("generation", [1, 2])
 @given(st.data())
 @settings(max_examples=100)
-def test_one_bit(generation: int, data: st.DataObject) -> None:
-    """A report with a wrong bit raises nothing; generation 2's checksum finds each."""
+def test_a_flipped_bit(generation: int, data: st.DataObject) -> None:
+    """A report with a flipped bit raises nothing, and generation 2's checksum detects it."""
     frame = data.draw(st.sampled_from(reports_of(generation)))
     bit = data.draw(st.integers(0, 8 * len(frame.data) - 1))
     flipped = (int.from_bytes(frame.data, "little") ^ 1 << bit).to_bytes(len(frame.data), "little")

@@ -1,4 +1,4 @@
-"""What the adapter sends is, byte for byte, what was worked out by hand from the facts."""
+"""The adapter's frames equal, byte for byte, those worked out by hand from the facts."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ def vectors(name: str) -> list[dict[str, Any]]:
 
 
 def sent(name: str, vector: dict[str, Any]) -> CanFrame | None:
-    """The frame of the adapter that asks for what the vector says; None where the adapter never says it."""
+    """Return the adapter's frame for a vector, or None if the adapter never sends such a frame."""
     known, signals, message = profile(name), dict(vector["signals"]), vector["message"]
     sender = FrameSender(known, START_NS)
     if signals.pop("CLEAR", 0):
-        return cleared(known, message, signals)
+        return clearing_frame(known, message, signals)
     for axis in AXES:
         if known.axes[axis].message == message:
-            return of_axis(known, axis, signals)
+            return axis_command(known, axis, signals)
     if known.gear.message == message and set(signals) == {known.gear.value}:
         gears = {number: gear for gear, number in known.gear.numbers.items()}
         gear = gears.get(signals[known.gear.value])
         return sender.gear_frame(gear) if gear else None
     if known.system and message == known.system.message and signals:
-        sender._numbers[message] = signals["RC"] - 1
+        sender._frame_counts[message] = signals["RC"] - 1
         return sender._system_frame(known.system, "enable" if signals["CMD"] == 1 else "disable")
     return None
 
 
-def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
-    """An axis's command of the type that the profile has; what the adapter never changes is a constant of a profile."""
+def axis_command(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | None:
+    """Return an axis's command of the profile's type; signals that the adapter never changes become constants."""
     command = known.axes[axis]
     kind, number = next(iter(command.constants.items()))
     if command.value not in signals or signals.get(kind, 0) != number:
@@ -52,17 +52,17 @@ def of_axis(known: Profile, axis: Axis, signals: dict[str, Any]) -> CanFrame | N
     varied = {command.value, command.enable, command.count}
     constants = {kind: number} | {name: each for name, each in signals.items() if name not in varied}
     sender = FrameSender(replace(known, axes={**known.axes, axis: replace(command, constants=constants)}), START_NS)
-    sender._numbers[command.message] = signals.get(command.count, 0) + command.modulus - 1
+    sender._frame_counts[command.message] = signals.get(command.count, 0) + command.modulus - 1
     is_enabled = bool(signals.get(command.enable, 0))
     return sender.axis_frame(axis, signals[command.value] / command.per_unit, is_enabled=is_enabled)
 
 
-def cleared(known: Profile, message: str, signals: dict[str, Any]) -> CanFrame | None:
-    """A frame of what takes back overrides."""
+def clearing_frame(known: Profile, message: str, signals: dict[str, Any]) -> CanFrame | None:
+    """Return a frame that clears overrides."""
     if message not in {command.message for command in known.axes.values()} | {known.gear.message}:
         return None
     sender = FrameSender(known, START_NS)
-    sender._numbers[message] = signals.get("RC", 0) - 1
+    sender._frame_counts[message] = signals.get("RC", 0) - 1
     frames = sender.frames(KitCommands(NONE, is_clearing=True), DriveCommand(0.0, 0.0, 0.0), 0.0, START_NS)
     identifier = known.codec.messages[message].identifier
     return next(frame for frame in frames if frame.identifier == identifier)
@@ -77,13 +77,13 @@ CASES = [
 
 
 @pytest.mark.parametrize(("frame", "vector"), CASES)
-def test_sent(frame: CanFrame, vector: dict[str, Any]) -> None:
-    """A command that the adapter makes has the bytes worked by hand, counter and checksum included."""
+def test_frames_equal_the_vectors(frame: CanFrame, vector: dict[str, Any]) -> None:
+    """A frame of the adapter has the bytes worked out by hand, including counter and checksum."""
     assert frame == CanFrame(vector["id"], bytes.fromhex(vector["data"]))
 
 
-def test_enough() -> None:
-    """Every message that the adapter sends is among them, but two that have no vector with anything in it."""
+def test_every_sent_message_has_a_vector() -> None:
+    """Every message that the adapter sends has a vector, except two without a vector with any signal."""
     checked = {(name, vector["message"]) for name in NAMES for vector in vectors(name) if sent(name, vector)}
     missing = set()
     for name in NAMES:

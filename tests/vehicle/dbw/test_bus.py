@@ -1,4 +1,4 @@
-"""A port on a bus of python-can: what leaves, what is heard, and what happens when the bus goes."""
+"""A port on a bus of python-can: sending, receiving, and loss of the bus."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ def until(done: Callable[[], bool]) -> None:
     raise AssertionError("it did not happen")
 
 
-def hear(port: CanPort, count: int) -> list[CanFrame]:
-    """The next frames that a port hears."""
-    heard: list[ReceivedCanFrame] = []
+def receive(port: CanPort, count: int) -> list[CanFrame]:
+    """Return the next frames that a port receives."""
+    received: list[ReceivedCanFrame] = []
 
     def enough() -> bool:
-        heard.extend(port.take(0))
-        return len(heard) >= count
+        received.extend(port.take(0))
+        return len(received) >= count
 
     until(enough)
-    return [each.frame for each in heard]
+    return [each.frame for each in received]
 
 
 @pytest.fixture
 def opened() -> Iterator[Callable[..., CanPort]]:
-    """Opens ports that are closed in the end."""
+    """Return a function that opens ports, which are closed after the test."""
     ports: list[CanPort] = []
 
     def open_port(interface: str = "virtual", channel: str = "test", clock: Any = None, **options: Any) -> CanPort:
@@ -68,7 +68,7 @@ def opened() -> Iterator[Callable[..., CanPort]]:
 
 @pytest.fixture
 def raw() -> Iterator[can.BusABC]:
-    """Somebody else on the bus `test`."""
+    """Return another participant on the bus `test`."""
     with can.Bus(interface="virtual", channel="test", ignore_config=True) as bus:
         yield bus
 
@@ -78,12 +78,12 @@ def now_ns() -> int:
 
 
 def test_virtual(opened: Callable[..., CanPort]) -> None:
-    """Frames come in order to every other port of the bus, as they were, and not to the one that sent them."""
+    """Frames arrive unchanged and in order at every other port of the bus, and not at their sender."""
     one, other = opened(), opened()
     one.send([STEERING, BRAKE, FAR], now_ns())
-    assert hear(other, 3) == [STEERING, BRAKE, FAR]
+    assert receive(other, 3) == [STEERING, BRAKE, FAR]
     other.send([BRAKE], now_ns())
-    assert hear(one, 1) == [BRAKE]
+    assert receive(one, 1) == [BRAKE]
 
 
 OTHER_PROCESS = """
@@ -92,10 +92,10 @@ from lavt.clock import MachineClock, pause
 from lavt.vehicle.dbw.bus import CanPort
 port = CanPort("udp_multicast", sys.argv[1], {"port": int(sys.argv[2])}, clock=MachineClock())
 print("ready", flush=True)
-heard = 0
-while heard < 3:
+count = 0
+while count < 3:
     for each in port.take(0):
-        heard += 1
+        count += 1
         port.send([each.frame], MachineClock().now().mono_ns)
     pause(1_000_000)
 port.close()
@@ -103,7 +103,7 @@ port.close()
 
 
 def test_two_processes(opened: Callable[..., CanPort]) -> None:
-    """Over `udp_multicast` two processes hear each other and neither itself, though the group sends everything back."""
+    """Over `udp_multicast` two processes receive each other's frames and not their own, which the group sends back."""
     number = free_port()
     port = opened("udp_multicast", GROUP, port=number)
     with subprocess.Popen(
@@ -113,22 +113,22 @@ def test_two_processes(opened: Callable[..., CanPort]) -> None:
         assert echo.stdout.readline() == "ready\n"
         before_ns = now_ns()
         port.send([STEERING, BRAKE, FAR], before_ns)
-        assert hear(port, 3) == [STEERING, BRAKE, FAR]
+        assert receive(port, 3) == [STEERING, BRAKE, FAR]
         assert echo.wait(DEADLINE_S) == 0
     until(lambda: port.counts["own_frames"] == 3)
     assert not port.take(0)
 
 
 def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames of `udp_multicast`, which counts as virtual, leave the machine only where the user says how far."""
+    """Frames of `udp_multicast`, which counts as virtual, stay on the machine unless the user sets `hop_limit`."""
     requested: list[dict[str, Any]] = []
     open_bus = can.Bus
 
-    def note(**keys: Any) -> can.BusABC:
+    def record(**keys: Any) -> can.BusABC:
         requested.append(keys)
         return open_bus(**keys)
 
-    monkeypatch.setattr(can, "Bus", note)
+    monkeypatch.setattr(can, "Bus", record)
     opened("udp_multicast", GROUP, port=free_port())
     opened("udp_multicast", GROUP, port=free_port(), hop_limit=1)
     opened()
@@ -136,7 +136,7 @@ def test_udp_multicast_stays_on_this_machine(opened: Callable[..., CanPort], mon
 
 
 def test_arrival(opened: Callable[..., CanPort]) -> None:
-    """A frame's time of arrival is the kernel's, on the monotonic clock, however late it is taken."""
+    """A frame's arrival time is the kernel's, on the monotonic clock, however late it is taken."""
     number = free_port()
     port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
     before_ns = now_ns()
@@ -151,36 +151,38 @@ def test_arrival(opened: Callable[..., CanPort]) -> None:
     assert before_ns - NS_PER_MS < taken[0].arrived_ns < now_ns()
 
 
-@pytest.mark.parametrize(("ahead_s", "is_heard"), [(-3, True), (0, True), (3, False)])
-def test_what_waited_too_long_is_dropped(opened: Callable[..., CanPort], ahead_s: int, is_heard: bool) -> None:
-    """A frame that the kernel has had for more than a second is counted; one of the future came now."""
+@pytest.mark.parametrize(("ahead_s", "is_received"), [(-3, True), (0, True), (3, False)])
+def test_a_frame_that_waited_too_long_is_dropped(
+    opened: Callable[..., CanPort], ahead_s: int, is_received: bool
+) -> None:
+    """A frame that has waited in the kernel for more than a second is counted and dropped."""
     number = free_port()
     port = opened("udp_multicast", GROUP, port=number, clock=ShiftedClock(wall_ns=ahead_s * NS_PER_S))
     opened("udp_multicast", GROUP, port=number).send([STEERING], now_ns())
-    if is_heard:
-        assert hear(port, 1) == [STEERING]
+    if is_received:
+        assert receive(port, 1) == [STEERING]
     else:
         until(lambda: port.counts["read_too_late"] == 1)
         assert port.take(0) == []
 
 
 def test_garbage_datagrams(opened: Callable[..., CanPort]) -> None:
-    """Datagrams of the group that are no frames are counted, and the next frame is heard."""
+    """Datagrams of the group that are not frames are counted, and the next frame is received."""
     number = free_port()
     port, other = opened("udp_multicast", GROUP, port=number), opened("udp_multicast", GROUP, port=number)
     garbage = [b"", b"\xff", b"\x80", b"\xc0", bytes(2000), b"\x81\xaearbitration_id\xcb?\xf8\0\0\0\0\0\0"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as anybody:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for datagram in garbage:
-            anybody.sendto(datagram, (GROUP, number))
-    until(lambda: port.counts["unreadable"] == len(garbage) - 1)  # one with no identifier but 0 is a frame of it
-    hear(port, 1)
+            stranger.sendto(datagram, (GROUP, number))
+    until(lambda: port.counts["unreadable"] == len(garbage) - 1)  # one of them is a frame with the identifier 0
+    receive(port, 1)
     other.send([BRAKE], now_ns())
-    assert hear(port, 1) == [BRAKE]
+    assert receive(port, 1) == [BRAKE]
 
 
 @pytest.mark.parametrize(("age_ns", "is_sent"), [(60 * NS_PER_MS, True), (60 * NS_PER_MS + 1, False)])
 def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, is_sent: bool) -> None:
-    """A frame made more than 60 ms before it is written is not written, and counted."""
+    """A frame made more than 60 ms before its write is counted and not written."""
     port = opened(clock=ManualClock(5 * NS_PER_S))
     port.send([STEERING], 5 * NS_PER_S - age_ns)
     assert (raw.recv(0) is not None) is is_sent
@@ -188,7 +190,7 @@ def test_too_old(opened: Callable[..., CanPort], raw: can.BusABC, age_ns: int, i
 
 
 def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
-    """The age is looked at before each frame: of those whose writer froze between two, the rest is not written."""
+    """The age is checked before each frame, so that a writer frozen between two frames does not write the rest."""
     clock = ManualClock(0)
     port = opened(clock=clock)
     clock.step_ns = 25 * NS_PER_MS
@@ -198,13 +200,13 @@ def test_too_old_while_writing(opened: Callable[..., CanPort], raw: can.BusABC) 
 
 
 def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
-    """Error frames, remote frames and those of CAN FD are counted and dropped."""
+    """Error frames, remote frames and CAN FD frames are counted and dropped."""
     port = opened()
     raw.send(can.Message(is_error_frame=True, arbitration_id=0x04))
     raw.send(can.Message(is_remote_frame=True, arbitration_id=0x60))
     raw.send(can.Message(is_fd=True, arbitration_id=0x60, data=bytes(12), is_extended_id=False))
     raw.send(can.Message(arbitration_id=0x60, data=b"\x07", is_extended_id=False))
-    assert hear(port, 1) == [CanFrame(0x60, b"\x07")]
+    assert receive(port, 1) == [CanFrame(0x60, b"\x07")]
     assert {name: count for name, count in port.counts.items() if count} == {
         "error_frames": 1,
         "remote_frames": 1,
@@ -212,8 +214,8 @@ def test_other_frames(opened: Callable[..., CanPort], raw: can.BusABC) -> None:
     }
 
 
-def test_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nobody takes what comes, the newest frames are kept and the others counted."""
+def test_queue_is_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full queue keeps the newest frames and counts the dropped ones."""
     monkeypatch.setattr(bus_module, "QUEUE_FRAMES", 4)
     port = opened()
     for number in range(10):
@@ -223,16 +225,16 @@ def test_bounded(opened: Callable[..., CanPort], raw: can.BusABC, monkeypatch: p
 
 
 def test_queue_holds_two_seconds_of_a_full_bus() -> None:
-    """A port keeps 8192 frames that nobody has taken: two seconds of a full bus of 500 kbit/s."""
+    """The queue has room for 8192 frames: two seconds of a full 500 kbit/s bus."""
     assert bus_module.QUEUE_FRAMES == 8192
 
 
 @dataclass
 class Device:
-    """A driver's device that can be pulled out."""
+    """A driver's device that can fail."""
 
-    heard: deque[can.Message | Exception] = field(default_factory=deque)
-    """What reading gives next, raised where it is an error."""
+    incoming: deque[can.Message | Exception] = field(default_factory=deque)
+    """Results of the next reads; errors are raised."""
     open_error: Exception | None = None
     send_error: Exception | None = None
     opened: int = 0
@@ -243,7 +245,7 @@ DEVICES: dict[str, Device] = {}
 
 
 class BreakableBus(can.BusABC):
-    """The driver."""
+    """The driver of the device."""
 
     def __init__(self, channel: str, **_: Any) -> None:
         self.device = DEVICES[channel]
@@ -253,13 +255,13 @@ class BreakableBus(can.BusABC):
         super().__init__(channel)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:  # noqa: ARG002 (python-can's)
-        if not self.device.heard:
+        if not self.device.incoming:
             pause(NS_PER_MS)
             return None, False
-        following = self.device.heard.popleft()
-        if isinstance(following, Exception):
-            raise following
-        return following, False
+        result = self.device.incoming.popleft()
+        if isinstance(result, Exception):
+            raise result
+        return result, False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002, D102 (python-can's)
         if self.device.send_error:
@@ -278,10 +280,10 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Device:
 
 
 def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> None:
-    """A bus that goes away is told of by reading and writing, tried again each second, and heard when it is back."""
+    """A lost bus raises an error in reading and writing, is reopened once a second, and receives again."""
     port = opened("breakable", "stick", clock=ManualClock(0))
     device.open_error = OSError(errno.ENODEV, "No such device")
-    device.heard.append(can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN))
+    device.incoming.append(can.CanOperationError("Error receiving: Network is down", errno.ENETDOWN))
     until(lambda: device.shut_down == 1)
     for attempt in (lambda: port.take(NS_PER_S - 1), lambda: port.send([STEERING], 0)):
         with pytest.raises(BusGone, match=r"breakable stick cannot be read .*Network is down"):
@@ -292,16 +294,16 @@ def test_bus_gone_and_back(opened: Callable[..., CanPort], device: Device) -> No
     with pytest.raises(BusGone):
         port.take(2 * NS_PER_S - 1)
     assert port.take(2 * NS_PER_S) == []
-    device.heard.append(can.Message(arbitration_id=7, is_extended_id=False))
-    assert hear(port, 1) == [CanFrame(7, b"")]
+    device.incoming.append(can.Message(arbitration_id=7, is_extended_id=False))
+    assert receive(port, 1) == [CanFrame(7, b"")]
     port.send([STEERING], 0)
     assert device.opened == 2
 
 
-def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) -> None:
-    """What was heard before the bus went away is taken first."""
+def test_frames_before_the_loss(opened: Callable[..., CanPort], device: Device) -> None:
+    """Frames received before the bus was lost are returned first."""
     port = opened("breakable", "stick", clock=ManualClock(0))
-    device.heard.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
+    device.incoming.extend([can.Message(arbitration_id=7, is_extended_id=False), OSError(errno.ENODEV, "gone")])
     until(lambda: device.shut_down == 1)
     assert [each.frame.identifier for each in port.take(0)] == [7]
     with pytest.raises(BusGone):
@@ -309,7 +311,7 @@ def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) ->
 
 
 @pytest.mark.parametrize(
-    ("error", "is_passing"),
+    ("error", "is_temporary"),
     [
         (can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS), True),
         (can.CanOperationError("Transmit buffer full"), True),
@@ -318,14 +320,14 @@ def test_heard_before_it_went(opened: Callable[..., CanPort], device: Device) ->
         (OSError(errno.ENODEV, "No such device"), False),
     ],
 )
-def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exception, is_passing: bool) -> None:
-    """What cannot be written is told of at once; a bus that has no room now is the same bus, another is tried again."""
+def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exception, is_temporary: bool) -> None:
+    """A failed write raises an error at once; after a full buffer the same bus is used, otherwise it is reopened."""
     port = opened("breakable", "stick", clock=ManualClock(0))
     device.send_error = error
     with pytest.raises(BusGone, match=r"breakable stick cannot be written to"):
         port.send([STEERING], 0)
     device.send_error = None
-    if is_passing:
+    if is_temporary:
         port.send([STEERING], 0)
     else:
         with pytest.raises(BusGone):
@@ -336,16 +338,16 @@ def test_not_written(opened: Callable[..., CanPort], device: Device, error: Exce
 
 
 def test_bus_off(opened: Callable[..., CanPort], device: Device) -> None:
-    """An error frame that says that the controller is off is a bus that has gone."""
+    """An error frame with bus-off means that the bus is lost."""
     port = opened("breakable", "stick", clock=ManualClock(0))
-    device.heard.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
+    device.incoming.append(can.Message(is_error_frame=True, arbitration_id=0x40, is_extended_id=False))
     until(lambda: device.shut_down == 1)
     with pytest.raises(BusGone, match="bus-off"):
         port.take(0)
 
 
 def test_closed(device: Device) -> None:
-    """A port that is closed has let go of the bus, and can be closed again."""
+    """A closed port has released the bus, rejects frames, and can be closed again."""
     port = CanPort("breakable", "stick", {}, clock=ManualClock(0))
     port.close()
     port.close()
@@ -369,26 +371,26 @@ REJECTED = [
 )  # python-can's
 @pytest.mark.parametrize(("interface", "channel", "options", "reason"), REJECTED)
 def test_rejected(interface: str, channel: str, options: dict[str, Any], reason: str) -> None:
-    """A bus that cannot be opened is refused in one sentence."""
+    """A bus that cannot be opened is rejected with an error of one line."""
     with pytest.raises(UserError, match=reason) as rejected:
         CanPort(interface, channel, options, clock=MachineClock())
     assert "\n" not in str(rejected.value)
     del rejected
-    gc.collect()  # while python-can's forgotten sockets are no matter
+    gc.collect()  # while warnings about python-can's open sockets are ignored
 
 
 @pytest.mark.parametrize(
-    ("number", "remedy"), [(errno.ENODEV, "ip link"), (errno.EPERM, "a user who may"), (errno.EAFNOSUPPORT, "can_raw")]
+    ("number", "remedy"), [(errno.ENODEV, "ip link"), (errno.EPERM, "permission"), (errno.EAFNOSUPPORT, "can_raw")]
 )
 def test_remedies(device: Device, number: int, remedy: str) -> None:
-    """A channel that is not there, a right that is missing and a kernel without CAN are told with what to do."""
+    """The errors for a missing channel, a missing permission and a kernel without CAN name a remedy."""
     device.open_error = OSError(number, "rejected")
-    with pytest.raises(UserError, match=rf"breakable stick cannot be opened \(.*refused\): .*{remedy}"):
+    with pytest.raises(UserError, match=rf"breakable stick cannot be opened \(.*rejected\): .*{remedy}"):
         CanPort("breakable", "stick", {}, clock=MachineClock())
 
 
 def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where python-can is missing, the sentence says what installs it."""
+    """Without python-can the error says how to install it."""
 
     def missing(name: str) -> None:
         raise ImportError(f"No module named {name!r}")
@@ -399,7 +401,7 @@ def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("bus", "told", "expected"),
+    ("bus", "output", "expected"),
     [
         (("virtual", "x"), "", True),
         (("udp_multicast", GROUP), "", True),
@@ -413,18 +415,18 @@ def test_without_python_can(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_is_virtual(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: tuple[str, str], told: str, expected: bool
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: tuple[str, str], output: str, expected: bool
 ) -> None:
-    """A bus is virtual where python-can or the kernel says so, and nowhere else."""
+    """A bus is virtual if python-can or the kernel says so, and not otherwise."""
     program = tmp_path / "ip"
-    program.write_text(f"#!/bin/sh\nprintf '%s' '{told}'\n")
+    program.write_text(f"#!/bin/sh\nprintf '%s' '{output}'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert is_virtual(*bus) is expected
 
 
 def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An interface that the kernel does not have, and a machine without `ip`, have no virtual bus."""
+    """A bus is not virtual if the interface does not exist or `ip` is missing."""
     assert not is_virtual("socketcan", "lo")
     assert not is_virtual("socketcan", "nosuch0")
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -432,7 +434,7 @@ def test_is_virtual_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 def test_log(tmp_path: Path) -> None:
-    """A log that was written is read as it was, to the microsecond."""
+    """A written log is read back unchanged, to the microsecond."""
     written = [ReceivedCanFrame(STEERING, 1_700_000_000_000_001_000), ReceivedCanFrame(FAR, 1_700_000_000_500_000_000)]
     log = tmp_path / "drive.log"
     log.write_text("".join(log_line(each.arrived_ns, "vcan0", each.frame) for each in written))
@@ -443,7 +445,7 @@ def test_log(tmp_path: Path) -> None:
 
 
 def test_bad_log(tmp_path: Path) -> None:
-    """A log that is missing, or stops being one, is refused with how far it was read."""
+    """The error for a missing or damaged log has the number of frames read."""
     with pytest.raises(UserError, match=r"missing\.log cannot be read after 0 frames"):
         list(read_log(tmp_path / "missing.log"))
     bad = tmp_path / "bad.log"
@@ -453,7 +455,7 @@ def test_bad_log(tmp_path: Path) -> None:
 
 
 def test_counts_of_a_log(tmp_path: Path) -> None:
-    """A log's error and remote frames are left out."""
+    """Error and remote frames in a log are ignored."""
     log = tmp_path / "drive.log"
     log.write_text("(1.0) can0 20000080#0000000000000000\n(2.0) can0 060#R\n(3.0) can0 060#01\n")
     assert [each.frame for each in read_log(log)] == [CanFrame(0x60, b"\x01")]

@@ -1,4 +1,4 @@
-"""The shipped DBC files say what the vectors worked by hand say, and mark what no fact says."""
+"""The shipped DBC files agree with the vectors worked out by hand, and mark everything that is not in the facts."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MESSAGES = [
 
 
 def selected(message: Message, selector: int) -> list[Signal]:
-    """The signals that a frame has whose multiplexer is `selector`, by number or by name."""
+    """Return the signals of a frame whose multiplexer is `selector`, a number or a name."""
     return [signal for signal in message.signals if selector in (signal.multiplexer_ids or [selector])]
 
 
@@ -64,14 +64,14 @@ def is_unverified(signal: Signal) -> bool:
 
 
 def full(message: Message, given_signals: dict[str, float]) -> dict[str, float]:
-    """All signals of the frame: those given, the others 0."""
+    """Return all signals of a frame: the given ones, and the others as 0."""
     multiplexer = selector_of(message)
     selector = int(given_signals.get(multiplexer.name, 0)) if multiplexer else 0
     return {signal.name: 0 for signal in selected(message, selector)} | given_signals
 
 
 def encoded(message: Message, signals: dict[str, float]) -> bytes:
-    """The frame's bytes, with its CRC where it has one."""
+    """Return a frame's bytes, with its CRC if it has one."""
     data = bytes(message.encode(full(message, signals)))
     if any(signal.name == "CRC" for signal in message.signals):
         return data[:-1] + bytes([frame_crc8(message.frame_id, data[:-1])])
@@ -80,7 +80,7 @@ def encoded(message: Message, signals: dict[str, float]) -> bytes:
 
 @pytest.mark.parametrize(("message", "vector"), CASES)
 def test_encoded(message: Message, vector: dict[str, Any]) -> None:
-    """What a command or report says becomes the bytes worked by hand; a short frame begins the full one."""
+    """A command or report is encoded to the bytes worked out by hand; a short frame is the start of the full one."""
     data = bytes.fromhex(vector["data"])
     assert message.frame_id == vector["id"]
     assert not message.is_extended_frame
@@ -90,7 +90,7 @@ def test_encoded(message: Message, vector: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("message", "vector"), CASES)
 def test_decoded(message: Message, vector: dict[str, Any]) -> None:
-    """The bytes worked by hand say what they were made from, to half a step."""
+    """The bytes worked out by hand are decoded to their values, to half a step."""
     data = bytes.fromhex(vector["data"])
     found = message.decode(data, decode_choices=False, allow_truncated=True)
     assert isinstance(found, dict)
@@ -109,7 +109,7 @@ def test_crc_by_hand(vector: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("message", "vector"), CASES)
 def test_marked(message: Message, vector: dict[str, Any]) -> None:
-    """A vector is unverified, and says by what assumption, where a signal that it sets has the mark, and only there."""
+    """A vector is unverified, with its assumption, exactly if it sets a signal that is marked as unverified."""
     marked = any(is_unverified(message.get_signal_by_name(name)) for name, value in vector["signals"].items() if value)
     assert vector.get("unverified", False) is marked
     assert ("assumption" in vector) is marked
@@ -119,7 +119,7 @@ def test_marked(message: Message, vector: dict[str, Any]) -> None:
 @given(data=st.data())
 @settings(max_examples=25)
 def test_round_trip(message: Message, data: st.DataObject) -> None:
-    """What is encoded within a signal's range is decoded as it was, and leaves every bit that is no signal's 0."""
+    """Encoded values within a signal's range are decoded unchanged, and unused bits are 0."""
     multiplexer = selector_of(message)
     selectors = sorted({n for signal in message.signals for n in signal.multiplexer_ids or []})
     selector = data.draw(st.sampled_from(selectors)) if multiplexer else 0
@@ -140,7 +140,7 @@ def test_round_trip(message: Message, data: st.DataObject) -> None:
 
 
 def raw_of(signal: Signal) -> st.SearchStrategy[int]:
-    """Numbers on the wire that are in the signal's range, or all of its bits where it has none."""
+    """Return raw numbers within the signal's range, or of all its bits if it has none."""
     if signal.minimum is None or signal.maximum is None:
         half = 1 << (signal.length - 1)
         return st.integers(-half, half - 1) if signal.is_signed else st.integers(0, 2 * half - 1)
@@ -158,12 +158,12 @@ def unverified(profile: str) -> set[str]:
 
 
 def test_unverified_of_generation_1() -> None:
-    """In generation 1 only the parking brake has a place that no fact gives."""
+    """In generation 1 only the parking brake has a position that is not in the facts."""
     assert unverified("dataspeed_gen1") == {"MiscCmd.PBRKCMD"}
 
 
 def test_unverified_of_generation_2() -> None:
-    """In generation 2 only the CRC of commands has a place that the facts give."""
+    """In generation 2 only the CRC of commands has a position that is in the facts."""
     everything = {
         f"{message.name}.{signal.name}"
         for message in DATABASES["dataspeed_gen2"].messages
@@ -179,8 +179,8 @@ def test_unverified_of_generation_2() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_unverified_says_why(profile: str) -> None:
-    """Every unverified signal has a comment that says what was assumed, and no other has."""
+def test_unverified_signals_have_a_comment(profile: str) -> None:
+    """Exactly the unverified signals have a comment with their assumption."""
     for message in DATABASES[profile].messages:
         for signal in message.signals:
             assert (signal.comment or "").startswith("Unverified") is is_unverified(signal), (message.name, signal.name)
@@ -188,7 +188,7 @@ def test_unverified_says_why(profile: str) -> None:
 
 @pytest.mark.parametrize("limit", WRITTEN["dataspeed_gen1"]["limits"], ids=lambda limit: limit["signal"])
 def test_limits(limit: dict[str, Any]) -> None:
-    """A command is encoded at the limits of the facts and refused one step beyond."""
+    """A command is encoded at the limits of the facts and rejected one step beyond."""
     message = DATABASES["dataspeed_gen1"].get_message_by_name(limit["message"])
     signal = message.get_signal_by_name(limit["signal"])
     multiplexer = selector_of(message)
@@ -201,7 +201,7 @@ def test_limits(limit: dict[str, Any]) -> None:
             encode({**selector, signal.name: end + beyond * signal.conversion.scale})
 
 
-TIMES = {  # period, time-out, ms
+TIMES = {  # period, timeout, ms
     "dataspeed_gen1": dict.fromkeys(("BrakeCmd", "ThrottleCmd", "SteeringCmd"), (20, 100)),
     "dataspeed_gen2": {
         **{f"{source}{name}Cmd": (None, 100) for source in ("Remote", "User", "Ulc") for name in ("Brake", "Thrtl")},
@@ -228,7 +228,7 @@ TIMES = {  # period, time-out, ms
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_times(profile: str) -> None:
-    """Periods and time-outs are those of the facts, and none is there that the facts have not."""
+    """Periods and timeouts are those of the facts, and there are no others."""
     found = {}
     for message in DATABASES[profile].messages:
         assert message.dbc is not None
@@ -240,7 +240,7 @@ def test_times(profile: str) -> None:
 
 
 def test_marks_of_invalid_values() -> None:
-    """A report's mark for "not valid" is decoded as a word, not as a number that could be driven by."""
+    """A report's number for "not valid" is decoded as a name, not as a value."""
     report = DATABASES["dataspeed_gen1"].get_message_by_name("SteeringReport")
     found = report.decode(bytes.fromhex("00 80 00 00 00 80 80 00"))
     assert isinstance(found, dict)

@@ -1,4 +1,4 @@
-"""What a kit reports is read in LAVT's units, and is too old after its time-out."""
+"""Reports are converted to LAVT's units and expire after their timeout."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ANGLE_AND_SPEED = CanFrame(STEERING, bytes.fromhex("64 00 00 00 E8 03 00 00"))
 @pytest.mark.parametrize(("angle_unit", "wheel_deg"), [("deg", 10.0), ("rad", math.degrees(10.0))])
 @pytest.mark.parametrize(("speed_unit", "speed_mps"), [("m/s", 10.0), ("km/h", 10.0 / 3.6)])
 def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: float) -> None:
-    """The wheel's angle in degrees or radians and the speed in m/s or km/h are read as degrees and m/s."""
+    """A wheel angle in degrees or radians and a speed in m/s or km/h are converted to degrees and m/s."""
     angle_per_deg, speed_per_mps = IN_DEGREES[angle_unit], IN_METRES_PER_SECOND[speed_unit]
     in_units = replace(profile("dataspeed_gen1"), angle_per_deg=angle_per_deg, speed_per_mps=speed_per_mps)
     reports = NewestReports(in_units, START_NS)
@@ -32,7 +32,7 @@ def test_units(angle_unit: str, wheel_deg: float, speed_unit: str, speed_mps: fl
 
 
 def test_deadline() -> None:
-    """The next deadline is that of the report that is the first to be 200 ms old, of those that are not yet."""
+    """The next deadline is that of the first report to become 200 ms old, without those that are so already."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     assert reports.deadline_ns(START_NS) is None
     reports.receive(ANGLE_AND_SPEED, START_NS)
@@ -45,7 +45,7 @@ def test_deadline() -> None:
 
 
 def test_missing() -> None:
-    """A report is missing until it has come with all its values, and again from the moment it is 200 ms old."""
+    """A report is missing until it has arrived with all its values, and again once it is 200 ms old."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
     missing = len(reports.missing(START_NS))
     assert missing == len(profile("dataspeed_gen1").reports)
@@ -55,9 +55,9 @@ def test_missing() -> None:
 
 
 def test_foreign_commands() -> None:
-    """Somebody else who commanded the kit is taken to do so for one second."""
+    """Another sender counts as present for one second after its last command."""
     reports = NewestReports(profile("dataspeed_gen1"), START_NS)
-    assert reports.foreign(START_NS) == ""
+    assert reports.other_commander(START_NS) == ""
     reports.receive(CanFrame(0x064, b""), START_NS)
-    assert reports.foreign(START_NS + 1000 * NS_PER_MS - 1) != ""
-    assert reports.foreign(START_NS + 1000 * NS_PER_MS) == ""
+    assert reports.other_commander(START_NS + 1000 * NS_PER_MS - 1) != ""
+    assert reports.other_commander(START_NS + 1000 * NS_PER_MS) == ""

@@ -1,4 +1,4 @@
-"""A car on a bus as a `Vehicle`: what its adapter, its port and a software car's truth are asked for and tell."""
+"""A by-wire car as a `Vehicle`: its calls of the adapter, the port and the source of ground truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.vehicle.dbw.rig import START_NS, profile
 from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent
 from lavt.vehicle.can_frame import BusGone, CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.adapter import ByWireAdapter
-from lavt.vehicle.dbw.vehicle import DbwVehicle, Truth
+from lavt.vehicle.dbw.vehicle import DbwVehicle, TruthSource
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
 CAPABILITIES = Capabilities(True, False, True, False, 2.8, 0.5, 0.5, 3.0, 8.0)
@@ -20,34 +20,34 @@ SPEED = CanFrame(0x065, bytes([0, 0, 0, 0, 100, 0, 0, 0]))
 
 
 class StandInPort:
-    """A port that says what a test puts into it, and keeps what is sent."""
+    """A port that returns frames from a test and records the sent ones."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter(overflowed=3)
         self.waiting: list[ReceivedCanFrame] = []
         self.sent: list[tuple[CanFrame, int]] = []
         self.wake_ns: int | None = None
-        self.captured_ns = 0
+        self.taken_ns = 0
         self.is_gone = self.is_closed = False
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Keep frames with the time at which they were made."""
+        """Record frames with the time at which they were made."""
         self._check()
         self.sent += [(frame, made_ns) for frame in frames]
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
-        """Return what is waiting, once, and keep when it was taken."""
+        """Return the waiting frames once, and record the time."""
         self._check()
-        self.captured_ns = now_ns
+        self.taken_ns = now_ns
         taken, self.waiting = self.waiting, []
         return taken
 
     def next_wake_ns(self) -> int | None:
-        """Return what the test has set."""
+        """Return the test's value."""
         return self.wake_ns
 
     def close(self) -> None:
-        """Keep that it was called."""
+        """Record the call."""
         self.is_closed = True
 
     def _check(self) -> None:
@@ -60,7 +60,7 @@ def port() -> StandInPort:
     return StandInPort()
 
 
-def made(port: StandInPort, truth: Truth | None = None) -> DbwVehicle:
+def made(port: StandInPort, truth: TruthSource | None = None) -> DbwVehicle:
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
     return DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS, truth=truth)
 
@@ -70,30 +70,32 @@ def truth_at(mono_ns: int) -> GroundTruth:
 
 
 def test_without_truth(port: StandInPort) -> None:
-    """A vehicle without a software car tells no ground truth, and what its kit says goes on."""
+    """Without a source of ground truth a vehicle returns none, and still processes its kit's reports."""
     vehicle = made(port)
     port.waiting = [ReceivedCanFrame(SPEED, START_NS + 1)]
     assert vehicle.advance(START_NS + NS_PER_MS) == []
     assert vehicle.ground_truth() is None
     assert vehicle.state().speed_mps > 0
-    assert port.captured_ns == START_NS + NS_PER_MS
+    assert port.taken_ns == START_NS + NS_PER_MS
 
 
 def test_truth_and_events(port: StandInPort) -> None:
-    """Events of the software car and of the kit come in order of time, and the newest truth is kept."""
-    told: list[tuple[GroundTruth | None, list[VehicleEvent]]] = [
+    """Events of the software car and of the kit are returned in order of time, with the newest truth."""
+    truths: list[tuple[GroundTruth | None, list[VehicleEvent]]] = [
         (truth_at(START_NS), []),
         (truth_at(START_NS + 5), [VehicleEvent(START_NS + 5, "collision", ""), VehicleEvent(START_NS, "off_road", "")]),
         (None, []),
     ]
-    vehicle = made(port, lambda _: told.pop(0))
+    vehicle = made(port, lambda _: truths.pop(0))
     assert vehicle.ground_truth() == truth_at(START_NS)
     override = CanFrame(0x061, bytes([0, 0, 0, 0, 0, 0, 0, 0x10]))  # a foot on the brake
     port.waiting = [ReceivedCanFrame(override, START_NS + 3)]
     events = vehicle.advance(START_NS + 9)
     assert [(event.mono_ns - START_NS, event.kind) for event in events] == [
-        (0, "off_road"), (3, "fault"), (5, "collision"),
-    ]  # fmt: skip
+        (0, "off_road"),
+        (3, "fault"),
+        (5, "collision"),
+    ]
     assert vehicle.ground_truth() == truth_at(START_NS + 5)
     vehicle.advance(START_NS + 20)
     assert vehicle.ground_truth() == truth_at(START_NS + 5)
@@ -110,7 +112,7 @@ def test_arrival(port: StandInPort, arrived_ns: int, counted_ns: int) -> None:
 
 
 def test_wake(port: StandInPort) -> None:
-    """The bus is listened to every 10 ms, or when the port says, and never later than the adapter wants."""
+    """The bus is polled every 10 ms or when the port requires it, and no later than the adapter requires."""
     vehicle = made(port)
     vehicle.advance(START_NS + NS_PER_MS)
     assert vehicle.next_wake_ns() == START_NS + 11 * NS_PER_MS
@@ -121,7 +123,7 @@ def test_wake(port: StandInPort) -> None:
 
 
 def test_bus_gone(port: StandInPort) -> None:
-    """A bus that has gone inhibits driving until a frame comes, and raises neither in reading nor in writing."""
+    """A lost bus inhibits driving until a frame arrives, and raises nothing in reading or writing."""
     vehicle = made(port)
     port.is_gone = True
     vehicle.advance(START_NS + 1)
@@ -134,30 +136,30 @@ def test_bus_gone(port: StandInPort) -> None:
 
 
 def test_apply(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the adapter has due leaves with the time of the tick, after the bus was heard."""
+    """Due frames are sent with the time of the tick, after received frames were processed."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
-    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.captured_ns == now_ns else [])
+    monkeypatch.setattr(adapter, "frames_due", lambda now_ns: [SPEED] if port.taken_ns == now_ns else [])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.apply(Actuation(0.1, 0.2, 0.3), START_NS + 7)
     assert port.sent == [(SPEED, START_NS + 7)]
     assert adapter.tick_ns == START_NS + 7
 
 
-def test_wishes_and_echoes(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The adapter hears whether driving is wanted, and what it saw reach the wheels is told."""
+def test_engage_and_reached(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`engage` is passed to the adapter, and the adapter's reached commands are returned."""
     adapter = ByWireAdapter(profile("dataspeed_gen1"), start_ns=START_NS)
-    wishes: list[tuple[bool, int]] = []
-    monkeypatch.setattr(adapter, "engage", lambda *wish: wishes.append(wish))
+    requests: list[tuple[bool, int]] = []
+    monkeypatch.setattr(adapter, "engage", lambda *request: requests.append(request))
     monkeypatch.setattr(adapter, "take_reached", lambda: [ReachedCommand(1, 2)])
     vehicle = DbwVehicle(adapter, port, CAPABILITIES, start_ns=START_NS)
     vehicle.engage(True, 3)
     vehicle.engage(False, 4)
-    assert wishes == [(True, 3), (False, 4)]
+    assert requests == [(True, 3), (False, 4)]
     assert vehicle.take_reached() == [ReachedCommand(1, 2)]
 
 
 def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bus that cannot be written to inhibits driving, though it could be read."""
+    """A bus that cannot be written to inhibits driving, even if it can be read."""
     vehicle = made(port)
 
     def fail(*_: object) -> None:
@@ -168,8 +170,8 @@ def test_write_fails(port: StandInPort, monkeypatch: pytest.MonkeyPatch) -> None
     assert "no more room" in vehicle.state().inhibit_reason
 
 
-def test_what_it_passes_on(port: StandInPort) -> None:
-    """Capabilities, counts of adapter and port, silence and closing are those of its parts."""
+def test_delegation(port: StandInPort) -> None:
+    """Capabilities, counts, silence and closing are those of the adapter and the port."""
     vehicle = made(port)
     port.waiting = [ReceivedCanFrame(CanFrame(0x555, bytes(8)), START_NS)]
     before = vehicle.counts.get("unknown_identifier", 0)

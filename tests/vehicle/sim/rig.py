@@ -1,4 +1,4 @@
-"""Cameras on roads, and what their pictures are."""
+"""Simulated cameras on roads, and digests of their pictures."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ MODEL = CameraModel()
 
 
 def camera_on(road: Road, *, seed: int = 1, model: CameraModel = MODEL, **keys: Any) -> SimCamera:
-    """Make a camera at 30 Hz."""
+    """Create a camera of 30 Hz."""
     return SimCamera(model=model, rate_hz=30.0, phase_ns=5, road=road, seed=seed, **keys)
 
 
 def pose_at(road: Road, s_m: float, lateral_m: float = 0.0, turned_rad: float = 0.0, *, mono_ns: int = 0) -> Pose:
-    """Give the pose at a station, beside the lane's centre and turned from its heading."""
+    """Return the pose at a station, with an offset from the lane's centre and a turn from its heading."""
     x_m, y_m = road.across(s_m, lateral_m).tolist()
     return Pose(mono_ns, x_m, y_m, float(road.point(s_m)[2]) + turned_rad)
 
 
 def picture_of(camera: SimCamera, pose: Pose, number: int = 0) -> Picture:
-    """Take one picture in a moment."""
+    """Return one picture without motion blur."""
     frame = camera.capture(number, 7, pose)
     assert frame is not None
     picture: Picture = frame.picture
@@ -32,5 +32,5 @@ def picture_of(camera: SimCamera, pose: Pose, number: int = 0) -> Picture:
 
 
 def digest(picture: Picture) -> str:
-    """SHA-256 of a picture."""
+    """Return the SHA-256 digest of a picture."""
     return hashlib.sha256(picture.tobytes()).hexdigest()

@@ -29,7 +29,7 @@ def cruise(car: CarDynamics, speed_mps: float, steering_rad: float, duration_s: 
 
 
 def test_a_car_at_rest_stays_at_rest() -> None:
-    """Whatever the wheel does, without throttle a standing car does not move, with and without brake."""
+    """A stationary car without throttle does not move, whatever its steering and brake."""
     for brake in (0.0, 1.0):
         car = car_at()
         drive(car, Actuation(0.3, 0.0, brake), 2.0)
@@ -39,8 +39,8 @@ def test_a_car_at_rest_stays_at_rest() -> None:
 
 @pytest.mark.parametrize("steering_rad", [0.02, -0.04])
 @pytest.mark.parametrize(("front_nprad", "rear_nprad"), [(155_495.0, 155_495.0), (90_000.0, 155_495.0), (2e5, 1.5e5)])
-def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float, front_nprad: float, rear_nprad: float) -> None:
-    """At 30 km/h the yaw rate is the linear bicycle's, v d / (L + K v^2), K = m (l_r / C_f - l_f / C_r) / L, to 1 %."""
+def test_yaw_rate_on_a_circle_matches_theory(steering_rad: float, front_nprad: float, rear_nprad: float) -> None:
+    """At 30 km/h the yaw rate is within 1 % of v d / (L + K v^2), K = m (l_r / C_f - l_f / C_r) / L."""
     speed_mps = 30 / 3.6
     car = car_at(speed_mps, replace(CAR, front_stiffness_nprad=front_nprad, rear_stiffness_nprad=rear_nprad))
     cruise(car, speed_mps, steering_rad, 4.0)
@@ -52,7 +52,7 @@ def test_a_steady_circle_has_the_yaw_rate_of_theory(steering_rad: float, front_n
 
 
 def test_a_steady_circle_closes() -> None:
-    """After the time of one turn at its yaw rate the rear axle is back where it was."""
+    """After one full turn at a steady yaw rate the rear axle is back at its start."""
     car = car_at(8.0)
     cruise(car, 8.0, 0.1, 5.0)
     motion = replace(car.motion)
@@ -70,8 +70,8 @@ def test_a_slow_car_rolls_without_slip() -> None:
     assert motion.side_speed_mps == pytest.approx(rear_m * motion.yaw_rate_radps, rel=1e-3)
 
 
-def test_nothing_jumps_where_the_models_meet() -> None:
-    """Accelerating and braking through 3 m/s in a turn, the yaw rate changes by less than 0.01 rad/s a step."""
+def test_yaw_rate_is_continuous_where_the_models_meet() -> None:
+    """Accelerating and braking through 3 m/s in a turn changes the yaw rate by less than 0.01 rad/s per step."""
     car = car_at(2.5)
     drive(car, Actuation(0.3, 0.0, 0.0), 0.5)
     for actuation in (Actuation(0.3, 1.0, 0.0), Actuation(0.3, 0.0, 0.5)):
@@ -81,8 +81,8 @@ def test_nothing_jumps_where_the_models_meet() -> None:
             assert abs(car.motion.yaw_rate_radps - before) < 0.01
 
 
-def test_tyres_cannot_hold_more_than_their_friction() -> None:
-    """At 25 m/s with the wheel fully turned the lateral acceleration stays below friction times gravity."""
+def test_tyre_forces_are_limited_by_friction() -> None:
+    """At 25 m/s and full steering the lateral acceleration does not exceed friction times gravity."""
     car = car_at(25.0)
     highest = 0.0
     for _ in range(480):
@@ -93,14 +93,14 @@ def test_tyres_cannot_hold_more_than_their_friction() -> None:
 
 
 def test_steering_follows_with_its_lag() -> None:
-    """One lag after a small step the wheel has made 63 % of it."""
+    """One time constant after a small step the steering has covered 63 % of it."""
     car = car_at()
     drive(car, Actuation(0.05, 0.0, 1.0), CAR.steering_lag_s)
     assert car.motion.steering_rad == pytest.approx(0.05 * (1 - math.exp(-1)), rel=0.02)
 
 
-def test_steering_keeps_its_rate_and_its_limit() -> None:
-    """A large step is followed at 0.534 rad/s at most, and never beyond 0.513 rad."""
+def test_steering_rate_and_angle_are_limited() -> None:
+    """Steering follows a large step at 0.534 rad/s at most, and never beyond 0.513 rad."""
     car = car_at()
     fastest = 0.0
     for _ in range(960):
@@ -113,14 +113,14 @@ def test_steering_keeps_its_rate_and_its_limit() -> None:
 
 
 def test_pedals_follow_with_their_lag() -> None:
-    """One lag after full throttle the pedal has made 63 % of it."""
+    """One time constant after full throttle the pedal has covered 63 % of it."""
     car = car_at()
     drive(car, Actuation(0.0, 1.0, 0.0), CAR.throttle_lag_s)
     assert car.motion.throttle == pytest.approx(1 - math.exp(-1), rel=0.02)
 
 
-def test_full_brake_stops_within_the_distance_of_theory() -> None:
-    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2 (a constant braking behind a lag T), and stays."""
+def test_full_braking_distance_matches_theory() -> None:
+    """From 30 km/h the car stops after v^2 / 2a + v T - a T^2 / 2, for braking a behind a lag T, and stays at rest."""
     speed_mps = 30 / 3.6
     car = car_at(speed_mps)
     drive(car, Actuation(0.0, 0.0, 1.0), 3.0)
@@ -134,7 +134,7 @@ def test_full_brake_stops_within_the_distance_of_theory() -> None:
 
 
 def test_full_throttle_accelerates_as_stated() -> None:
-    """At full throttle, once the pedal has followed, the car gains 2 m/s2 less its resistance."""
+    """At full throttle the car accelerates by 2 m/s2 minus its resistance."""
     car = car_at()
     drive(car, Actuation(0.0, 1.0, 0.0), 2.0)
     before = car.motion.speed_mps
@@ -144,15 +144,15 @@ def test_full_throttle_accelerates_as_stated() -> None:
     assert car.motion.y_m == 0.0
 
 
-def test_without_a_lag_the_next_step_has_what_was_requested() -> None:
-    """Lags of zero are no lags: pedals are there at once, the wheels as fast as their rate allows."""
+def test_without_lags_a_command_takes_effect_in_one_step() -> None:
+    """With lags of zero the pedals and a small steering change take effect in the next step."""
     car = car_at(parameters=replace(CAR, steering_lag_s=0.0, throttle_lag_s=0.0, brake_lag_s=0.0))
     car.step(Actuation(0.001, 0.5, 0.25))
     assert (car.motion.steering_rad, car.motion.throttle, car.motion.brake) == (0.001, 0.5, 0.25)
 
 
-def test_throttle_and_brake_have_lags_of_their_own() -> None:
-    """After 0.2 s a brake with a lag of 0.1 s has made 86 % of a step, a throttle with 0.4 s 39 %."""
+def test_throttle_and_brake_have_separate_lags() -> None:
+    """After 0.2 s a brake with a lag of 0.1 s has covered 86 % of a step, a throttle with a lag of 0.4 s 39 %."""
     car = car_at(parameters=replace(CAR, throttle_lag_s=0.4, brake_lag_s=0.1))
     drive(car, Actuation(0.0, 1.0, 1.0), 0.2)
     assert car.motion.throttle == pytest.approx(1 - math.exp(-0.5), rel=0.01)
@@ -169,7 +169,7 @@ def energy_j(car: CarDynamics) -> float:
 @settings(max_examples=60)
 @given(st.floats(4.0, 30.0), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=12), st.floats(0.0, 1.0))
 def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: list[float], brake: float) -> None:
-    """However it is steered, and sliding too, a car that only rolls or brakes loses energy, while tyres have slip."""
+    """A car that rolls or brakes loses energy however it is steered, also when it slides."""
     car = car_at(speed_mps)
     for steering_rad in wheel_rad:
         for _ in range(48):
@@ -183,14 +183,14 @@ def test_a_car_without_throttle_gains_no_energy(speed_mps: float, wheel_rad: lis
 
 @settings(max_examples=100)
 @given(st.floats(0.0, 20.0), st.floats(-5.0, 5.0), st.floats(-1.0, 1.0), st.floats(-3.2, 3.2), st.booleans())
-def test_a_rail_takes_the_motion_into_it_and_gives_none(
+def test_a_rail_stops_motion_into_it_and_adds_no_energy(
     speed_mps: float, side_mps: float, yaw_radps: float, out_rad: float, front: bool
 ) -> None:
-    """After a contact its point is out and moves in no more, and the car has no more energy, wherever it is."""
+    """After a contact the point is outside the rail and does not move into it, and the car has gained no energy."""
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.3, speed_mps, side_mps, yaw_radps), STEP_S)
     ahead_m, left_m = (3.89, 0.93) if front else (-1.043, -0.93)
     before_j = energy_j(car)
-    car.slide(Contact(ahead_m, left_m, 0.02, out_rad))
+    car.resolve_contact(Contact(ahead_m, left_m, 0.02, out_rad))
     motion = car.motion
     assert (motion.x_m, motion.y_m) == pytest.approx((0.02 * math.cos(out_rad), 0.02 * math.sin(out_rad)))
     assert energy_j(car) <= before_j + 1e-6
@@ -198,15 +198,15 @@ def test_a_rail_takes_the_motion_into_it_and_gives_none(
     from_gravity_m = ahead_m - (CAR.wheelbase_m - CAR.front_axle_to_gravity_m)
     outwards_mps = (motion.speed_mps - motion.yaw_rate_radps * left_m) * out[0]
     outwards_mps += (motion.side_speed_mps + motion.yaw_rate_radps * from_gravity_m) * out[1]
-    if motion.speed_mps > 0.0:  # a car is not pushed backwards: there what is left of its speed is taken instead
+    if motion.speed_mps > 0.0:  # a car is not pushed backwards: its remaining speed is removed instead
         assert outwards_mps >= -1e-9
 
 
 def test_a_car_along_a_rail_is_slowed_by_friction() -> None:
-    """Pressed sideways into a rail at its centre of gravity it loses friction times the speed that was stopped."""
+    """A car pressed sideways into a rail at its centre of gravity loses friction times the lateral speed."""
     car = CarDynamics(CAR, CarMotion(0.0, 0.0, 0.0, 8.0, 0.5, 0.0), STEP_S)
     at_gravity_m = CAR.wheelbase_m - CAR.front_axle_to_gravity_m
-    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    car.resolve_contact(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
     assert (car.motion.speed_mps, car.motion.side_speed_mps) == pytest.approx((8.0 - RAIL_FRICTION * 0.5, 0.0))
-    car.slide(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
+    car.resolve_contact(Contact(at_gravity_m, 0.0, 0.0, -math.pi / 2))
     assert car.motion.speed_mps == pytest.approx(8.0 - RAIL_FRICTION * 0.5)

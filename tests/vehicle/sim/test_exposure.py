@@ -1,4 +1,4 @@
-"""Exposure and sensor delay: when a frame is taken, when it is there, and what moves in between."""
+"""Exposure and sensor delay: capture times, the time of availability, and motion blur."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from lavt.transport.video.frame_codec import VideoSender
 from lavt.transport.video.h264 import Encoder
 from lavt.transport.video.path_validation import PathServer
 from lavt.transport.video.stream_sender import StreamSender
-from lavt.vehicle.sim.rendering.camera import SimCamera
-from lavt.vehicle.sim.rendering.camera import pose_at as pose_between
+from lavt.vehicle.sim.rendering.camera import SimCamera, interpolate_pose
 from lavt.vehicle.sim.road.road import Road, load_road
 from lavt.vehicle.sim.simulator import grid_ns
 
@@ -47,8 +46,8 @@ def node_of(camera: SimCamera) -> CameraNode:
 
 
 @pytest.mark.parametrize(("exposure_ns", "delay_ns"), [(0, 0), (10_000_000, 0), (8_333_333, 41_000_001), (0, 5_000)])
-def test_a_frame_is_due_at_its_opening_and_there_after_the_delay(road: Road, exposure_ns: int, delay_ns: int) -> None:
-    """The node wakes when the picture is there: half the exposure and the delay after the middle of the exposure."""
+def test_a_frame_is_available_after_exposure_and_delay(road: Road, exposure_ns: int, delay_ns: int) -> None:
+    """The node wakes when the exposure and the sensor delay are over; the capture time is the exposure's middle."""
     camera = camera_on(road, scenery="none", exposure_ns=exposure_ns, sensor_delay_ns=delay_ns)
     node = node_of(camera)
     give(node, "pose", pose_at(road, 0.0, mono_ns=MONO_NS - 1), at(0))
@@ -61,7 +60,7 @@ def test_a_frame_is_due_at_its_opening_and_there_after_the_delay(road: Road, exp
 
 
 def latencies_us(out: Path, *changes: str) -> list[int]:
-    """Drive two virtual seconds; capture to stamp of every frame, in microseconds."""
+    """Drive two virtual seconds and return the time from capture to stamp of every frame, in microseconds."""
     changes = ("vehicle.scenery=none", "record.video=false", *changes)
     loop = build_loop(plan_run(load_config(RunConfig, shipped("configs/demo.yaml"), changes)), out)
     drive(loop, limit_ns=2 * NS_PER_S)
@@ -70,8 +69,8 @@ def latencies_us(out: Path, *changes: str) -> list[int]:
     return [round(each / 1000) for each in late_ns.tolist()]
 
 
-def test_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
-    """In a drive it is half the exposure and the delay, and what drawing and checking cost, to the microsecond."""
+def test_time_from_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
+    """In a virtual run a frame is stamped half the exposure, the delay and the stages' costs after its capture."""
     (tmp_path / "run").mkdir()
     late_us = latencies_us(tmp_path / "run", "camera.exposure_ms=12.0", "camera.sensor_delay_ms=25.5")
     costs_us = read_costs().stages_us["camera"]
@@ -80,13 +79,13 @@ def test_capture_to_stamp_in_virtual_time(tmp_path: Path) -> None:
 
 
 def sharpness(picture: Picture) -> float:
-    """Mean step from row to row in the lowest quarter of a picture, where the road passes fastest."""
+    """Return the mean difference between rows in the lowest quarter of a picture, where the road moves fastest."""
     part = picture[-120:].astype(float).mean(axis=2)
     return float(np.abs(np.diff(part, axis=0)).mean())
 
 
-def test_what_moves_is_blurred_and_what_stands_is_not(road: Road) -> None:
-    """At 30 km/h a longer exposure smooths the near road more; a standing car's picture is that of a moment."""
+def test_a_moving_car_has_motion_blur_and_a_stationary_one_has_none(road: Road) -> None:
+    """At 30 km/h a longer exposure blurs the near road more; a stationary car's picture is not blurred."""
     moving = [pose_at(road, 8.33 * step / 240, mono_ns=grid_ns(step)) for step in range(10)]
     steps = []
     for exposure_ms in (0, 4, 16):
@@ -95,14 +94,14 @@ def test_what_moves_is_blurred_and_what_stands_is_not(road: Road) -> None:
         assert frame is not None
         steps.append(sharpness(frame.picture))
     assert all(later < 0.85 * earlier for earlier, later in pairwise(steps))
-    standing = [pose_at(road, 5.0, mono_ns=grid_ns(step)) for step in range(10)]
-    frame = camera.expose(3, grid_ns(3), standing)
+    stationary = [pose_at(road, 5.0, mono_ns=grid_ns(step)) for step in range(10)]
+    frame = camera.expose(3, grid_ns(3), stationary)
     assert frame is not None
-    assert digest(frame.picture) == digest(picture_of(camera_on(road, scenery="none"), standing[0], 3))
+    assert digest(frame.picture) == digest(picture_of(camera_on(road, scenery="none"), stationary[0], 3))
 
 
-def test_an_exposure_of_nothing_is_the_moment(road: Road) -> None:
-    """With an exposure of 0 a frame is, to the byte, that of the newest pose at or before its time."""
+def test_an_exposure_of_zero_shows_the_newest_pose(road: Road) -> None:
+    """With an exposure of 0 a frame is byte for byte that of the newest pose at or before its time."""
     poses = [pose_at(road, 0.1 * step, mono_ns=step * STEP_NS) for step in range(6)]
     camera = camera_on(road)
     frame = camera.expose(9, 3 * STEP_NS + 1, poses)
@@ -112,16 +111,16 @@ def test_an_exposure_of_nothing_is_the_moment(road: Road) -> None:
     assert camera.expose(9, -1, poses) is None
 
 
-def test_poses_are_read_between_those_known() -> None:
-    """Between two poses the car is between them, after the last it goes on for 20 ms, before all it is nowhere."""
+def test_poses_are_interpolated_and_extrapolated() -> None:
+    """A pose is interpolated between two poses, extrapolated for 20 ms beyond the last, and None before the first."""
     poses = [Pose(0, 0.0, 0.0, 3.1), Pose(4_000_000, 4.0, 2.0, -3.1)]
-    assert pose_between(poses, -1) is None
-    assert pose_between(poses[:1], 9) == poses[0]
-    middle = pose_between(poses, 2_000_000)
+    assert interpolate_pose(poses, -1) is None
+    assert interpolate_pose(poses[:1], 9) == poses[0]
+    middle = interpolate_pose(poses, 2_000_000)
     assert middle is not None
     assert (middle.x_m, middle.y_m) == (2.0, 1.0)
     assert abs(middle.heading_rad) == pytest.approx(np.pi, abs=0.05)
-    ahead = pose_between(poses, 6_000_000)
+    ahead = interpolate_pose(poses, 6_000_000)
     assert ahead is not None
     assert (ahead.x_m, ahead.y_m) == pytest.approx((6.0, 3.0))
-    assert pose_between(poses, 24_000_000) == pose_between(poses, 900_000_000)
+    assert interpolate_pose(poses, 24_000_000) == interpolate_pose(poses, 900_000_000)

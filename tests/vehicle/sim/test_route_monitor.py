@@ -12,8 +12,8 @@ from lavt.vehicle.sim.road.road import Road, load_road, parse_road
 from lavt.vehicle.sim.route_monitor import RouteMonitor
 
 CAR = LINCOLN_MKZ
-SECOND_WITHOUT_RAIL_M = 40.0
-"""Along the connecting road there is no rail to the right."""
+NO_RAIL_STATION_M = 40.0
+"""A station on the connecting road, which has no rail on the right."""
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +28,12 @@ def motion_at(
     return CarMotion(x_m, y_m, float(road.point(s_m)[2]) + turned_rad, speed_mps=speed_mps)
 
 
-def judged(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
-    """Judge a car that is moved from place to place (station, lateral offset)."""
-    judge = RouteMonitor(road, CAR, near_s_m=places[0][0])
+def events_along(road: Road, places: list[tuple[float, float]], turned_rad: float = 0.0) -> list[VehicleEvent]:
+    """Return the events of a car that is moved through positions (station, lateral offset)."""
+    monitor = RouteMonitor(road, CAR, near_s_m=places[0][0])
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
-        events += judge.judge(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
+        events += monitor.update(motion_at(road, s_m, lateral_m, turned_rad), index * 1000)
     return events
 
 
@@ -41,145 +41,146 @@ def kinds(events: list[VehicleEvent]) -> list[EventKind]:
     return [event.kind for event in events]
 
 
-def test_a_drive_along_the_lane_is_only_completed(road: Road) -> None:
-    """A car that keeps the centre of its lane to the end completes the route and nothing else happens, and once."""
-    events = judged(road, [(s_m / 2, 0.0) for s_m in range(270)])
+def test_a_drive_along_the_lane_only_completes(road: Road) -> None:
+    """A car on its lane's centre completes the route once, without other events."""
+    events = events_along(road, [(s_m / 2, 0.0) for s_m in range(270)])
     assert kinds(events) == ["completed"]
-    assert events[0].mono_ns == 246 * 1000  # 123.0 m is the first place beyond 122.933 m
+    assert events[0].mono_ns == 246 * 1000  # 123.0 m is the first position beyond 122.933 m
 
 
 @pytest.mark.parametrize(("lateral_m", "turned_rad"), [(0.4, 0.05), (-0.7, -0.1)])
-def test_the_track_is_measured_at_the_rear_axle(road: Road, lateral_m: float, turned_rad: float) -> None:
-    """Cross-track, heading error and progress are the rear axle's, left positive, in the curve as on the straight."""
+def test_tracking_error_is_measured_at_the_rear_axle(road: Road, lateral_m: float, turned_rad: float) -> None:
+    """Cross-track error, heading error and progress are the rear axle's, left positive, also in a curve."""
     for s_m in (5.0, 50.0, 110.0):
-        track = RouteMonitor(road, CAR, near_s_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
-        assert (track.cross_track_m, track.heading_error_rad, track.progress_m) == pytest.approx(
+        error = RouteMonitor(road, CAR, near_s_m=s_m).track(motion_at(road, s_m, lateral_m, turned_rad))
+        assert (error.cross_track_m, error.heading_error_rad, error.progress_m) == pytest.approx(
             (lateral_m, turned_rad, s_m), abs=1e-6
         )
 
 
-def test_heading_error_is_the_short_way_round(road: Road) -> None:
-    """A heading that went on past a full turn gives the same small error."""
-    track = RouteMonitor(road, CAR, near_s_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
-    assert track.heading_error_rad == pytest.approx(0.1)
+def test_heading_error_is_wrapped(road: Road) -> None:
+    """A heading beyond a full turn has the same small error."""
+    error = RouteMonitor(road, CAR, near_s_m=5.0).track(motion_at(road, 5.0, 0.0, 2 * math.pi + 0.1))
+    assert error.heading_error_rad == pytest.approx(0.1)
 
 
-def test_each_edge_that_changes_its_lane_is_an_invasion(road: Road) -> None:
-    """To the left and back: the left edge goes and comes; a whole change of lane is left edge, then right edge."""
+def test_each_edge_that_changes_lanes_is_an_invasion(road: Road) -> None:
+    """Each edge of the body that changes lanes is one lane invasion, in order of time."""
     away = [(5.0, 0.0), (5.1, 0.80), (5.2, 0.83)]
-    events = judged(road, [*away, (5.3, 0.0)])
+    events = events_along(road, [*away, (5.3, 0.0)])
     assert kinds(events) == ["lane_invasion", "lane_invasion"]
     assert [event.detail for event in events] == [
         "left edge from lane 2 to 3 from the right",
         "left edge from lane 3 to 2 from the right",
     ]
-    events = judged(road, [(5.0, 0.0), (5.1, -1.0), (5.2, -3.5)])
+    events = events_along(road, [(5.0, 0.0), (5.1, -1.0), (5.2, -3.5)])
     assert [event.detail.split()[0] for event in events] == ["right", "left"]
 
 
-def test_the_edge_of_the_body_counts_not_the_axle(road: Road) -> None:
-    """With 0.82 m to either side of a body of 1.86 m in a lane of 3.5 m, 0.81 m is in the lane and 0.83 m is not."""
-    assert judged(road, [(5.0, 0.0), (5.0, 0.81), (5.0, -0.81)]) == []
-    assert kinds(judged(road, [(5.0, 0.0), (5.0, 0.83)])) == ["lane_invasion"]
+def test_lane_invasions_are_measured_at_the_edge_of_the_body(road: Road) -> None:
+    """A body of 1.86 m in a lane of 3.5 m has 0.82 m on either side: 0.81 m is inside and 0.83 m is not."""
+    assert events_along(road, [(5.0, 0.0), (5.0, 0.81), (5.0, -0.81)]) == []
+    assert kinds(events_along(road, [(5.0, 0.0), (5.0, 0.83)])) == ["lane_invasion"]
 
 
-def test_where_a_drive_begins_is_no_invasion(road: Road) -> None:
-    """The first look only notes the lanes."""
-    assert judged(road, [(5.0, 1.5)]) == []
+def test_the_start_is_no_lane_invasion(road: Road) -> None:
+    """A start outside the lane is no lane invasion."""
+    assert events_along(road, [(5.0, 1.5)]) == []
 
 
-@pytest.mark.parametrize(("lateral_m", "word"), [(-8.25, "rail"), (11.35, "barrier")])
-def test_a_corner_at_a_rail_is_a_collision_once(road: Road, lateral_m: float, word: str) -> None:
-    """The body's side 0.93 m from the axle reaches the rail 9.15 m right, the barrier 12.25 m left; it happens once."""
+@pytest.mark.parametrize(("lateral_m", "kind"), [(-8.25, "rail"), (11.35, "barrier")])
+def test_a_corner_at_a_rail_is_one_collision(road: Road, lateral_m: float, kind: str) -> None:
+    """A body whose side reaches the rail or the barrier has one collision, which names the obstacle."""
     before = lateral_m - math.copysign(0.1, lateral_m)
-    assert "collision" not in kinds(judged(road, [(5.0, before)]))
-    events = [event for event in judged(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
+    assert "collision" not in kinds(events_along(road, [(5.0, before)]))
+    events = [event for event in events_along(road, [(5.0, lateral_m), (5.0, lateral_m)]) if event.kind == "collision"]
     assert len(events) == 1
-    assert word in events[0].detail
+    assert kind in events[0].detail
 
 
 def test_the_front_reaches_the_rail_before_the_axle(road: Road) -> None:
-    """A car turned to the rail hits it with its front corner though its axle is more than 2 m away."""
-    assert "collision" in kinds(judged(road, [(5.0, -7.0)], turned_rad=-0.5))
-    assert "collision" not in kinds(judged(road, [(5.0, -7.0)]))
+    """A car turned towards the rail hits it with its front corner while its axle is more than 2 m away."""
+    assert "collision" in kinds(events_along(road, [(5.0, -7.0)], turned_rad=-0.5))
+    assert "collision" not in kinds(events_along(road, [(5.0, -7.0)]))
 
 
-def test_leaving_the_asphalt_where_no_rail_stands_is_off_road(road: Road) -> None:
-    """Along the connecting road the right is open: the body's middle beyond the shoulder is off the road, once."""
-    place = (SECOND_WITHOUT_RAIL_M, -8.9)
-    assert kinds(judged(road, [place, place])) == ["off_road"]
-    assert judged(road, [(SECOND_WITHOUT_RAIL_M, -8.4)]) == []
+def test_leaving_the_asphalt_without_a_rail_is_off_road(road: Road) -> None:
+    """Where there is no rail, a body whose middle is beyond the shoulder is off the road; this is reported once."""
+    place = (NO_RAIL_STATION_M, -8.9)
+    assert kinds(events_along(road, [place, place])) == ["off_road"]
+    assert events_along(road, [(NO_RAIL_STATION_M, -8.4)]) == []
 
 
-def test_the_time_of_a_drive_counts_from_its_first_movement(road: Road) -> None:
-    """The limit is the route at 10 km/h plus 30 s, 74.3 s here, once the car exceeds 0.1 m/s; waiting is free."""
-    judge = RouteMonitor(road, CAR, near_s_m=0.0)
-    standing, moving = motion_at(road, 1.0), motion_at(road, 1.0, speed_mps=0.2)
+def test_the_time_limit_counts_from_the_first_movement(road: Road) -> None:
+    """The time limit, the route at 10 km/h plus 30 s, starts when the car first exceeds 0.1 m/s."""
+    monitor = RouteMonitor(road, CAR, near_s_m=0.0)
+    stationary, moving = motion_at(road, 1.0), motion_at(road, 1.0, speed_mps=0.2)
     began_ns = 500 * NS_PER_S
-    assert judge.judge(standing, 0) == []
-    assert judge.judge(standing, began_ns - 1) == []
-    assert judge.judge(moving, began_ns) == []
+    assert monitor.update(stationary, 0) == []
+    assert monitor.update(stationary, began_ns - 1) == []
+    assert monitor.update(moving, began_ns) == []
     limit_ns = round((road.length_m / (30 / 3.6 / 3) + 30) * NS_PER_S)
-    assert judge.judge(standing, began_ns + limit_ns) == []
-    assert kinds(judge.judge(standing, began_ns + limit_ns + 1)) == ["timeout"]
-    assert judge.judge(standing, began_ns + limit_ns + 2) == []
+    assert monitor.update(stationary, began_ns + limit_ns) == []
+    assert kinds(monitor.update(stationary, began_ns + limit_ns + 1)) == ["timeout"]
+    assert monitor.update(stationary, began_ns + limit_ns + 2) == []
 
 
 def test_the_time_limit_can_be_set(road: Road) -> None:
-    """A drive may be given a time of its own."""
-    judge = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
+    """A drive with a time limit of 2 s times out once it has lasted longer."""
+    monitor = RouteMonitor(road, CAR, near_s_m=0.0, limit_s=2.0)
     moving = motion_at(road, 1.0, speed_mps=0.2)
-    assert [kinds(judge.judge(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
+    assert [kinds(monitor.update(moving, at_s * NS_PER_S)) for at_s in (5, 7, 8)] == [[], [], ["timeout"]]
 
 
 def test_an_edge_exactly_on_a_line_is_still_in_its_lane() -> None:
-    """On either side the line itself belongs to the lane the body is in; a hair further is an invasion."""
+    """An edge exactly on a line is in the body's lane; 1 mm further is a lane invasion."""
     straight = parse_road("title: x\nsegments: [{length_m: 100}]\nlanes: {widths_m: [3.0]}", source="x")
     wide = replace(CAR, body_width_m=2.0)  # half a metre to either side, without rounding
     for lateral_m, invasions in ((0.5, 0), (-0.5, 0), (0.501, 1), (-0.501, 1)):
-        judge = RouteMonitor(straight, wide, near_s_m=5.0)
-        judge.judge(motion_at(straight, 5.0), 0)
-        assert kinds(judge.judge(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
+        monitor = RouteMonitor(straight, wide, near_s_m=5.0)
+        monitor.update(motion_at(straight, 5.0), 0)
+        assert kinds(monitor.update(motion_at(straight, 5.0, lateral_m), 1)) == ["lane_invasion"] * invasions
 
 
 def test_both_edges_can_leave_their_lanes_at_once(road: Road) -> None:
-    """A car across its lane invades to both sides in the same step, left edge first."""
-    events = judged(road, [(5.0, 0.0), (5.0, 0.0)])
+    """A car across its lane has two lane invasions in one step, the left edge's first."""
+    events = events_along(road, [(5.0, 0.0), (5.0, 0.0)])
     assert events == []
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    judge.judge(motion_at(road, 5.0), 0)
-    events = judge.judge(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor.update(motion_at(road, 5.0), 0)
+    events = monitor.update(motion_at(road, 5.0, -1.4, math.pi / 2), 1000)
     assert [event.detail for event in events] == [
-        "left edge from lane 2 to 3 from the right", "right edge from lane 2 to 1 from the right"
-    ]  # fmt: skip
+        "left edge from lane 2 to 3 from the right",
+        "right edge from lane 2 to 1 from the right",
+    ]
 
 
-def test_a_spin_is_judged_by_the_points_furthest_out(road: Road) -> None:
-    """A car that has turned round in its lane has invaded on the way, and at the end is where it was."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
+def test_a_spin_is_evaluated_at_the_outermost_points(road: Road) -> None:
+    """A car that turns around in its lane invades the next lane and returns."""
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     events = []
     for index in range(181):
-        events += judge.judge(motion_at(road, 5.0, 0.0, math.radians(index)), index)
+        events += monitor.update(motion_at(road, 5.0, 0.0, math.radians(index)), index)
     sides = [event.detail.split()[0] for event in events if event.kind == "lane_invasion"]
     assert sides == ["left", "left"]  # the front goes out and comes back; the rear, 1.4 m from the axle, stays in
     assert set(kinds(events)) == {"lane_invasion"}
 
 
 def test_driving_backwards_does_not_complete_a_route(road: Road) -> None:
-    """A car that goes back from the start is measured there, and only its time runs out."""
+    """A car that drives backwards from the start has negative progress and only exceeds its time limit."""
     places = [(1.0 - index / 4, 0.0) for index in range(100)]
-    judge = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
+    monitor = RouteMonitor(road, CAR, near_s_m=1.0, limit_s=1e-6)
     events = []
     for index, (s_m, lateral_m) in enumerate(places):
-        events += judge.judge(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
+        events += monitor.update(motion_at(road, s_m, lateral_m, math.pi, speed_mps=5.0), index * 1000)
     assert kinds(events) == ["timeout"]
-    assert judge.track(motion_at(road, -23.75)).progress_m == pytest.approx(-23.75)
+    assert monitor.track(motion_at(road, -23.75)).progress_m == pytest.approx(-23.75)
 
 
-def test_a_route_is_completed_where_it_ends_to_the_step(road: Road) -> None:
-    """Steps of a centimetre across the end: the first at or beyond it completes."""
+def test_a_route_is_completed_at_its_end(road: Road) -> None:
+    """The first step at or beyond the route's end completes it."""
     at_m = [122.0 + index / 100 for index in range(200)]
-    events = judged(road, [(s_m, 0.0) for s_m in at_m])
+    events = events_along(road, [(s_m, 0.0) for s_m in at_m])
     assert kinds(events) == ["completed"]
     assert at_m[events[0].mono_ns // 1000] == pytest.approx(122.94)
 
@@ -192,61 +193,61 @@ rails: [{offset_m: -6, from_m: 40}]
 
 
 def test_grass_before_a_rail_is_off_road() -> None:
-    """A rail beyond the asphalt does not make the grass before it a road."""
+    """Grass between the asphalt and a rail is off the road."""
     road = parse_road(OPEN_RAIL, source="x")
-    assert kinds(judged(road, [(60.0, 0.0), (60.0, -2.0), (60.0, -3.0)])) == [
+    assert kinds(events_along(road, [(60.0, 0.0), (60.0, -2.0), (60.0, -3.0)])) == [
         "lane_invasion",
         "lane_invasion",
         "off_road",
     ]
 
 
-def test_asphalt_counts_where_it_is() -> None:
-    """A lay-by beside the lane is road between its stations and nowhere else."""
+def test_asphalt_is_limited_to_its_stations() -> None:
+    """A lay-by beside the lane is road only between its stations."""
     paved = "paved: [{left_m: 2.25, right_m: -2.25}, {left_m: -2.25, right_m: -6, from_m: 30, to_m: 60}]"
     road = parse_road(f"title: x\nsegments: [{{length_m: 100}}]\n{paved}", source="x")
     for s_m, off in ((20.0, True), (45.0, False), (70.0, True)):
-        assert ("off_road" in kinds(judged(road, [(s_m, -4.0)]))) == off
+        assert ("off_road" in kinds(events_along(road, [(s_m, -4.0)]))) == off
 
 
 def test_a_car_behind_a_rail_does_not_touch_it() -> None:
-    """Where the rail begins, a body that is wholly behind it passes; one that it meets in front has a collision."""
+    """A body entirely behind a rail passes its beginning; a body that meets its front has a collision."""
     road = parse_road(OPEN_RAIL, source="x")
-    assert "collision" not in kinds(judged(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
-    assert "collision" in kinds(judged(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
+    assert "collision" not in kinds(events_along(road, [(30.0 + s_m, -7.5) for s_m in range(20)]))
+    assert "collision" in kinds(events_along(road, [(30.0 + s_m, -6.2) for s_m in range(20)]))
 
 
 def test_one_contact_is_one_collision(road: Road) -> None:
-    """Touching and leaving a rail within half a second is one collision, after more than that it is another."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
+    """Contacts within half a second are one collision; a later contact is another one."""
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
     at_rail, off_rail = motion_at(road, 5.0, -8.25), motion_at(road, 5.0, -8.0)
     collisions = []
     for at_ms in (0, 10, 20, 500, 1021, 1500):
-        judge.judge(off_rail, at_ms * 1_000_000 - 1)
-        events = judge.judge(at_rail, at_ms * 1_000_000)
+        monitor.update(off_rail, at_ms * 1_000_000 - 1)
+        events = monitor.update(at_rail, at_ms * 1_000_000)
         collisions += [at_ms for event in events if event.kind == "collision"]
     assert collisions == [0, 1021]
 
 
-def test_a_car_that_stands_in_a_rail_stays_in_one_collision(road: Road) -> None:
-    """Pressed against a rail for seconds and moved there again, a car has touched it once."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    events = [event for at_s in range(4) for event in judge.judge(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
-    events += judge.judge(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
+def test_a_lasting_contact_is_one_collision(road: Road) -> None:
+    """A car pressed against a rail for seconds has one collision, also when it moves deeper."""
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    events = [event for at_s in range(4) for event in monitor.update(motion_at(road, 5.0, -8.5), at_s * NS_PER_S // 3)]
+    events += monitor.update(motion_at(road, 5.0, -8.8), 4 * NS_PER_S // 3)
     assert kinds(events).count("collision") == 1
 
 
-def test_a_contact_says_which_corner_how_deep_and_which_way_out(road: Road) -> None:
-    """The front right corner in the right rail: its place on the body, its depth, and that out is to the left."""
-    judge = RouteMonitor(road, CAR, near_s_m=5.0)
-    judge.judge(motion_at(road, 5.0, -6.5, -0.5), 0)
-    (contact,) = judge.contacts
+def test_a_contact_has_its_corner_depth_and_direction(road: Road) -> None:
+    """A contact has the position of its corner on the body, its depth, and the direction out of the rail."""
+    monitor = RouteMonitor(road, CAR, near_s_m=5.0)
+    monitor.update(motion_at(road, 5.0, -6.5, -0.5), 0)
+    (contact,) = monitor.contacts
     assert (contact.ahead_m, contact.left_m) == (CAR.rear_axle_to_front_m, -CAR.body_width_m / 2)
     corner_m = -6.5 - 0.93 * math.cos(0.5) - 3.89 * math.sin(0.5)
     assert contact.depth_m == pytest.approx(-9.15 - corner_m)
     assert math.remainder(contact.out_rad - road.start[2] - math.pi / 2, 2 * math.pi) == pytest.approx(0.0)
-    judge.judge(motion_at(road, 5.0), 1)
-    assert judge.contacts == ()
+    monitor.update(motion_at(road, 5.0), 1)
+    assert monitor.contacts == ()
 
 
 WINDING = """
@@ -264,15 +265,15 @@ STEPS = st.tuples(st.floats(-0.3, 0.6), st.floats(-0.3, 0.3), st.floats(-0.1, 0.
 
 @settings(max_examples=30)
 @given(st.sampled_from(ROADS), st.lists(STEPS, min_size=50, max_size=300), st.floats(0.0, 90.0), st.floats(-6.0, 6.0))
-def test_looking_only_when_needed_changes_no_verdict(
+def test_skipping_checks_changes_no_events(
     road: Road, steps: list[tuple[float, float, float]], s_m: float, lateral_m: float
 ) -> None:
-    """However a car moves, its judge says the same as one that looks at the whole body in every step."""
+    """A monitor that skips checks within its margin reports the same events as one that checks every step."""
     lazy, eager = RouteMonitor(road, CAR, near_s_m=s_m), RouteMonitor(road, CAR, near_s_m=s_m)
     turned_rad = 0.0
     for index, (ahead_m, beside_m, turn_rad) in enumerate(steps):
         s_m, lateral_m, turned_rad = s_m + ahead_m, lateral_m + beside_m, turned_rad + turn_rad
         motion = motion_at(road, s_m, lateral_m, turned_rad)
-        eager._quiet._room_m = 0.0
-        assert lazy.judge(motion, index) == eager.judge(motion, index)
+        eager._event_margin._across_margin_m = 0.0
+        assert lazy.update(motion, index) == eager.update(motion, index)
         assert (lazy.contacts == ()) == (eager.contacts == ())

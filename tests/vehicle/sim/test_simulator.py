@@ -25,8 +25,8 @@ def simulator_on(road: Road, seed: int = 1, start_mono_ns: int = START_NS) -> Si
     return Simulator(road=road, seed=seed, start_mono_ns=start_mono_ns)
 
 
-def test_it_is_a_vehicle_that_says_what_it_can(road: Road) -> None:
-    """The simulator is a `Vehicle`: simulated, at home in virtual time, with ground truth and the limits of its car."""
+def test_the_simulator_reports_its_capabilities(road: Road) -> None:
+    """The simulator is a simulated `Vehicle` with virtual time, ground truth and the limits of its car."""
     vehicle: Vehicle = simulator_on(road)
     can = vehicle.capabilities
     assert (can.simulated, can.virtual_time, can.ground_truth, can.reset) == (True, True, True, False)
@@ -34,7 +34,7 @@ def test_it_is_a_vehicle_that_says_what_it_can(road: Road) -> None:
 
 
 def test_the_grid_does_not_drift(road: Road) -> None:
-    """Steps are at n / 240 s of the monotonic clock, rounded down, also after years."""
+    """Grid points are at n / 240 s of the monotonic clock, rounded down, also after years."""
     assert [grid_ns(index) for index in (0, 1, 2, 3, 240)] == [0, 4_166_666, 8_333_333, 12_500_000, NS_PER_S]
     assert grid_ns(240 * 10**9) == 10**9 * NS_PER_S
     simulator = simulator_on(road)
@@ -46,8 +46,8 @@ def test_the_grid_does_not_drift(road: Road) -> None:
         assert simulator.state().mono_ns == wake_ns
 
 
-def test_it_stays_at_rest_until_told_otherwise(road: Road) -> None:
-    """A car that nobody commands stands where it began, and nothing happens."""
+def test_the_car_is_stationary_until_the_first_command(road: Road) -> None:
+    """A car without commands stays at its start without events."""
     simulator = simulator_on(road)
     before = simulator.pose()
     assert simulator.advance(START_NS + 5 * NS_PER_S) == []
@@ -56,8 +56,8 @@ def test_it_stays_at_rest_until_told_otherwise(road: Road) -> None:
     assert simulator.state().speed_mps == 0.0
 
 
-def test_it_catches_up_whatever_the_steps(road: Road) -> None:
-    """One long advance ends in the same state as many short ones."""
+def test_one_long_advance_equals_many_short_ones(road: Road) -> None:
+    """One long advance has the same events and final state as many short ones."""
     one, many = simulator_on(road), simulator_on(road)
     end_ns = START_NS + 4 * NS_PER_S
     for simulator in (one, many):
@@ -71,8 +71,8 @@ def test_it_catches_up_whatever_the_steps(road: Road) -> None:
     assert events == collected
 
 
-def test_a_command_takes_effect_at_the_next_point_of_the_grid(road: Road) -> None:
-    """Commands given while the physics was late act at their own times, not when the physics comes to it."""
+def test_a_command_takes_effect_at_the_next_grid_point(road: Road) -> None:
+    """Commands applied while the physics is late take effect at their own times."""
     late, punctual = simulator_on(road), simulator_on(road)
     first_ns, second_ns, end_ns = START_NS + 100 * NS_PER_MS, START_NS + 900 * NS_PER_MS, START_NS + 2 * NS_PER_S
     stop = Actuation(0.1, 0.0, 1.0)
@@ -95,8 +95,8 @@ def test_a_command_takes_effect_at_the_next_point_of_the_grid(road: Road) -> Non
     assert one_later._car.motion.throttle > 0.0
 
 
-def test_starts_differ_by_seed_within_their_bounds(road: Road) -> None:
-    """Over seeds the start fills 2 m ahead, 0.25 m and 1.5 degrees to both sides, and one seed gives one start."""
+def test_the_seed_draws_the_start_within_bounds(road: Road) -> None:
+    """Starts of many seeds fill 2 m ahead, 0.25 m and 1.5 degrees to both sides; one seed has one start."""
     truths = [simulator_on(road, seed=seed).ground_truth() for seed in range(60)]
     assert truths[7] == simulator_on(road, seed=7).ground_truth()
     for values, low, high in (
@@ -109,8 +109,8 @@ def test_starts_differ_by_seed_within_their_bounds(road: Road) -> None:
         assert high - 0.1 * span < max(values) <= high + 1e-9
 
 
-def test_a_drive_at_the_rail_ends_in_one_collision(road: Road) -> None:
-    """Full throttle straight on: lanes are left, the barrier is hit once, and the car stays where it hit it."""
+def test_driving_into_the_barrier_is_one_collision(road: Road) -> None:
+    """At full throttle straight ahead the car leaves its lane, hits the barrier once and stays there."""
     simulator = simulator_on(road)
     simulator.apply(GO, START_NS)
     events = simulator.advance(START_NS + 20 * NS_PER_S)
@@ -124,7 +124,7 @@ def test_a_drive_at_the_rail_ends_in_one_collision(road: Road) -> None:
 
 
 def test_a_good_driver_completes_the_route(road: Road) -> None:
-    """Steered by the truth at about 30 km/h the car stays within 0.5 m of the centre and completes, nothing else."""
+    """Steered by ground truth at 30 km/h the car stays within 0.5 m of the centre and only completes the route."""
     simulator = simulator_on(road, seed=3)
     events: list[VehicleEvent] = []
     worst_m = 0.0
@@ -146,7 +146,7 @@ def test_a_good_driver_completes_the_route(road: Road) -> None:
 @settings(max_examples=25)
 @given(st.lists(st.integers(0, 400 * NS_PER_MS), max_size=30))
 def test_the_trajectory_does_not_depend_on_how_advance_is_called(pauses_ns: list[int]) -> None:
-    """However late and unevenly the physics is called, commands at the same times give the same drive to the bit."""
+    """Commands at equal times give a bit-identical drive however late and unevenly `advance` is called."""
     road = load_road("a_key")
     one, other = simulator_on(road), simulator_on(road)
     for index in range(20):
@@ -162,8 +162,8 @@ def test_the_trajectory_does_not_depend_on_how_advance_is_called(pauses_ns: list
     assert collected == events
 
 
-def test_dead_times_hold_commands_back_each_its_own(road: Road) -> None:
-    """Wheels begin to follow after their dead time, pedals after theirs, and then with their lags."""
+def test_steering_and_pedals_have_separate_dead_times(road: Road) -> None:
+    """Steering and pedals each begin to follow after their own dead time, and then with their lag."""
     car = replace(LINCOLN_MKZ, steering_dead_time_s=0.15, pedal_dead_time_s=0.05)
     simulator = Simulator(road=road, seed=1, start_mono_ns=0, parameters=car)
     simulator.apply(Actuation(0.02, 1.0, 0.0), 0)
@@ -178,8 +178,8 @@ def test_dead_times_hold_commands_back_each_its_own(road: Road) -> None:
     assert seen[270][0] == pytest.approx(0.02 * (1 - math.exp(-1)), rel=0.05)
 
 
-def test_with_dead_time_commands_keep_their_order_and_distance(road: Road) -> None:
-    """A dead time only moves commands: the wheel does later exactly what it does without."""
+def test_dead_time_only_shifts_commands(road: Road) -> None:
+    """With a dead time the steering repeats, later, exactly its motion without one."""
     late_ns = 250 * NS_PER_MS  # a whole number of steps
     plain = Simulator(road=road, seed=1, start_mono_ns=0)
     delayed = Simulator(
@@ -211,22 +211,22 @@ rails: [{offset_m: 0.52, from_m: 20, kind: barrier}]
 """
 
 
-def into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
-    """Drive with constant wheel and throttle, collisions not ending it; tell the deepest any corner got into a rail."""
-    simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, goes_on=True)
+def drive_into_the_rail(steering_rad: float, duration_s: float) -> tuple[Simulator, list[VehicleEvent], float]:
+    """Drive with constant steering and throttle through collisions; return car, events and deepest contact."""
+    simulator = Simulator(road=parse_road(RAILED, source="x"), seed=1, start_mono_ns=0, continue_after_collision=True)
     simulator.apply(Actuation(steering_rad, 0.6, 0.0), 0)
     events: list[VehicleEvent] = []
     deepest_m = 0.0
     for _ in range(round(240 * duration_s)):
         events += simulator.advance(simulator.next_wake_ns())
-        deepest_m = max([deepest_m, *(contact.depth_m for contact in simulator._judge.contacts)])
+        deepest_m = max([deepest_m, *(contact.depth_m for contact in simulator._route_monitor.contacts)])
     return simulator, events, deepest_m
 
 
 @pytest.mark.parametrize(("steering_rad", "name"), [(0.03, "barrier"), (-0.03, "rail")])
-def test_a_car_that_goes_on_after_a_collision_slides_along(steering_rad: float, name: str) -> None:
-    """Steered at barrier or rail it has one collision, gets no deeper than a step takes it, lies along, and goes on."""
-    simulator, events, deepest_m = into_the_rail(steering_rad, 16.0)
+def test_a_car_that_continues_after_a_collision_slides_along(steering_rad: float, name: str) -> None:
+    """A car steered into a rail has one collision, aligns with the rail, barely penetrates it, and drives on."""
+    simulator, events, deepest_m = drive_into_the_rail(steering_rad, 16.0)
     hits = [event.detail for event in events if event.kind == "collision"]
     assert len(hits) == 1
     assert name in hits[0]
@@ -238,25 +238,25 @@ def test_a_car_that_goes_on_after_a_collision_slides_along(steering_rad: float, 
     assert truth.progress_m > 80.0
 
 
-def test_a_rail_costs_speed() -> None:
-    """Pressed against the rail the car is slower than one that drives free for as long with the same throttle."""
-    pressed, _, _ = into_the_rail(-0.03, 10.0)
-    free, events, _ = into_the_rail(0.0, 10.0)
+def test_a_rail_slows_the_car() -> None:
+    """A car pressed against a rail is slower than a free car with the same throttle."""
+    pressed, _, _ = drive_into_the_rail(-0.03, 10.0)
+    free, events, _ = drive_into_the_rail(0.0, 10.0)
     assert "collision" not in {event.kind for event in events}
     assert pressed.state().speed_mps < 0.8 * free.state().speed_mps
 
 
-def test_a_crash_at_a_large_angle_stops_a_car_that_goes_on() -> None:
-    """At 45 degrees into the barrier hardly any speed is left, and the car does not bounce back."""
-    simulator, events, _ = into_the_rail(0.4, 8.0)
+def test_a_crash_at_a_large_angle_stops_the_car() -> None:
+    """A car that hits the barrier at 45 degrees loses nearly all speed and does not bounce back."""
+    simulator, events, _ = drive_into_the_rail(0.4, 8.0)
     assert "collision" in {event.kind for event in events}
     assert 0.0 <= simulator.state().speed_mps < 0.3
 
 
-def test_a_car_that_runs_against_the_end_of_a_rail_stops_before_it() -> None:
-    """It meets the end with its front, stays where it is across the road, and never jumps; that is one collision."""
+def test_a_car_that_hits_the_end_of_a_rail_stops_before_it() -> None:
+    """A car that hits a rail's end with its front stops there without a jump; that is one collision."""
     road = parse_road(RAIL_AHEAD, source="x")
-    simulator = Simulator(road=road, seed=1, start_mono_ns=0, goes_on=True)
+    simulator = Simulator(road=road, seed=1, start_mono_ns=0, continue_after_collision=True)
     simulator.apply(Actuation(0.0, 0.6, 0.0), 0)
     events, steps_m, before = [], [], simulator.pose()
     for _ in range(240 * 12):

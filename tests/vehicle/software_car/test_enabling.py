@@ -1,94 +1,96 @@
+"""Enabling the axes of a kit, and commands of enabled axes."""
+
 import pytest
-from tests.vehicle.software_car.rig import ALL, Asked, Hand2, Rig, both, driving, with_crc
+from tests.vehicle.software_car.rig import ALL, CommandValues, KitRig, Sender2, both, driving, with_crc
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import ReleaseReason, SystemState
 
 
 def test_generation_1_enables_each_axis_by_its_own_bit() -> None:
-    """In generation 1 an axis obeys from its first command with EN on, and no other axis does."""
-    rig = Rig(1)
-    steering, _, _ = rig.hand.commands(Asked(angle_deg=10.0))
+    """In generation 1 each axis is enabled by its own command with EN, independently of the others."""
+    rig = KitRig(1)
+    steering, _, _ = rig.sender.commands(CommandValues(angle_deg=10.0))
     assert rig.enabled() == set()
     rig.send(steering)
     assert rig.enabled() == {"steering"}
 
 
-def test_generation_2_enables_when_requested_and_all_axes_are_commanded() -> None:
-    """In generation 2 nothing obeys until the system is asked to enable and every axis is commanded with EN on."""
-    rig = Rig(2)
+def test_generation_2_needs_a_request_and_commands_to_all_axes() -> None:
+    """In generation 2 no axis is enabled until the system is requested to enable and all axes are commanded with EN."""
+    rig = KitRig(2)
     rig.command()
     assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
-    rig.ask()
+    rig.request_system()
     assert (rig.enabled(), rig.kit.state.system) == (ALL, SystemState.ACTIVE)
-    other = Rig(2)
-    other.ask()
-    steering, brake, throttle = other.hand.commands(Asked())
+    other = KitRig(2)
+    other.request_system()
+    steering, brake, throttle = other.sender.commands(CommandValues())
     other.send(steering, brake)
     assert other.enabled() == set()
     other.send(throttle)
     assert other.enabled() == ALL
 
 
-def test_generation_2_forgets_a_request_to_enable_after_100_ms() -> None:
-    """A request to enable holds for 100 ms: commands that come later enable nothing."""
+def test_a_request_to_enable_expires() -> None:
+    """A request to enable expires after 100 ms: later commands enable nothing."""
     for wait_ms, enabled in ((99.999, ALL), (100, set())):
-        rig = Rig(2)
-        rig.ask()
+        rig = KitRig(2)
+        rig.request_system()
         rig.wait_ms(wait_ms)
         rig.command()
         assert rig.enabled() == enabled
 
 
 @both
-def test_disabling_in_park_is_quiet(generation: int) -> None:
-    """Who disables the kit in park at standstill gets it disabled, with no brake of the watchdog's."""
-    rig = Rig(generation)
+def test_disabling_in_park_does_not_trip(generation: int) -> None:
+    """Disabling the kit in park at standstill does not trip the watchdog."""
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
-    rig.ask(2)
+    rig.request_system(2)
     rig.command(enable=False)
     state = rig.kit.state
     assert (rig.enabled(), state.watchdog, state.watchdog_brakes) == (set(), ReleaseReason.NONE, False)
 
 
-def test_generation_2_has_to_be_requested_anew() -> None:
-    """Once the kit has let go, requests that were coming all along do not enable it: they have to begin anew."""
+def test_generation_2_needs_a_new_request() -> None:
+    """After the kit has disengaged, continuing requests do not enable it: they must stop and begin again."""
     rig = driving(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    rig.ask()
+    rig.request_system()
     rig.command(clear=True)
-    rig.ask()
+    rig.request_system()
     assert (rig.enabled(), rig.kit.state.system) == (set(), SystemState.READY)
-    rig.ask(2)
-    rig.ask()
+    rig.request_system(2)
+    rig.request_system()
     assert rig.enabled() == ALL
 
 
 def test_only_the_chosen_set_is_accepted() -> None:
-    """A kit that obeys the remote's set does not hear the user's, and the other way round."""
-    rig = Rig(2)
-    rig.hand = Hand2(0x210)
+    """A kit accepts commands of its own set only, remote or user."""
+    rig = KitRig(2)
+    rig.sender = Sender2(0x210)
     rig.command()
-    rig.ask()
+    rig.request_system()
     assert rig.enabled() == set()
-    user = Rig(2, commands="user")
-    user.hand = Hand2(0x210)
+    user = KitRig(2, commands="user")
+    user.sender = Sender2(0x210)
     user.enable()
     assert user.enabled() == ALL
 
 
 @both
 def test_commands_reach_the_wheels(generation: int) -> None:
-    """Angle, throttle and brake of a command reach the wheels as they were asked for."""
+    """Angle, throttle and brake of a command reach the wheels unchanged."""
     rig = driving(generation)
     rig.drive_ms(1000, angle_deg=-123.4, throttle=0.3, brake=0.2)
     assert rig.wheels() == (-123.4, 0.3, 0.2)
 
 
 @both
-def test_the_wheel_turns_no_faster_than_requested(generation: int) -> None:
-    """At 25 steps, 100 deg/s, the wheel is at 10 degrees after 100 ms; without a rate it turns at 17.5 rad/s."""
+def test_steering_rate(generation: int) -> None:
+    """At 25 steps, 100 deg/s, the wheel turns 10 degrees in 100 ms; without a rate it turns at 17.5 rad/s."""
     rig = driving(generation)
     for _ in range(5):
         rig.command(angle_deg=90.0, rate=25)
@@ -101,22 +103,22 @@ def test_the_wheel_turns_no_faster_than_requested(generation: int) -> None:
 
 
 @both
-def test_the_wheel_begins_where_it_is(generation: int) -> None:
-    """When the kit takes over it turns the wheel from where it is, not from the middle."""
-    rig = Rig(generation)
-    rig.is_moving_at(0.0, steering_rad=0.2)
+def test_steering_starts_at_the_current_angle(generation: int) -> None:
+    """Once enabled, the kit turns the wheel from its current angle, not from the centre."""
+    rig = KitRig(generation)
+    rig.set_motion(0.0, steering_rad=0.2)
     rig.enable()
     assert rig.wheels()[0] == pytest.approx(0.2 * 14.8 * 57.29578)
 
 
 @both
-def test_an_unknown_type_of_command_enables_nothing(generation: int) -> None:
-    """A command of a type that the kit has not is like one without its enable bit."""
-    rig = Rig(generation)
-    rig.ask()
+def test_an_unknown_command_type_enables_nothing(generation: int) -> None:
+    """A command of an unknown type counts as a command without its enable bit."""
+    rig = KitRig(generation)
+    rig.request_system()
     rig.command(angle_deg=1.0)
     assert rig.enabled() == ALL
-    _, brake, _ = rig.hand.commands(Asked(brake=0.5))
+    _, brake, _ = rig.sender.commands(CommandValues(brake=0.5))
     data = bytearray(brake.data)
     data[2] = 7 << 4 if generation == 1 else 1 << 4 | 7
     rig.send(CanFrame(0x060, bytes(data)) if generation == 1 else with_crc(0x201, bytes(data[:-1])))
@@ -136,22 +138,22 @@ def test_an_unknown_type_of_command_enables_nothing(generation: int) -> None:
     ],
 )
 def test_generation_1_types_of_brake_command(kind: int, raw: float, fraction: float) -> None:
-    """Pedal (0.15 to 0.5), percent, torque (of 3412 Nm) and deceleration (of 6 m/s2) give that much brake."""
+    """Brake commands by pedal (0.15 to 0.5), percent, torque (of 3412 Nm) and deceleration (of 6 m/s2) are scaled."""
     rig = driving(1)
-    _, brake, _ = rig.hand.commands(Asked(brake=raw))
+    _, brake, _ = rig.sender.commands(CommandValues(brake=raw))
     data = bytearray(brake.data)
     data[2] = kind << 4
     rig.send(CanFrame(brake.identifier, bytes(data)))
     assert rig.wheels()[2] == pytest.approx(fraction, abs=2e-4)
 
 
-def test_a_request_with_a_counter_heard_before_is_not_heard() -> None:
-    """Generation 2 does not hear a request to the system whose counter is that of the one before."""
-    rig = Rig(2)
+def test_a_repeated_counter_invalidates_a_request() -> None:
+    """Generation 2 ignores a request to the system with the counter of the previous one."""
+    rig = KitRig(2)
     rig.enable()
-    rig.ask()
-    rig.hand.count -= 1
-    rig.ask(2)
+    rig.request_system()
+    rig.sender.count -= 1
+    rig.request_system(2)
     assert rig.enabled() == ALL
-    rig.ask(2)
+    rig.request_system(2)
     assert rig.enabled() == set()

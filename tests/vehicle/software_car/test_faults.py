@@ -1,5 +1,7 @@
+"""Faults of a kit, conditions that inhibit it, and loss of the bus."""
+
 import pytest
-from tests.vehicle.software_car.rig import ALL, Rig, both, driving
+from tests.vehicle.software_car.rig import ALL, KitRig, both, driving
 
 from lavt.errors import UserError
 from lavt.vehicle.software_car.authority import WATCHDOG_BRAKE
@@ -17,20 +19,20 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
-def test_a_fault_lets_go_and_brakes(generation: int, name: str) -> None:
-    """A part that breaks while it is driven lets everything go, and the kit brakes."""
+def test_a_fault_disengages_and_brakes(generation: int, name: str) -> None:
+    """A fault while driving makes the kit release all axes and brake."""
     rig = driving(generation)
     rig.kit.set_fault(name, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.watchdog, rig.wheels()[2]) == (set(), ReleaseReason.FAULT, WATCHDOG_BRAKE)
 
 
 @pytest.mark.parametrize(("generation", "name"), FAULTS)
-def test_what_is_broken_is_not_enabled(generation: int, name: str) -> None:
-    """A part that is broken is not enabled, and generation 2 not at all; once it is mended it is."""
-    rig = Rig(generation)
+def test_a_faulty_axis_is_not_enabled(generation: int, name: str) -> None:
+    """A part with a fault is not enabled, and generation 2 not at all; clearing the fault allows it again."""
+    rig = KitRig(generation)
     rig.kit.set_fault(name, rig.now_ns)
     rig.command()
-    rig.ask()
+    rig.request_system()
     assert rig.enabled() == (set() if generation == 2 else ALL - {name.split(".", maxsplit=1)[0]})
     rig.kit.set_fault(name, rig.now_ns, is_set=False)
     rig.command()
@@ -48,11 +50,11 @@ def test_what_is_broken_is_not_enabled(generation: int, name: str) -> None:
     ],
 )
 def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
-    """Belt, door and lockouts keep generation 2 in manual, and it says why; while driving it lets go and brakes."""
-    rig = Rig(2)
+    """Belt, door and lockouts keep generation 2 in manual, with the reason; while driving it disengages and brakes."""
+    rig = KitRig(2)
     rig.kit.inhibit(name, rig.now_ns)
     rig.command()
-    rig.ask()
+    rig.request_system()
     assert (rig.enabled(), rig.kit.state.system, rig.kit.state.not_ready) == (set(), SystemState.MANUAL, reason)
     rig.kit.inhibit(None, rig.now_ns)
     assert rig.enabled() == ALL
@@ -62,34 +64,34 @@ def test_what_inhibits_generation_2(name: str, reason: ReleaseReason) -> None:
 
 @pytest.mark.parametrize("remote_state", [0, 1])
 def test_the_remotes_switch(remote_state: int) -> None:
-    """At emergency stop or pause generation 2 lets go and brakes, and is not ready."""
+    """At emergency stop or pause generation 2 disengages and brakes, and is not ready."""
     rig = driving(2)
     rig.kit.switch_remote(remote_state, rig.now_ns)
     assert (rig.enabled(), rig.wheels()[2], rig.kit.state.watchdog) == (set(), WATCHDOG_BRAKE, ReleaseReason.REMOTE)
 
 
 @both
-def test_bus_off_is_silence(generation: int) -> None:
-    """Cut from the bus the kit says and hears nothing, so commands time out and it brakes; back on it, it talks."""
+def test_bus_off(generation: int) -> None:
+    """Off the bus the kit sends and receives nothing, so that commands time out; back on the bus it sends again."""
     rig = driving(generation)
     rig.wait_ms(20)
-    rig.kit.bus_off(rig.now_ns)
+    rig.kit.set_bus_off(rig.now_ns)
     rig.last.clear()
     rig.drive_ms(80, throttle=0.5)
     assert rig.last == {}
     assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.TIMEOUT)
-    rig.kit.bus_off(rig.now_ns, is_off=False)
+    rig.kit.set_bus_off(rig.now_ns, is_off=False)
     rig.wait_ms(100)
     assert len(rig.last) == (5 if generation == 1 else 8)
 
 
 @both
 def test_unknown_names_are_rejected(generation: int) -> None:
-    """A fault, hindrance, value or gear that there is not is refused in a sentence that names the known ones."""
-    kit = Rig(generation).kit
+    """An unknown fault, inhibit reason, value or gear is rejected with the known ones."""
+    kit = KitRig(generation).kit
     with pytest.raises(UserError, match=r"no fault 'brake\.smoke': the known ones are brake"):
         kit.set_fault("brake.smoke", 10**12)
-    with pytest.raises(UserError, match="no hindrance 'rain'"):
+    with pytest.raises(UserError, match=r"'rain': the known ones are acceleration"):
         kit.inhibit("rain", 10**12)
     with pytest.raises(UserError, match="no value that can be unknown 'mood'"):
         kit.set_unknown("mood")

@@ -1,3 +1,5 @@
+"""Encoding and decoding of the kit's frames."""
+
 import ast
 from pathlib import Path
 
@@ -9,7 +11,7 @@ from tests.vehicle.software_car.rig import START_NS, crc_by_division
 import lavt.vehicle.software_car as package
 from lavt.domain import NS_PER_MS
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import Field, Layout, checksum, crc8, has_crc, pack, unpack
+from lavt.vehicle.software_car.frames import BitField, Layout, checksum, crc8, has_valid_crc, pack, unpack
 from lavt.vehicle.software_car.generation_1 import BRAKE_REPORT, STEERING_REPORT
 from lavt.vehicle.software_car.generation_2_layouts import REPORT_LAYOUTS, UNVERIFIED
 from lavt.vehicle.software_car.kit import Kit
@@ -20,45 +22,45 @@ identifiers = st.sampled_from(COMMANDS) | st.integers(0, 0x7FF)
 
 
 @pytest.mark.parametrize(("data", "crc"), [(b"", 0x00), (b"0", 0x71), (b"01", 0x28), (b"012", 0x24), (LETTERS, 0xA3)])
-def test_the_crc_is_the_notes(data: bytes, crc: int) -> None:
-    """The CRC gives what the notes on CAN have for their strings."""
+def test_the_crc_matches_the_facts(data: bytes, crc: int) -> None:
+    """The CRC of the strings in the facts is as given there."""
     assert crc8(data) == crc
 
 
 def test_the_checksum_begins_with_the_identifier() -> None:
-    """Identifier 0 without data has checksum 0xBE, and 0x59 when it is an extended one."""
+    """The checksum covers the identifier: that of identifier 0 without data is 0xBE, and 0x59 if it is extended."""
     assert (checksum(0, b""), checksum(0, b"", is_extended=True)) == (0xBE, 0x59)
 
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=7))
-def test_the_checksum_is_a_remainder(identifier: int, data: bytes) -> None:
-    """The checksum is the remainder of a long division, and one turned bit of the data gives another."""
+def test_the_checksum_detects_a_flipped_bit(identifier: int, data: bytes) -> None:
+    """The checksum is the remainder of a long division, and detects each flipped bit of the data."""
     crc = crc_by_division(identifier, data)
     assert checksum(identifier, data) == crc
-    assert has_crc(CanFrame(identifier, data + bytes([crc])))
+    assert has_valid_crc(CanFrame(identifier, data + bytes([crc])))
     for bit in range(8 * len(data)):
-        turned = bytes(byte ^ (1 << bit % 8 if index == bit // 8 else 0) for index, byte in enumerate(data))
-        assert not has_crc(CanFrame(identifier, turned + bytes([crc])))
+        flipped = bytes(byte ^ (1 << bit % 8 if index == bit // 8 else 0) for index, byte in enumerate(data))
+        assert not has_valid_crc(CanFrame(identifier, flipped + bytes([crc])))
 
 
 @given(st.data())
-def test_what_is_packed_is_unpacked(data: st.DataObject) -> None:
-    """Numbers in range come out of every report's layout as they went in."""
+def test_unpack_inverts_pack(data: st.DataObject) -> None:
+    """Values in range are unchanged by packing and unpacking, for every report's layout."""
     layout = data.draw(st.sampled_from([BRAKE_REPORT, STEERING_REPORT, *REPORT_LAYOUTS.values()]))
     values = {field.name: data.draw(st.integers(field.least, field.most)) for field in layout.fields}
     assert unpack(layout, pack(layout, values)) == values
 
 
-def test_a_number_out_of_range_becomes_the_nearest() -> None:
-    """A number too great for its bits spoils no other field."""
-    layout = Layout(2, (Field("low", 0, 4), Field("signed", 4, 4, is_signed=True), Field("high", 8, 8)))
+def test_values_out_of_range_are_clamped() -> None:
+    """A value that does not fit its field is clamped and changes no other field."""
+    layout = Layout(2, (BitField("low", 0, 4), BitField("signed", 4, 4, is_signed=True), BitField("high", 8, 8)))
     assert pack(layout, {"low": 99, "signed": -99, "high": 300}) == bytes([0x8F, 0xFF])
     with pytest.raises(KeyError, match="other"):
         pack(layout, {"other": 1})
 
 
-def test_no_fields_lie_on_each_other() -> None:
-    """In every report each bit belongs to one field, and none to the checksum's byte."""
+def test_fields_do_not_overlap() -> None:
+    """In every report no two fields overlap, and none overlaps the checksum."""
     for identifier, layout in REPORT_LAYOUTS.items():
         bits = [bit for field in layout.fields for bit in range(field.bit, field.bit + field.width)]
         assert len(bits) == len(set(bits))
@@ -71,12 +73,12 @@ def test_no_fields_lie_on_each_other() -> None:
     frames=st.lists(st.tuples(identifiers, st.binary(max_size=8), st.booleans(), st.integers(0, 30)), max_size=40),
 )
 def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, bytes, bool, int]]) -> None:
-    """Whatever is on the bus, nothing raises, and without a right checksum or an enable bit nothing is enabled."""
+    """Any frames raise nothing, and enable nothing without a right checksum or an enable bit."""
     kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
     now_ns = START_NS
     for identifier, data, is_extended, wait_ms in frames:
         frame = CanFrame(identifier, data, is_extended)
-        if generation == 2 and has_crc(frame):
+        if generation == 2 and has_valid_crc(frame):
             continue
         enable_byte = {0x060: 3, 0x062: 3, 0x064: 2}.get(identifier)
         if generation == 1 and enable_byte is not None and len(data) == 8 and not is_extended:
@@ -94,7 +96,7 @@ def test_random_frames_enable_nothing(generation: int, frames: list[tuple[int, b
     frames=st.lists(st.tuples(identifiers, st.binary(min_size=1, max_size=8), st.integers(0, 60)), max_size=60),
 )
 def test_valid_but_senseless_frames_raise_nothing(generation: int, frames: list[tuple[int, bytes, int]]) -> None:
-    """Frames with right checksums and anything in them raise nothing, and what reaches the wheels stays in range."""
+    """Frames with right checksums and any contents raise nothing, and the actuation stays in range."""
     kit = Kit(1 if generation == 1 else 2, start_ns=START_NS)
     now_ns = START_NS
     for identifier, data, wait_ms in frames:

@@ -1,8 +1,18 @@
+"""Reports of a kit: their periods and their contents."""
+
 import math
 import struct
 
 import pytest
-from tests.vehicle.software_car.rig import START_NS, Asked, Rig, both, crc_by_division, driving, with_crc_broken
+from tests.vehicle.software_car.rig import (
+    START_NS,
+    CommandValues,
+    KitRig,
+    both,
+    crc_by_division,
+    driving,
+    with_crc_broken,
+)
 
 from lavt.domain import NS_PER_MS
 
@@ -12,8 +22,8 @@ PERIODS_MS = {
 }
 
 
-def reports(rig: Rig) -> dict[int, bytes]:
-    """The newest of each report, 1 ms after a whole period of all."""
+def reports(rig: KitRig) -> dict[int, bytes]:
+    """Return the newest reports after all periods have passed."""
     rig.last.clear()
     for _ in range(10):
         rig.wait_ms(10)
@@ -24,8 +34,8 @@ def reports(rig: Rig) -> dict[int, bytes]:
 
 @both
 def test_reports_have_their_periods(generation: int) -> None:
-    """Over one second each report leaves once in each of its periods, to the nanosecond."""
-    kit = Rig(generation).kit
+    """Each report is sent once per period, exact to the nanosecond."""
+    kit = KitRig(generation).kit
     times: dict[int, list[int]] = {identifier: [] for identifier in PERIODS_MS[generation]}
     while (wake_ns := kit.next_wake_ns()) <= START_NS + 1000 * NS_PER_MS:
         for frame in kit.frames_due(wake_ns):
@@ -35,9 +45,9 @@ def test_reports_have_their_periods(generation: int) -> None:
 
 
 @both
-def test_a_late_call_gets_each_report_once(generation: int) -> None:
-    """Who asks after a second gets one of each report, and the next ones when they would have been due anyway."""
-    kit = Rig(generation).kit
+def test_a_late_call_returns_each_report_once(generation: int) -> None:
+    """A call that is one second late returns each report once, and the next ones at their regular times."""
+    kit = KitRig(generation).kit
     late_ns = START_NS + 1_003 * NS_PER_MS
     assert sorted(frame.identifier for frame in kit.frames_due(late_ns)) == sorted(PERIODS_MS[generation])
     assert kit.frames_due(late_ns) == []
@@ -45,45 +55,45 @@ def test_a_late_call_gets_each_report_once(generation: int) -> None:
 
 
 def test_generation_1_reports_of_a_drive() -> None:
-    """Reports tell angle, command, speed, torque, the pedals' input, command and output, the gear, and ENABLED."""
+    """Reports contain angle, command, speed, torque, the pedals' input, command and output, the gear, and ENABLED."""
     rig = driving(1)
     rig.command(angle_deg=-45.0)
-    rig.is_moving_at(10.0, steering_rad=math.radians(10.0))
+    rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
-    told = reports(rig)
-    assert told[0x065] == struct.pack("<hHhbB", 1480, -450 & 0x7FFF, 3600, -24, 0b00000001)
-    assert told[0x061] == struct.pack("<HHHBB", 0, 8192, 8192, 0, 0b00000001)
-    assert told[0x063] == struct.pack("<HHHBB", 0, 16384, 16384, 0, 0b00000001)
-    assert told[0x067] == bytes([4 | 4 << 4, 0x80])
-    assert told[0x06A] == struct.pack("<4h", 3030, 3030, 3030, 3030)
+    found = reports(rig)
+    assert found[0x065] == struct.pack("<hHhbB", 1480, -450 & 0x7FFF, 3600, -24, 0b00000001)
+    assert found[0x061] == struct.pack("<HHHBB", 0, 8192, 8192, 0, 0b00000001)
+    assert found[0x063] == struct.pack("<HHHBB", 0, 16384, 16384, 0, 0b00000001)
+    assert found[0x067] == bytes([4 | 4 << 4, 0x80])
+    assert found[0x06A] == struct.pack("<4h", 3030, 3030, 3030, 3030)
 
 
 def test_generation_2_reports_of_a_drive() -> None:
-    """The same in generation 2: active, ready and enabled, each report with its counter and checksum."""
+    """In generation 2 the reports contain the same, with the state active, a counter and a checksum."""
     rig = driving(2)
     rig.command(angle_deg=-45.0)
-    rig.is_moving_at(10.0, steering_rad=math.radians(10.0))
+    rig.set_motion(10.0, steering_rad=math.radians(10.0))
     rig.kit.driver_steers(-1.5, rig.now_ns)
-    told = reports(rig)
+    found = reports(rig)
     flags = 0b10_0000_0011
-    assert told[0x100][:6] == struct.pack("<HHBB", 1480, -450 & 0x3FFF, -24 & 0xFF, flags & 0xFF)
-    assert told[0x100][6] & 0x0F == flags >> 8
-    assert int.from_bytes(told[0x101][:5], "little") == 0 | 500 << 12 | 500 << 24
-    assert int.from_bytes(told[0x102][:5], "little") == 0 | 1000 << 12 | 1000 << 24
-    assert told[0x103][0] == 4 | 4 << 4
-    assert told[0x106][:3] == bytes([2 | 2 << 4, 0, 0])
-    assert told[0x107][:4] == struct.pack("<hh", 3600, 3600)
-    assert told[0x2A4] == struct.pack("<4h", 3030, 3030, 3030, 3030)
-    assert told[0x2D8][0] == 2 << 4
-    for identifier in set(told) - {0x2A4}:
-        assert told[identifier][7] == crc_by_division(identifier, told[identifier][:7])
-    before = told[0x100][6] >> 4
+    assert found[0x100][:6] == struct.pack("<HHBB", 1480, -450 & 0x3FFF, -24 & 0xFF, flags & 0xFF)
+    assert found[0x100][6] & 0x0F == flags >> 8
+    assert int.from_bytes(found[0x101][:5], "little") == 0 | 500 << 12 | 500 << 24
+    assert int.from_bytes(found[0x102][:5], "little") == 0 | 1000 << 12 | 1000 << 24
+    assert found[0x103][0] == 4 | 4 << 4
+    assert found[0x106][:3] == bytes([2 | 2 << 4, 0, 0])
+    assert found[0x107][:4] == struct.pack("<hh", 3600, 3600)
+    assert found[0x2A4] == struct.pack("<4h", 3030, 3030, 3030, 3030)
+    assert found[0x2D8][0] == 2 << 4
+    for identifier in set(found) - {0x2A4}:
+        assert found[identifier][7] == crc_by_division(identifier, found[identifier][:7])
+    before = found[0x100][6] >> 4
     rig.wait_ms(10)
     assert rig.last[0x100][6] >> 4 == (before + 1) % 16
 
 
-def test_generation_1_tells_of_a_time_out() -> None:
-    """After a time-out every axis has TMOUT and FLTWDC, not ENABLED, and the brake tells of the watchdog."""
+def test_generation_1_reports_a_timeout() -> None:
+    """After a timeout every axis reports TMOUT and FLTWDC, not ENABLED, and the brake reports the watchdog."""
     rig = driving(1)
     rig.last.clear()
     for _ in range(20):
@@ -94,15 +104,15 @@ def test_generation_1_tells_of_a_time_out() -> None:
     assert struct.unpack_from("<H", rig.last[0x061], 4) == (32768,)
 
 
-def test_generation_1_tells_of_the_driver() -> None:
-    """OVERRIDE stays on after the driver's foot has gone, DRIVER and the pedal are as the foot is."""
+def test_generation_1_reports_an_override() -> None:
+    """OVERRIDE remains after the driver has released the pedal; DRIVER and the input follow the pedal."""
     rig = driving(1)
     rig.kit.driver_brakes(1.0, rig.now_ns)
-    told = reports(rig)
-    assert (told[0x061][7], told[0x061][:2]) == (0b00000110, b"\xff\xff")
+    found = reports(rig)
+    assert (found[0x061][7], found[0x061][:2]) == (0b00000110, b"\xff\xff")
     rig.kit.driver_brakes(0.0, rig.now_ns)
-    told = reports(rig)
-    assert (told[0x061][7], told[0x061][:2]) == (0b00000010, b"\x00\x00")
+    found = reports(rig)
+    assert (found[0x061][7], found[0x061][:2]) == (0b00000010, b"\x00\x00")
 
 
 @pytest.mark.parametrize(
@@ -126,27 +136,27 @@ def test_generation_1_tells_of_the_driver() -> None:
     ],
 )
 def test_faults_have_their_bits(name: str, identifier: int, byte: int, bit: int) -> None:
-    """A fault is told by its bit and by nobody else's."""
-    rig = Rig(1 if identifier < 0x100 else 2)
+    """A fault sets exactly its own bit."""
+    rig = KitRig(1 if identifier < 0x100 else 2)
     before = dict(reports(rig))[identifier]
     rig.kit.set_fault(name, rig.now_ns)
-    turned = [index ^ after for index, after in zip(before, dict(reports(rig))[identifier], strict=True)]
+    changed = [index ^ after for index, after in zip(before, dict(reports(rig))[identifier], strict=True)]
     ready = 1 if identifier >= 0x100 else 0
     expected = [0] * len(before)
     expected[byte] = 1 << bit | ready
     if identifier == 0x067:
         expected[1] = 0x80  # not ready
-    assert turned[:6] == expected[:6]
+    assert changed[:6] == expected[:6]
     if identifier < 0x100:
-        assert turned == expected
+        assert changed == expected
 
 
-def test_generation_2_tells_why_it_let_go() -> None:
-    """Time-out, wrong checksum, stuck counter and override have their states, reasons and bits."""
-    told = {}
+def test_generation_2_reports_why_it_disengaged() -> None:
+    """Timeout, wrong checksum, repeated counter and override are reported by state, reason and bits."""
+    found = {}
     for name, reason in (("timeout", 1), ("crc", 2), ("counter", 3), ("override", 4)):
         rig = driving(2)
-        frames = rig.hand.commands(Asked())
+        frames = rig.sender.commands(CommandValues())
         if name == "crc":
             rig.send(with_crc_broken(frames[0]))
         elif name == "counter":
@@ -157,9 +167,9 @@ def test_generation_2_tells_why_it_let_go() -> None:
             rig.wait_ms(10)
         state = 0 if name == "override" else 7
         assert rig.last[0x106][:3] == bytes([state | 2 << 4, reason, reason])
-        told[name] = rig.last[0x100][5] | (rig.last[0x100][6] & 0x0F) << 8
+        found[name] = rig.last[0x100][5] | (rig.last[0x100][6] & 0x0F) << 8
     ready, timeout, bad_crc, bad_rc, active, latched = 1, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 8
-    assert told == {
+    assert found == {
         "timeout": ready | timeout,
         "crc": ready | timeout | bad_crc,
         "counter": ready | timeout | bad_rc,
@@ -167,32 +177,32 @@ def test_generation_2_tells_why_it_let_go() -> None:
     }
 
 
-def test_override_of_another_axis_is_told() -> None:
-    """Generation 2's axes tell that another axis is overridden."""
+def test_generation_2_reports_an_override_of_another_axis() -> None:
+    """In generation 2 each axis reports that another one is overridden."""
     rig = driving(2)
     rig.kit.driver_brakes(0.5, rig.now_ns)
-    told = reports(rig)
+    found = reports(rig)
     other, latched = 1 << 7, 1
-    assert (told[0x100][5] & other, told[0x102][5] & other, told[0x101][5] & other) == (other, other, 0)
-    assert (told[0x100][6] & latched, told[0x101][6] & latched) == (0, latched)
+    assert (found[0x100][5] & other, found[0x102][5] & other, found[0x101][5] & other) == (other, other, 0)
+    assert (found[0x100][6] & latched, found[0x101][6] & latched) == (0, latched)
 
 
-def test_what_is_unknown_is_told_as_unknown() -> None:
-    """An unknown angle, speed or wheel speed is 0x8000 (generation 1), also in the i16 of generation 2."""
-    rig = Rig(1)
+def test_unknown_values() -> None:
+    """An unknown angle, speed or wheel speed is reported as 0x8000."""
+    rig = KitRig(1)
     for name in ("angle", "speed", "wheel_speed"):
         rig.kit.set_unknown(name)
-    told = reports(rig)
-    assert (told[0x065][0:2], told[0x065][4:6], told[0x06A]) == (b"\x00\x80", b"\x00\x80", b"\x00\x80" * 4)
+    found = reports(rig)
+    assert (found[0x065][0:2], found[0x065][4:6], found[0x06A]) == (b"\x00\x80", b"\x00\x80", b"\x00\x80" * 4)
     rig.kit.set_unknown("speed", is_unknown=False)
     assert reports(rig)[0x065][4:6] == b"\x00\x00"
-    second = Rig(2)
+    second = KitRig(2)
     second.kit.set_unknown("speed")
     assert reports(second)[0x107][:4] == b"\x00\x80\x00\x80"
 
 
-def test_a_rejected_gear_is_told() -> None:
-    """Generation 1 tells the refusal: 5, press the brake."""
-    rig = Rig(1)
-    rig.send(rig.hand.gear(4))
+def test_a_rejected_gear_is_reported() -> None:
+    """Generation 1 reports the reason of a rejected gear: 5, press the brake."""
+    rig = KitRig(1)
+    rig.send(rig.sender.gear(4))
     assert reports(rig)[0x067] == bytes([1 | 4 << 4, 5 | 0x80])

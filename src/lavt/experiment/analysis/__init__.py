@@ -1,1 +1,1 @@
-"""What is computed from the records of one run."""
+"""The analysis of one run's records: clock offset, latencies, lane keeping, validity and `result.json`."""

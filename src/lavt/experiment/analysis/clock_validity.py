@@ -1,35 +1,35 @@
-"""What the clocks have against a run: one reason for one cause, so that what follows from it is not told beside it."""
+"""Reasons from the clocks for which a run is invalid: one reason per cause, without its consequences."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.analysis.clock_offset import follows
+from lavt.experiment.analysis.clock_offset import follows_peer
 from lavt.experiment.analysis.clocks import MARGIN_NS, PROBE, SAME_KERNEL, RunClocks, drive_on_client
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, IntArray, Table
 
 STEP_LIMIT_MS = 5.0
-"""A wall clock that moves this much against the monotonic clock between two samples was set. Steering, however fast,
-moves both (clock_gettime(2)), and is no step."""
+"""A wall clock that moves this much relative to the monotonic clock between two samples was set. Steering, however
+fast, moves both (clock_gettime(2)) and is not a step."""
 POLL_LIMIT_S = 2.5
-"""Clocks are sampled every second: one sample may be late or missing, and no more."""
+"""Clocks are sampled every second: at most one sample may be late or missing."""
 CLOCK_BOUND_LIMIT_MS = 2.0
-"""Beyond this the split of the loop into tau_v and tau_c says too little."""
+"""With a larger bound, the split of the loop latency into tau_v and tau_c is too uncertain."""
 PATH_LIMIT_MS = 1.0
-"""How much longer than the probe's NTP's round trip may be before its path is not the probe's."""
+"""With a round trip this much longer than the probe's, NTP does not take the probe's path."""
 STILL_LIMIT_POLLS = 5
-"""So many polls without a good sample, and chrony only extrapolates."""
+"""After this many polls without a good sample, chrony only extrapolates."""
 STILL_LEAST_S = 5.0
-"""Shorter than this it may, however often it polls: a busy machine loses some samples of many."""
+"""A shorter time without a good sample is accepted at any poll interval: a busy machine loses some of many samples."""
 
 Sides = tuple[tuple[str, Table, Table, IntArray], ...]
-"""Name of a side, its samples, the other side's, and beginning and end of the drive on its wall clock."""
+"""For each side: name, its clock samples, the other side's, and start and end of the drive on its wall clock."""
 
 
 def step_reasons(server: Record, client: Record, clocks: RunClocks, began_ns: int, ended_ns: int) -> list[str]:
-    """Tell of wall clocks that were set near the drive; two sides on one kernel have one clock."""
+    """Return a reason for each wall clock that was set near the drive; two sides on one kernel share one clock."""
     found = {
         "server": _step_ms(server.table("clock"), (began_ns, ended_ns)),
         "client": _step_ms(client.table("clock"), drive_on_client(server, client, began_ns, ended_ns)),
@@ -50,9 +50,9 @@ def _step_ms(samples: Table, drive_ns: tuple[int, int]) -> float | None:
 
 
 def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -> list[str]:
-    """Look for samples of the clocks that are missing: without them the offset is only guessed.
+    """Return a reason for each side that lacks clock samples between the start and the end of the drive.
 
-    On both sides they must follow each other from the drive's beginning to its end.
+    Without them the clock offset is only a guess.
     """
     if began_ns > ended_ns:
         return []
@@ -75,41 +75,41 @@ def poll_reasons(server: Record, client: Record, began_ns: int, ended_ns: int) -
         if gap_ns > limit_ns
     ]
     near_ns = client_ns[(client_ns > client_began_ns - limit_ns) & (client_ns < client_ended_ns + limit_ns)]
-    whole = len(client_ns) and client_ns[0] - client_began_ns <= limit_ns >= client_ended_ns - client_ns[-1]
-    if not whole:
+    is_covered = len(client_ns) and client_ns[0] - client_began_ns <= limit_ns >= client_ended_ns - client_ns[-1]
+    if not is_covered:
         covered_s, drive_s = (int(np.ptp(near_ns)) if len(near_ns) else 0) / NS_PER_S, (ended_ns - began_ns) / NS_PER_S
-        reasons.append(f"the clock samples of the client reach over {covered_s:.1f} s of a drive of {drive_s:.1f} s")
+        reasons.append(f"the clock samples of the client cover {covered_s:.1f} s of a drive of {drive_s:.1f} s")
     return reasons
 
 
 def _longest_gap_ns(sampled_ns: IntArray, began_ns: int, ended_ns: int) -> int:
-    """For how long, between two samples, there was none while it was driven."""
+    """Return the longest time between two samples that overlaps the drive."""
     in_drive = (sampled_ns[1:] > began_ns) & (sampled_ns[:-1] < ended_ns)
     return int(np.max(np.diff(sampled_ns)[in_drive], initial=0))
 
 
 def _sampled_ns(record: Record) -> IntArray:
-    """When a side's clocks were sampled, on its monotonic clock."""
+    """Return the times at which a side's clocks were sampled, on its monotonic clock."""
     mono_ns = record.table("clock").ints("mono_ns")
     return np.sort(mono_ns[mono_ns != MISSING])
 
 
 def offset_reasons(server: Record, client: Record, clocks: RunClocks) -> list[str]:
-    """Tell what is wrong with Delta: an unfit source of time first, and only where there is none what it leads to."""
+    """Return the reasons against Delta: an unfit time source, or else a disagreement, bound or probe that is unfit."""
     if clocks.source == SAME_KERNEL:
         return []
     of_server, of_client = server.table("clock"), client.table("clock")
     if clocks.source is None:
-        said = {side: _status(samples) for side, samples in (("server", of_server), ("client", of_client))}
-        words = ", ".join(f"{side}: {status}" for side, status in said.items())
-        return [f"the offset between the clocks is not known ({words}), and the probe had no answer"]
+        sides = (("server", of_server), ("client", of_client))
+        statuses = ", ".join(f"{side}: {_last_status(samples)}" for side, samples in sides)
+        return [f"the offset between the clocks is not known ({statuses}), and the probe had no answer"]
     unfit = [] if clocks.source == PROBE else _source_reasons(of_server, of_client, clocks)
     return unfit or _agreement_reasons(clocks) or _bound_reasons(clocks) or _unchecked_reasons(clocks)
 
 
-def _status(samples: Table) -> str:
-    said = [status for status in samples.texts("status") if status]
-    return said[-1] if said else "no sample that can be used"
+def _last_status(samples: Table) -> str:
+    statuses = [status for status in samples.texts("status") if status]
+    return statuses[-1] if statuses else "no usable sample"
 
 
 def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> list[str]:
@@ -117,7 +117,7 @@ def _source_reasons(of_server: Table, of_client: Table, clocks: RunClocks) -> li
         ("client", of_client, of_server, clocks.client_wall_ns),
         ("server", of_server, of_client, clocks.server_wall_ns),
     )
-    reasons = [reason for look in (_path_reasons, _still_reasons) for reason in look(sides, clocks)]
+    reasons = [*_path_reasons(sides, clocks), *_still_reasons(sides)]
     masters = {name for samples in (of_server, of_client) for name in _grandmasters(samples)}
     if len(masters) > 1:
         reasons.append(f"the hosts follow different PTP grandmasters: {' and '.join(sorted(masters))}")
@@ -130,13 +130,13 @@ def _grandmasters(samples: Table) -> set[str]:
 
 
 def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
-    """Compare the shortest round trips of NTP and of the probe during the drive, where one host follows the other.
+    """Return a reason where NTP's shortest round trip between the hosts during the drive is longer than the probe's.
 
-    A busy machine makes some of them longer, injected delay all of them.
+    A busy machine delays some exchanges, an injected delay all of them.
     """
     reasons = []
     for side, samples, other, drive_ns in sides:
-        followed = _during(samples.where(follows(samples, other)), drive_ns)
+        followed = _during(samples.where(follows_peer(samples, other)), drive_ns)
         delays_ms = followed.floats("peer_delay_s") * 1e3
         delays_ms = delays_ms[np.isfinite(delays_ms)]
         if len(delays_ms) == 0 or len(clocks.probed) == 0:
@@ -150,8 +150,8 @@ def _path_reasons(sides: Sides, clocks: RunClocks) -> list[str]:
     return reasons
 
 
-def _still_reasons(sides: Sides, _clocks: RunClocks) -> list[str]:
-    """Look for a time that touches the drive in which NTP's samples came to nothing, or came no more."""
+def _still_reasons(sides: Sides) -> list[str]:
+    """Return a reason for each side where NTP accepted no sample for too long, in a time that overlaps the drive."""
     reasons = []
     for side, samples, _, drive_ns in sides:
         still = _longest_still_s(samples, drive_ns)
@@ -159,13 +159,13 @@ def _still_reasons(sides: Sides, _clocks: RunClocks) -> list[str]:
             still_s, limit_s = still
             reasons.append(
                 f"the NTP of the {side} accepted no sample for {still_s:.1f} s (limit {STILL_LIMIT_POLLS} polls, "
-                f"{limit_s:.1f} s): its path is lost or was put through injected delay, or the machine is too busy"
+                f"{limit_s:.1f} s): its path is lost or goes through injected delay, or the machine is too busy"
             )
     return reasons
 
 
 def _longest_still_s(samples: Table, drive_ns: IntArray) -> tuple[float, float] | None:
-    """For how long the count of good samples stood still, and for how long it may; None: nowhere too long."""
+    """Return the longest time without a good sample and its limit; None where the limit is met."""
     good = samples.ints("good_samples")
     counted = (good != MISSING) & np.isfinite(samples.floats("poll_s")) & (samples.ints("wall_ns") != MISSING)
     samples, good = samples.where(counted), good[counted]
@@ -202,17 +202,17 @@ def _unchecked_reasons(clocks: RunClocks) -> list[str]:
     if clocks.probe is not None:
         return []
     return [
-        "the probe had no answer during the drive, so that nobody has checked the offset between the clocks: open "
-        "the server's UDP port clock.probe_port"
+        "the probe had no answer during the drive, so the offset between the clocks was not checked: open the server's "
+        "UDP port clock.probe_port"
     ]
 
 
 def _agreement_reasons(clocks: RunClocks) -> list[str]:
-    apart_ms = clocks.disagreement_ms()
-    if apart_ms is None:
+    disagreement_ms = clocks.disagreement_ms()
+    if disagreement_ms is None:
         return []
-    source_ms, probe_ms, allowed_ms = apart_ms
+    source_ms, probe_ms, allowed_ms = disagreement_ms
     return [
         f"{clocks.source} and the probe disagree about the offset between the clocks: {source_ms:.2f} and "
-        f"{probe_ms:.2f} ms, where both bounds together are {allowed_ms:.2f} ms"
+        f"{probe_ms:.2f} ms, although both bounds together are {allowed_ms:.2f} ms"
     ]

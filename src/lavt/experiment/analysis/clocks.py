@@ -1,4 +1,4 @@
-"""Which Delta a run goes by, and what the other opinion on it is."""
+"""The clock offset Delta of a run: the estimate that is used, and the probe's independent estimate."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lavt.experiment.analysis.clock_offset import (
     NO_OFFSET,
     ClockOffset,
     ProbeExchanges,
-    by_probe,
-    by_sources,
-    exchanges,
     known_samples,
+    offset_from_probe,
+    offset_from_sources,
+    probe_exchanges,
 )
 from lavt.experiment.analysis.latency import frames_within, look_up
 from lavt.recording.record import Record
@@ -24,15 +24,15 @@ from lavt.recording.table import MISSING, IntArray, Table
 SAME_KERNEL = "same kernel"
 PROBE = "probe"
 MARGIN_NS = 5 * NS_PER_S
-"""So much before and after the drive the clocks matter: at 500 ppm what was known earlier bounds Delta to 2.5 ms more,
-which is more than a run may have."""
+"""Clock data from this long before to this long after the drive are used: at 500 ppm an older sample would add 2.5 ms
+to the bound of Delta, which is more than a valid run may have."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunClocks:
-    """Delta of a run by name of its source, the probe's opinion, and over which wall times of client and server.
+    """Delta of a run with the name of its source, the probe's estimate, and the drive on both wall clocks.
 
-    `offset` is None where nobody knows Delta, `probe` where the probe had no answer during the drive.
+    `offset` is None where Delta is unknown, `probe` where the probe had no answer during the drive.
     """
 
     source: str | None
@@ -41,17 +41,17 @@ class RunClocks:
     probed: ProbeExchanges
     """Exchanges during the drive."""
     client_wall_ns: IntArray
-    """Beginning and end of the drive, on each host's wall clock."""
+    """Start and end of the drive on the client's wall clock; `server_wall_ns` on the server's."""
     server_wall_ns: IntArray
 
     @property
     def bound_ms(self) -> float | None:
-        """How wrong Delta can be at most during the drive; None: nobody knows."""
+        """The largest error bound of Delta during the drive; None where it is unknown."""
         return None if self.offset is None else self._bound_ms(self.offset)
 
     @property
     def entry(self) -> dict[str, Any]:
-        """What `result.json` says as `delta`."""
+        """The entry `delta` of `result.json`."""
         return {
             "source": self.source,
             "ms": self._middle_ms(self.offset),
@@ -62,9 +62,10 @@ class RunClocks:
         }
 
     def disagreement_ms(self) -> tuple[float, float, float] | None:
-        """Delta, the probe's Delta and the sum of both bounds where these leave no room for both; None: they agree.
+        """Return Delta, the probe's Delta and the sum of both bounds where they contradict each other; None otherwise.
 
-        Every exchange of the drive is held against Delta at its own moment: the one that is farthest out.
+        Every exchange of the drive is compared with Delta at its own time. The values are those of the exchange that
+        exceeds the bounds most.
         """
         if self.offset is None or self.source == PROBE or len(self.probed) == 0:
             return None
@@ -79,14 +80,14 @@ class RunClocks:
         )
         return delta_ms, probe_ms, bound_ms
 
-    def _inner(self, offset: ClockOffset) -> IntArray:
-        """Moments of an offset during the drive."""
-        moments = offset.client_wall_ns
-        return np.asarray(moments[(moments > self.client_wall_ns[0]) & (moments < self.client_wall_ns[1])], np.int64)
+    def _times_in_drive(self, offset: ClockOffset) -> IntArray:
+        """Return the client wall times of an offset that lie within the drive."""
+        times = offset.client_wall_ns
+        return np.asarray(times[(times > self.client_wall_ns[0]) & (times < self.client_wall_ns[1])], np.int64)
 
     def _bound_ms(self, offset: ClockOffset) -> float | None:
-        moments = np.union1d(self._inner(offset), self.client_wall_ns)
-        largest_ns = float(np.max(offset.bound_at(moments)))
+        times = np.union1d(self._times_in_drive(offset), self.client_wall_ns)
+        largest_ns = float(np.max(offset.bound_at(times)))
         return largest_ns / NS_PER_MS if np.isfinite(largest_ns) else None
 
     def _middle_ms(self, offset: ClockOffset | None) -> float | None:
@@ -96,33 +97,33 @@ class RunClocks:
         return float(offset.at(np.array([(began_ns + ended_ns) // 2]))[0]) / NS_PER_MS
 
     def _drift_ppm(self, offset: ClockOffset) -> float | None:
-        """Slope of the straight line through Delta during the drive."""
+        """Return the slope of the straight line through Delta during the drive."""
         if self.source == SAME_KERNEL:
             return 0.0
-        moments = self._inner(offset)
-        gone_ns = (moments - moments[:1]).astype(float)
-        return None if len(moments) < 2 else float(np.polyfit(gone_ns, offset.at(moments), 1)[0]) * 1e6
+        times = self._times_in_drive(offset)
+        elapsed_ns = (times - times[:1]).astype(float)
+        return None if len(times) < 2 else float(np.polyfit(elapsed_ns, offset.at(times), 1)[0]) * 1e6
 
 
-def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunClocks:
-    """Find Delta of a run that was driven between two times of the server's monotonic clock.
+def run_clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunClocks:
+    """Return Delta of a run whose drive is an interval of the server's monotonic clock.
 
-    Hosts that report the same name share a kernel, and so a clock: Delta is 0 and so is its bound. Else what the hosts'
-    sources of time say counts, where both know it with a bound all through the drive and neither leaves it to the
-    probe; else the probe alone; else what the sources say without a bound. Of all of them what was found out near the
-    drive counts: while nobody drove yet a clock may have been set.
+    Hosts that report the same name share a kernel and thus a clock: Delta and its bound are 0. Otherwise the first of
+    these that is known is used: the time sources of both hosts, where both know a bound throughout the drive and
+    neither is configured to use the probe; the probe alone; the time sources without a bound. Only data from the drive
+    and `MARGIN_NS` around it are used, because a clock may have been set earlier.
     """
     on_client_ns = drive_on_client(server, client, began_ns, ended_ns)
     of_server = _near(server.table("clock"), (began_ns, ended_ns))
     of_client = _near(client.table("clock"), on_client_ns)
     server_wall_ns = np.array([wall_ns(server, began_ns), wall_ns(server, max(began_ns, ended_ns))])
-    every = exchanges(_near(client.table("clock_probe"), on_client_ns))
-    probed = every.within(*server_wall_ns.tolist())
-    probe = by_probe(every) if len(probed) else None
-    sources = None if _left_to_the_probe(of_server, of_client) else by_sources(of_server, of_client)
+    exchanges = probe_exchanges(_near(client.table("clock_probe"), on_client_ns))
+    probed = exchanges.within(*server_wall_ns.tolist())
+    probe = offset_from_probe(exchanges) if len(probed) else None
+    sources = None if _use_probe_only(of_server, of_client) else offset_from_sources(of_server, of_client)
     source: str | None
     offset: ClockOffset | None
-    if _one_host(of_server, of_client):
+    if _share_kernel(of_server, of_client):
         source, offset = SAME_KERNEL, NO_OFFSET
     elif sources is not None and (_is_bounded(sources, server_wall_ns) or probe is None):
         names = {name for samples in (of_server, of_client) for name in known_samples(samples).texts("source")}
@@ -134,11 +135,11 @@ def clocks(server: Record, client: Record, began_ns: int, ended_ns: int) -> RunC
 
 
 def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int) -> tuple[int, int]:
-    """Give beginning and end of the drive on the client's monotonic clock, which nobody sets.
+    """Return start and end of the drive on the client's monotonic clock, which cannot be set.
 
-    Pictures are on both monotonic clocks, and the one that took least to be read says how these differ: others can have
-    waited for seconds in a full queue. Where none was read it is all the time in which the client's clocks were
-    sampled, or as much from there on as the drive took.
+    Pictures have times on both monotonic clocks. The picture with the shortest latency gives the difference of the
+    clocks, as others may have waited for seconds in a full queue. Without any picture, the whole time in which the
+    client's clocks were sampled is returned, extended to the length of the drive.
     """
     frames, pictures = frames_within(server.table("frame"), began_ns, ended_ns), client.table("picture")
     stamped_ns = look_up(frames.ints("stamp_ns"), frames.ints("stamped_mono_ns"), pictures.ints("stamp_ns"))
@@ -152,12 +153,12 @@ def drive_on_client(server: Record, client: Record, began_ns: int, ended_ns: int
 
 
 def _near(samples: Table, drive_ns: tuple[int, int]) -> Table:
-    """Those that were taken during a drive, on the same monotonic clock, or shortly before or after it."""
+    """Return the samples taken within `MARGIN_NS` of a drive on the same monotonic clock."""
     return samples.where((samples.mono_ns >= drive_ns[0] - MARGIN_NS) & (samples.mono_ns <= drive_ns[1] + MARGIN_NS))
 
 
 def wall_ns(record: Record, mono_ns: int) -> int:
-    """Wall time of a record's host at a time of its monotonic clock, by the nearest of its clock samples and events."""
+    """Return the wall time of a record's host at a monotonic time, from the nearest of its clock samples and events."""
     nearest, found_ns = None, mono_ns
     for table in (record.table("clock"), record.table("event")):
         for message_mono_ns, message_wall_ns in zip(table.mono_ns.tolist(), table.wall_ns.tolist(), strict=True):
@@ -167,22 +168,22 @@ def wall_ns(record: Record, mono_ns: int) -> int:
     return found_ns
 
 
-def _one_host(server: Table, client: Table) -> bool:
+def _share_kernel(server: Table, client: Table) -> bool:
     hosts = set(server.texts("host")) | set(client.texts("host"))
     return len(server) > 0 and len(client) > 0 and len(hosts) == 1 and "" not in hosts
 
 
-def _left_to_the_probe(server: Table, client: Table) -> bool:
+def _use_probe_only(server: Table, client: Table) -> bool:
     return PROBE in {*server.texts("source"), *client.texts("source")}
 
 
 def _is_bounded(offset: ClockOffset, server_wall_ns: IntArray) -> bool:
-    """Tell whether the bound is known, and from before the drive's beginning on."""
+    """Return whether the bound is known throughout, and from before the start of the drive on."""
     known = np.isfinite(offset.bound_ns)
     return bool(known.all()) and bool(offset.client_wall_ns[0] <= _on_client(offset, server_wall_ns)[0])
 
 
 def _on_client(offset: ClockOffset, server_wall_ns: IntArray) -> IntArray:
-    """Turn wall times of the server into those of the client, where Delta hardly changes within itself."""
+    """Convert wall times of the server to the client's wall clock, assuming a slow change of Delta."""
     guess_ns = server_wall_ns - offset.at(server_wall_ns)
     return np.asarray(server_wall_ns - offset.at(guess_ns), np.int64)

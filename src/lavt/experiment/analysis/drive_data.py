@@ -1,4 +1,4 @@
-"""What the figures of a report need of each run: its result, and what its server recorded of the drive."""
+"""The data of a run that the figures of a report need: its result, and the server's record of the drive."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lavt.recording.record import Record, read_record
 from lavt.recording.table import MISSING, Table
 
 DRAWN = ("mono_ns", "x_m", "y_m", "progress_m", "cross_track_m", "steering_rad")
-"""What figures show of the truth."""
+"""The columns of the ground truth that figures show."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveData:
-    """One run: where it is, its `result.json`, the truth of the driving interval, and the route's centre line.
+    """One run: its directory, its `result.json`, the ground truth of the driving interval, and the route's centre line.
 
-    `reference_m` is (points, 2); `truth` has the columns `DRAWN`, and no rows where there was no simulator.
+    `reference_m` is (points, 2). `truth` has the columns `DRAWN`, and no rows without a simulator.
     """
 
     directory: Path
@@ -36,17 +36,19 @@ class DriveData:
 
     @property
     def condition(self) -> str:
-        """Name of the run's condition."""
+        """The name of the run's condition."""
         return str(self.result["condition"])
 
 
 def read_drive(directory: Path, result: Mapping[str, Any]) -> DriveData:
-    """Read what the figures need of the run in `directory`."""
-    return drive_of(read_record(directory / "server.mcap", channels=("truth", "event", "route")), directory, result)
+    """Read the data of the run in `directory` that figures need."""
+    return extract_drive(
+        read_record(directory / "server.mcap", channels=("truth", "event", "route")), directory, result
+    )
 
 
-def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> DriveData:
-    """Take what the figures need out of the server's record of a run."""
+def extract_drive(record: Record, directory: Path, result: Mapping[str, Any]) -> DriveData:
+    """Return the data that figures need from the server's record of a run."""
     began_ns, ended_ns, _ = driving_interval(record)
     truth = record.table("truth")
     truth_ns = truth.ints("mono_ns")
@@ -59,7 +61,7 @@ def drive_of(record: Record, directory: Path, result: Mapping[str, Any]) -> Driv
 
 
 def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
-    """Choose a drive of each condition, in their order: a valid one if there is one, the first of those."""
+    """Return one drive per condition, sorted by condition: the first valid one, or else the first."""
     chosen: dict[str, DriveData] = {}
     for drive in sorted(drives, key=lambda drive: not drive.result["valid"]):
         chosen.setdefault(drive.condition, drive)
@@ -67,7 +69,10 @@ def one_of_each_condition(drives: Sequence[DriveData]) -> list[DriveData]:
 
 
 def capture_to_stamp_ms(server_record: Path) -> float | None:
-    """Median time from a frame's exposure to its stamp, which is before the loop; None where no camera told of it."""
+    """Return the median time from a frame's exposure to its stamp, which the loop latency excludes.
+
+    None where the camera does not report the time of exposure.
+    """
     server = read_record(server_record, channels=("frame", "event"))
     began_ns, ended_ns, _ = driving_interval(server)
     frames = frames_within(server.table("frame"), began_ns, ended_ns)

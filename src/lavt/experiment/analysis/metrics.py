@@ -1,4 +1,4 @@
-"""Everything `result.json` says of how a run went, computed from its two records and nothing else."""
+"""The measurements in `result.json`, computed from the two records of a run only."""
 
 from __future__ import annotations
 
@@ -9,32 +9,39 @@ from typing import Any
 import numpy as np
 
 from lavt.domain import NS_PER_MS, NS_PER_S
-from lavt.experiment.analysis.clocks import RunClocks, clocks
+from lavt.experiment.analysis.clocks import RunClocks, run_clocks
 from lavt.experiment.analysis.latency import (
     ages_at_actuation_ns,
     closure_ns,
     control_latency_ns,
     decoded_pictures,
     frames_within,
-    loops,
+    pair_loops,
     percentiles_ms,
     picture_age,
     pictures_of,
     video_latency_ns,
 )
 from lavt.experiment.analysis.stage_latency import stage_percentiles
-from lavt.experiment.analysis.steering import steering
-from lavt.experiment.analysis.tracking import cross_track, distance_m, heading, p95_by_10m, per_km, route_length_m
+from lavt.experiment.analysis.steering import steering_metrics
+from lavt.experiment.analysis.tracking import (
+    cross_track_metrics,
+    distance_m,
+    heading_metrics,
+    p95_by_10m,
+    per_km,
+    route_length_m,
+)
 from lavt.recording.record import Record
 from lavt.recording.table import MISSING, Table
 
 
 @dataclass(frozen=True, slots=True)
 class RunMeasurement:
-    """What was measured in a run.
+    """The measurements of a run.
 
-    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of how far the
-    parts of the loop are from the whole, None where it is not known.
+    `entry` has the keys of `result.json` from `ending` on. `closure_p95_ms` is the 95th percentile of the absolute
+    difference between the sum of the loop's parts and the loop latency, or None where it is unknown.
     """
 
     entry: Mapping[str, Any]
@@ -43,10 +50,10 @@ class RunMeasurement:
 
 
 def driving_interval(server: Record) -> tuple[int, int, str | None]:
-    """When the drive began and ended, on the server's monotonic clock, and how.
+    """Return start and end of the drive on the server's monotonic clock, and its ending.
 
-    Without an event `drive_began` nothing was driven: the interval is empty. Without an event `ending` (a crash) it
-    reaches to the last message of the record, and the ending is None.
+    Without an event `drive_began` the interval is empty. Without an event `ending` (a crash) it ends with the last
+    message of the record, and the ending is None.
     """
     began_ns: int | None = None
     ended_ns, ending = server.last_ns, None
@@ -63,19 +70,19 @@ def _events(events: Table) -> list[tuple[str, int, str]]:
 
 
 def measure(server: Record, client: Record) -> RunMeasurement:
-    """Compute every metric of a run. What cannot be known (no truth, no clock samples, no picture) is None."""
+    """Compute every metric of a run. Metrics without data (no truth, no clock samples, no picture) are None."""
     began_ns, ended_ns, ending = driving_interval(server)
     drove = began_ns <= ended_ns
-    on_one_scale = clocks(server, client, began_ns, ended_ns)
-    latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, on_one_scale)
+    clocks = run_clocks(server, client, began_ns, ended_ns)
+    latencies, closure_p95_ms = _latencies(server, client, began_ns, ended_ns, clocks)
     entry = {
         "ending": ending,
         **_tracking(server, began_ns, ended_ns),
         "duration_s": (ended_ns - began_ns) / NS_PER_S if drove else None,
         **latencies,
-        "delta": on_one_scale.entry,
+        "delta": clocks.entry,
     }
-    return RunMeasurement(entry, closure_p95_ms, on_one_scale)
+    return RunMeasurement(entry, closure_p95_ms, clocks)
 
 
 def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
@@ -87,10 +94,10 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
     return {
         "route_length_m": route_length_m(server.table("route")),
         "distance_m": driven_m,
-        **cross_track(truth),
+        **cross_track_metrics(truth),
         "p95_by_10m": p95_by_10m(truth),
-        **heading(truth),
-        **steering(truth),
+        **heading_metrics(truth),
+        **steering_metrics(truth),
         "collisions": collisions,
         "lane_invasions": invasions,
         "collisions_per_km": per_km(collisions, driven_m),
@@ -99,19 +106,19 @@ def _tracking(server: Record, began_ns: int, ended_ns: int) -> dict[str, Any]:
 
 
 def _latencies(
-    server: Record, client: Record, began_ns: int, ended_ns: int, on_one_scale: RunClocks
+    server: Record, client: Record, began_ns: int, ended_ns: int, clocks: RunClocks
 ) -> tuple[dict[str, Any], float | None]:
     all_frames, admissions = server.table("frame"), server.table("admission")
     frames = frames_within(all_frames, began_ns, ended_ns)
     pictures = decoded_pictures(pictures_of(client.table("picture"), frames))
-    paired = loops(frames, admissions, ended_ns)
+    paired = pair_loops(frames, admissions, ended_ns)
     age = picture_age(all_frames, admissions, began_ns, ended_ns)
-    nothing = np.zeros(0, np.int64)
-    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = nothing, nothing, on_one_scale.bound_ms, None
-    if on_one_scale.offset is not None:
-        tau_v_ns = video_latency_ns(pictures, on_one_scale.offset)
-        tau_c_ns = control_latency_ns(admissions, on_one_scale.offset, began_ns, ended_ns)
-        closures_ns = closure_ns(pictures, paired, on_one_scale.offset)
+    none = np.zeros(0, np.int64)
+    tau_v_ns, tau_c_ns, bound_ms, closure_p95_ms = none, none, clocks.bound_ms, None
+    if clocks.offset is not None:
+        tau_v_ns = video_latency_ns(pictures, clocks.offset)
+        tau_c_ns = control_latency_ns(admissions, clocks.offset, began_ns, ended_ns)
+        closures_ns = closure_ns(pictures, paired, clocks.offset)
         if len(closures_ns):
             closure_p95_ms = float(np.percentile(np.abs(closures_ns), 95)) / NS_PER_MS
     entry = {
@@ -120,7 +127,7 @@ def _latencies(
         "age_at_actuation_ms": percentiles_ms(ages_at_actuation_ns(all_frames, admissions, began_ns, ended_ns)),
         "tau_v_ms": _with_bound(percentiles_ms(tau_v_ns), bound_ms),
         "tau_c_ms": _with_bound(percentiles_ms(tau_c_ns), bound_ms),
-        "stages_ms": stage_percentiles(server, client, frames, tau_c_ns, on_one_scale.offset),
+        "stages_ms": stage_percentiles(server, client, frames, tau_c_ns, clocks.offset),
         "frames_sent": len(frames),
         "frames_decoded": len(pictures),
         "frames_unreadable": int(np.sum(~pictures.flags("readable"))),
@@ -138,8 +145,8 @@ def _with_bound(summary: dict[str, Any], bound_ms: float | None) -> dict[str, An
     }
 
 
-def count(record: Record, name: str) -> int | None:
-    """Last value of a counter on the channel `counts`; None where it was never recorded."""
+def last_count(record: Record, name: str) -> int | None:
+    """Return the last value of a counter on the channel `counts`; None where it was never recorded."""
     values = record.table("counts").ints(name)
     known = values[values != MISSING]
     return int(known[-1]) if len(known) else None

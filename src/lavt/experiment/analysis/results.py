@@ -1,4 +1,4 @@
-"""`result.json`: what one run was, how it ended, and what was measured."""
+"""`result.json`: the identity, the ending and the measurements of one run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lavt.recording.json_payload import without_nan
 from lavt.recording.record import Record
 
 FAILED = "failed.json"
-"""In a sweep's directory: the runs that failed and why; absent or empty where none did."""
+"""In a sweep's directory: the runs that failed, with the reasons; absent or empty where none did."""
 
 IDENTITY = (
     "run",
@@ -34,10 +34,10 @@ IDENTITY = (
     "repetition",
     "seed",
 )
-"""What says which run it was: known before it is driven. What does not apply is null."""
+"""The keys that identify a run, known before it is driven. Those that do not apply are null."""
 
-FURTHER = ("axes", "changes", "injected_ms", "injected_least_ms")
-"""What some runs have beside it."""
+OPTIONAL_IDENTITY = ("axes", "changes", "injected_ms", "injected_least_ms")
+"""Further such keys, which only some runs have."""
 
 MEASURES = (
     "route_length_m",
@@ -81,30 +81,29 @@ def run_result(
     digest: str | None = None,
     reasons: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Compute the run's entry of `summary.json` from its records.
+    """Compute the run's `result.json`, which is also its entry in `summary.json`, from its records.
 
     `identity` has the keys `IDENTITY`, and may have `axes` (values of a sweep's further axes), `changes` (of the
-    condition), `injected_ms` (what was asked of the network) and `injected_least_ms` (where that is less); these are
-    kept. `reasons` are those against the run that records do not show.
+    condition), `injected_ms` (the requested delay) and `injected_least_ms` (where that is less), which are copied.
+    `reasons` are the reasons against the run that its records do not show.
     """
     measured = measure(server, client)
-    against = [*invalid_reasons(server, client, measured), *reasons]
-    if not against and "injected_ms" in identity:  # where clocks are wrong, latencies are
-        against = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
-    further = {key: identity[key] for key in FURTHER if key in identity}
+    all_reasons = [*invalid_reasons(server, client, measured), *reasons]
+    if not all_reasons and "injected_ms" in identity:  # with wrong clocks the latencies are wrong, too
+        all_reasons = absent_reasons(measured.entry, identity.get("injected_least_ms", identity["injected_ms"]))
     return {
         **{key: identity.get(key) for key in IDENTITY},
-        **further,
+        **{key: identity[key] for key in OPTIONAL_IDENTITY if key in identity},
         "digest": digest,
         "ending": measured.entry["ending"],
-        "valid": not against,
-        "invalid_reasons": against,
+        "valid": not all_reasons,
+        "invalid_reasons": all_reasons,
         **{key: measured.entry[key] for key in MEASURES},
     }
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as JSON that people can read, all at once: nobody ever sees half a file. NaN becomes null."""
+    """Write `value` as indented JSON, atomically: a reader never sees an incomplete file. NaN becomes null."""
     text = json.dumps(without_nan(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     unfinished = path.with_name(path.name + ".part")
     unfinished.write_text(text, encoding="utf-8")
@@ -112,7 +111,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. Raises `WorkError` where it is missing or is no JSON."""
+    """Read a JSON file; raise `WorkError` where it is missing or is not JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""How the car was steered: pure functions of the recorded ground truth. `docs/metrics.md` has the formulas."""
+"""Steering metrics: pure functions of the recorded ground truth. `docs/metrics.md` has the formulas."""
 
 from __future__ import annotations
 
@@ -11,81 +11,84 @@ from lavt.experiment.analysis.tracking import distance_m, per_km, root_mean_squa
 from lavt.recording.table import Table
 
 REVERSAL_DEADBAND_RAD = 0.01
-"""Smallest turn back of the road wheels that counts as a steering reversal (0.57 degrees)."""
+"""The smallest turn back of the road wheels that counts as a steering reversal (0.57 degrees)."""
 
-SAMPLED_HZ = 20.0
-"""The steering is brought to this rate to find its frequency: no wheel oscillates at half of it."""
+SAMPLE_RATE_HZ = 20.0
+"""The steering is resampled at this rate for its spectrum: no wheel oscillates at half of it."""
 LOWEST_HZ, HIGHEST_HZ = 0.1, 5.0
-"""Slower is the road, faster is noise: the loop's own frequency lies between, `theory.py`."""
+"""Slower is the road, and faster is noise: the loop's own frequency lies between (`delay_margin.py`)."""
 FEWEST_PERIODS = 3
-"""An oscillation is seen at least so often; fewer swings could be bends."""
+"""An oscillation has at least this many periods in the drive; fewer could be bends of the road."""
 
 
-def steering(truth: Table) -> dict[str, Any]:
-    """Tell of the road wheels' angle: root mean square of it and of its rate, turns back, and its oscillation."""
+def steering_metrics(truth: Table) -> dict[str, Any]:
+    """Return the RMS of the road wheels' angle and of its rate, the reversal rates, and the oscillation frequency."""
     mono_ns, steering_rad = truth.ints("mono_ns"), truth.floats("steering_rad")
     known = np.isfinite(steering_rad)
-    at_s, angle_rad = (mono_ns[known] - (mono_ns[known][0] if known.any() else 0)) / NS_PER_S, steering_rad[known]
-    turns, driven_m, lasted_s = steering_reversals(angle_rad), distance_m(truth), float(at_s[-1]) if len(at_s) else 0.0
+    times_s, angle_rad = (mono_ns[known] - (mono_ns[known][0] if known.any() else 0)) / NS_PER_S, steering_rad[known]
+    reversals, driven_m = steering_reversals(angle_rad), distance_m(truth)
+    duration_s = float(times_s[-1]) if len(times_s) else 0.0
     return {
         "steering_rms_rad": root_mean_square(sampled_by_distance(truth, "steering_rad")),
-        "steering_rate_rms_radps": steering_rate_rms_radps(at_s, angle_rad),
-        "steering_reversals_per_s": turns / lasted_s if lasted_s > 0 else None,
-        "steering_reversals_per_km": per_km(turns, driven_m) if len(at_s) else None,
-        "oscillation_hz": oscillation_hz(at_s, angle_rad),
+        "steering_rate_rms_radps": steering_rate_rms_radps(times_s, angle_rad),
+        "steering_reversals_per_s": reversals / duration_s if duration_s > 0 else None,
+        "steering_reversals_per_km": per_km(reversals, driven_m) if len(times_s) else None,
+        "oscillation_hz": oscillation_hz(times_s, angle_rad),
     }
 
 
-def steering_rate_rms_radps(at_s: FloatArray, steering_rad: FloatArray) -> float | None:
-    """Root of the mean over time of the square of the steering's rate, taken between rows; None of fewer than two."""
-    step_s = np.diff(at_s)
+def steering_rate_rms_radps(times_s: FloatArray, steering_rad: FloatArray) -> float | None:
+    """Return the time-weighted RMS of the steering rate between rows; None for fewer than two rows."""
+    step_s = np.diff(times_s)
     if not (step_s > 0).any():
         return None
     turned_rad, step_s = np.diff(steering_rad)[step_s > 0], step_s[step_s > 0]
     return float(np.sqrt(np.sum(turned_rad**2 / step_s) / np.sum(step_s)))
 
 
-def oscillation_hz(at_s: FloatArray, steering_rad: FloatArray) -> float | None:
-    """Frequency at which the steering swings most; None where no swing is wider than `REVERSAL_DEADBAND_RAD`.
+def oscillation_hz(times_s: FloatArray, steering_rad: FloatArray) -> float | None:
+    """Return the frequency of the strongest steering oscillation.
 
-    It is the highest peak of the periodogram (Hann's window, mean and slope taken off) between `LOWEST_HZ` and
-    `HIGHEST_HZ` with at least `FEWEST_PERIODS` in the drive.
+    It is the highest peak of the periodogram (Hann window, mean and slope removed) between `LOWEST_HZ` and `HIGHEST_HZ`
+    with at least `FEWEST_PERIODS` in the drive; None where its peak-to-peak value is at most `REVERSAL_DEADBAND_RAD`.
     """
-    lasted_s = float(at_s[-1] - at_s[0]) if len(at_s) else 0.0
-    even_s = np.arange(0.0, lasted_s, 1 / SAMPLED_HZ)
-    if lasted_s < FEWEST_PERIODS / HIGHEST_HZ:
+    duration_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
+    even_s = np.arange(0.0, duration_s, 1 / SAMPLE_RATE_HZ)
+    if duration_s < FEWEST_PERIODS / HIGHEST_HZ:
         return None
-    even_rad = np.interp(even_s, at_s - at_s[0], steering_rad)
+    even_rad = np.interp(even_s, times_s - times_s[0], steering_rad)
     hertz, power = power_spectrum(even_rad)
     peaks = 1 + np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] > power[2:]))
-    peaks = peaks[(hertz[peaks] >= max(LOWEST_HZ, FEWEST_PERIODS / lasted_s)) & (hertz[peaks] <= HIGHEST_HZ)]
+    peaks = peaks[(hertz[peaks] >= max(LOWEST_HZ, FEWEST_PERIODS / duration_s)) & (hertz[peaks] <= HIGHEST_HZ)]
     if len(peaks) == 0:
         return None
     highest = peaks[np.argmax(power[peaks])]
-    swing_rad = 2 * np.sqrt(2 * power[highest])  # a sine of amplitude a has the power a^2 / 2, and swings by 2 a
-    return float(hertz[highest]) if swing_rad > REVERSAL_DEADBAND_RAD else None
+    peak_to_peak_rad = 2 * np.sqrt(2 * power[highest])  # a sine of amplitude a has the power a^2 / 2
+    return float(hertz[highest]) if peak_to_peak_rad > REVERSAL_DEADBAND_RAD else None
 
 
 def power_spectrum(even_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Frequencies, and the power at each of what was sampled at `SAMPLED_HZ`: that of a sine is half its square.
+    """Return frequencies and the power at each, of angles sampled at `SAMPLE_RATE_HZ`; a sine's is amplitude^2 / 2.
 
-    As `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than a short geometry drive.
+    Equal to `scipy.signal.periodogram` with `scaling="spectrum"`, whose import takes longer than a short drive without
+    pixels.
     """
-    at = np.arange(len(even_rad))
-    straight = np.polynomial.Polynomial.fit(at, even_rad, 1)(at)
+    index = np.arange(len(even_rad))
+    line = np.polynomial.Polynomial.fit(index, even_rad, 1)(index)
     window = np.hanning(len(even_rad) + 1)[:-1]
-    # Longer than the drive, filled up with zeros: the peak is then found finer than one period in the drive.
+    # Zero padding resolves the peak more finely than one period per drive.
     length = 1 << (8 * len(even_rad) - 1).bit_length()
-    amplitudes = np.abs(np.fft.rfft((even_rad - straight) * window, length)) / window.sum()
-    return np.asarray(np.fft.rfftfreq(length, 1 / SAMPLED_HZ), np.float64), np.asarray(2 * amplitudes**2, np.float64)
+    amplitudes = np.abs(np.fft.rfft((even_rad - line) * window, length)) / window.sum()
+    hertz = np.fft.rfftfreq(length, 1 / SAMPLE_RATE_HZ)
+    return np.asarray(hertz, np.float64), np.asarray(2 * amplitudes**2, np.float64)
 
 
 def steering_reversals(steering_rad: FloatArray) -> int:
-    """How often the steering turned back by more than `REVERSAL_DEADBAND_RAD` from its last extreme."""
+    """Return the number of turns back by more than `REVERSAL_DEADBAND_RAD` from the last extreme."""
     count, direction = 0, 0
     extreme = lowest = highest = steering_rad[0] if len(steering_rad) else 0.0
     for angle in steering_rad.tolist():
-        if direction == 0:  # not yet known: the first turn sets it and is no reversal
+        if direction == 0:  # unknown yet: the first turn sets it and is not a reversal
             lowest, highest = min(lowest, angle), max(highest, angle)
             if highest - lowest > REVERSAL_DEADBAND_RAD:
                 direction, extreme = (1 if angle == highest else -1), angle

@@ -1,4 +1,4 @@
-"""How well the lane was kept: pure functions of the recorded ground truth. `docs/metrics.md` has the formulas."""
+"""Lane-keeping metrics: pure functions of the recorded ground truth. `docs/metrics.md` has the formulas."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from lavt.domain import FloatArray
 from lavt.recording.table import Table
 
 STEP_M = 0.25
-"""Errors are sampled by distance, so that a car that creeps or waits does not count more than one that drives."""
+"""Errors are sampled by distance, so that slow or waiting phases do not count more than fast ones."""
 
-PLACES_M = 10
-"""Of every so many metres driven, the error up to there is kept: runs that ended early are compared by it."""
+PARTIAL_STEP_M = 10
+"""The error from the start is kept at multiples of this distance, to compare runs that ended early."""
 
 
 def sampled_by_distance(truth: Table, name: str) -> FloatArray:
-    """Column `name` every `STEP_M` of new progress along the route, interpolated linearly.
+    """Return column `name` at every `STEP_M` of new progress along the route, interpolated linearly.
 
-    Where the car went back, the first passage counts.
+    Where the car moved backwards, the first passage counts.
     """
     progress_m = truth.floats("progress_m")
     values = truth.floats(name)
@@ -27,12 +27,12 @@ def sampled_by_distance(truth: Table, name: str) -> FloatArray:
         return np.zeros(0)
     farthest_m = np.maximum.accumulate(progress_m)
     new = np.concatenate([[True], progress_m[1:] > farthest_m[:-1]])
-    places_m = np.arange(progress_m[0], farthest_m[-1] + 1e-9, STEP_M)
-    return np.asarray(np.interp(places_m, progress_m[new], values[new]), np.float64)
+    positions_m = np.arange(progress_m[0], farthest_m[-1] + 1e-9, STEP_M)
+    return np.asarray(np.interp(positions_m, progress_m[new], values[new]), np.float64)
 
 
-def cross_track(truth: Table) -> dict[str, float | None]:
-    """Mean, root mean square, 95th percentile and maximum of the distance from the lane's centre, in metres."""
+def cross_track_metrics(truth: Table) -> dict[str, float | None]:
+    """Return mean, RMS, 95th percentile and maximum of the distance from the lane's centre, in metres."""
     error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
     if len(error_m) == 0:
         return {"mae_m": None, "rms_m": None, "p95_m": None, "max_m": None}
@@ -45,17 +45,17 @@ def cross_track(truth: Table) -> dict[str, float | None]:
 
 
 def p95_by_10m(truth: Table) -> list[float]:
-    """95th percentile of the distance from the lane's centre, from the start to 10 m, 20 m, .. of progress.
+    """Return the 95th percentile of the distance from the lane's centre, from the start to 10 m, 20 m, .. of progress.
 
-    Whole tens only: nothing where less than 10 m were driven.
+    Only full multiples of 10 m are included: the list is empty for less than 10 m.
     """
     error_m = np.abs(sampled_by_distance(truth, "cross_track_m"))
-    a_place = round(PLACES_M / STEP_M)
-    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(a_place, len(error_m), a_place)]
+    step = round(PARTIAL_STEP_M / STEP_M)
+    return [float(np.percentile(error_m[: end + 1], 95)) for end in range(step, len(error_m), step)]
 
 
-def heading(truth: Table) -> dict[str, float | None]:
-    """Mean, root mean square and 95th percentile of the angle between the car and the lane, in radians."""
+def heading_metrics(truth: Table) -> dict[str, float | None]:
+    """Return mean, RMS and 95th percentile of the angle between the car and the lane, in radians."""
     error_rad = np.abs(sampled_by_distance(truth, "heading_error_rad"))
     return {
         "heading_mae_rad": float(error_rad.mean()) if len(error_rad) else None,
@@ -65,23 +65,23 @@ def heading(truth: Table) -> dict[str, float | None]:
 
 
 def root_mean_square(values: FloatArray) -> float | None:
-    """Root of the mean square; None of nothing."""
+    """Return the root mean square; None without values."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def distance_m(truth: Table) -> float | None:
-    """Progress along the route from the first to the farthest row."""
+    """Return the progress along the route from the first to the farthest row; None without rows."""
     progress_m = truth.floats("progress_m")
     progress_m = progress_m[np.isfinite(progress_m)]
     return float(progress_m.max() - progress_m[0]) if len(progress_m) else None
 
 
 def per_km(count: int, driven_m: float | None) -> float | None:
-    """Give how often something happened per kilometre driven; None where nothing was driven."""
+    """Return a count per kilometre driven; None where no distance was driven."""
     return count / (driven_m / 1000) if driven_m else None
 
 
 def route_length_m(route: Table) -> float | None:
-    """How far it is from the route's start to its goal, as the server recorded it; None where it did not."""
+    """Return the recorded distance from the route's start to its goal; None where it was not recorded."""
     lengths_m = route.floats("length_m")
     return float(lengths_m[0]) if len(lengths_m) and np.isfinite(lengths_m[0]) else None

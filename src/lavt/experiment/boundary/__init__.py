@@ -1,1 +1,1 @@
-"""The search for the maximum tolerable latency, and the theory it is compared with."""
+"""The search for the maximum tolerable latency, and the theoretical delay margin for comparison."""

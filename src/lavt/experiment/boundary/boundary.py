@@ -1,4 +1,4 @@
-"""How much total delay a loop bears: by search, seed after seed, on all cores. docs/boundary.md defines it."""
+"""The search for the maximum tolerable latency of a loop, for many seeds on all cores (`docs/boundary.md`)."""
 
 from __future__ import annotations
 
@@ -18,30 +18,32 @@ import numpy as np
 from lavt.config import BoundaryConfig, RunConfig
 from lavt.config_file import parse_config
 from lavt.domain import NS_PER_MS
-from lavt.errors import UserError, WorkError, in_words
+from lavt.errors import UserError, WorkError, describe_error
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.boundary.bisection import Bracket, first_bracket, zero_bracket
 from lavt.experiment.boundary.delay_margin import configured_loop, critical_delay_s
 from lavt.experiment.boundary.oscillation_growth import straight_growth
 from lavt.experiment.report.boundary_figure import boundary_figure
 from lavt.experiment.report.files import save_figure
-from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
-from lavt.experiment.statistics.boundary_summary import CRITERIA, groups_of
-from lavt.experiment.sweep.workers import Workers, processes
+from lavt.experiment.statistics.boundary_summary import CRITERIA, summarize_groups
+from lavt.experiment.sweep.workers import Workers, process_workers
 
 BOUNDARY = "boundary.json"
 FIELDS = ("route", "preset", "seed", "repetition", *(f"{name}_ms" for name in CRITERIA), "theory_ms")
-SEARCHED = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
-"""Keys of a boundary config that are not a run's."""
+SEARCH_KEYS = frozenset({"routes", "presets", "repetition", "repetitions", "longest_delay_ms", "grid_ms", "within_ms"})
+"""The keys of a boundary config that are not a run's."""
 
-Tell = Callable[[str], None]
-Totals = Callable[[float], float]
+ProgressCallback = Callable[[str], None]
+"""A callback that shows one line of progress."""
+TotalDelay = Callable[[float], float]
+"""A function from the added delay to the total delay, in ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoundarySearch:
-    """One seed on one route with one preset: its run without added delay, and where to look."""
+    """One search: a run of one seed, route and preset without added delay, and the searched delays."""
 
     planned: PlannedRun
     longest_delay_ms: float
@@ -50,70 +52,69 @@ class BoundarySearch:
 
     @property
     def name(self) -> str:
-        """What is told of it."""
+        """The name of the search, for messages."""
         return self.planned.name
 
 
 def plan_boundary(config: BoundaryConfig) -> list[BoundarySearch]:
-    """Plan every route with every preset, repeated; a first seed of each comes before any second one.
+    """Plan the searches of every route with every preset, repeated; the first seed of each comes before any second one.
 
-    Raises `UserError` for what `plan_run` refuses, for what has no straight road or no virtual time, for a video delay
-    that is given, and where nothing is asked for or something twice.
+    Raises `UserError` for a run that `plan_run` rejects, for a run in real time or without the simulator, for a given
+    video delay, and for missing or duplicate routes or presets.
     """
     if config.time != "virtual" or config.vehicle.kind != "simulator":
         raise UserError(
-            "a boundary is searched in virtual time with the built-in simulator: set time and vehicle.kind so"
+            "a boundary is searched in virtual time with the built-in simulator: set time to virtual and vehicle.kind "
+            "to simulator"
         )
     if config.network.video.delay_ms is not None:
-        raise UserError("network.video.delay_ms is what is searched for: leave it out")
+        raise UserError("network.video.delay_ms is varied by the search: omit it")
     for key, names in (("routes", config.routes), ("presets", config.presets)):
         if not names or len(set(names)) < len(names):
             raise UserError(f"{key}: give at least one, and each once")
-    base = config.model_dump(mode="json", exclude=set(SEARCHED))
+    base = config.model_dump(mode="json", exclude=set(SEARCH_KEYS))
     searches = []
     for repetition, route, preset in itertools.product(range(config.repetitions), config.routes, config.presets):
-        requested = {
+        run = {
             **base,
             "vehicle": {**base["vehicle"], "route": route},
             "controller": {**base["controller"], "preset": preset},
             "repetition": repetition,
         }
-        planned = plan_run(
-            parse_config(RunConfig, requested, "the boundary"), name=f"{route} {preset} {repetition:02d}"
-        )
+        planned = plan_run(parse_config(RunConfig, run, "the boundary"), name=f"{route} {preset} {repetition:02d}")
         searches.append(BoundarySearch(planned, config.longest_delay_ms, config.grid_ms, config.within_ms))
     return searches
 
 
 def with_video_delay(config: RunConfig, delay_ms: float) -> RunConfig:
-    """Give the config with this constant delay of the video instead of the condition's, to the nanosecond."""
+    """Return the config with this constant video delay, rounded to 1 ns, in place of the condition's."""
     delay_ms = round(delay_ms * NS_PER_MS) / NS_PER_MS
     video = config.network.video.model_copy(update={"delay_ms": delay_ms})
     return config.model_copy(update={"network": config.network.model_copy(update={"video": video})})
 
 
 def began(drive: MonitoredRun) -> bool:
-    """Whether the vehicle was armed: with pictures that are too old it is not, and nobody drives anywhere."""
+    """Return whether the drive began: the vehicle is never armed with pictures that are too old."""
     return len(drive.time_s) > 0
 
 
 def departed(drive: MonitoredRun) -> bool:
-    """Whether the car left its lane: at least one event `lane_invasion`."""
+    """Return whether the car left its lane (at least one event `lane_invasion`)."""
     return drive.lane_invasions > 0
 
 
 def not_completed(drive: MonitoredRun) -> bool:
-    """Whether the drive ended in any other way than at the route's end."""
+    """Return whether the drive had another ending than the route's end."""
     return drive.ending != "completed"
 
 
-def search(requested: BoundarySearch) -> dict[str, Any]:
-    """Find the boundaries of one seed, and give its entry of `boundary.json`."""
-    config, identity = requested.planned.config, requested.planned.identity
+def run_search(search: BoundarySearch) -> dict[str, Any]:
+    """Find the boundaries of one search, and return its entry of `boundary.json`."""
+    config, identity = search.planned.config, search.planned.identity
 
     @functools.cache
     def drive(delay_ms: float) -> MonitoredRun:
-        return watch_drive(plan_run(with_video_delay(config, delay_ms), name=requested.name))
+        return drive_monitored(plan_run(with_video_delay(config, delay_ms), name=search.name))
 
     added_ms: list[float] = []
 
@@ -122,22 +123,22 @@ def search(requested: BoundarySearch) -> dict[str, Any]:
         added_ms.append(measured_ms - delay_ms)
         return growth_per_s
 
-    grid_ms = _grid(requested.longest_delay_ms, requested.grid_ms)
+    grid_ms = _grid(search.longest_delay_ms, search.grid_ms)
     first_total_ms = drive(0.0).total_delay_ms
     if math.isnan(first_total_ms):
-        raise WorkError("nothing is driven even without added delay: look at lavt run with the same config")
+        raise WorkError("the drive does not begin even without added delay: try lavt run with the same config")
 
     def total_ms(delay_ms: float) -> float:
         measured_ms = drive(delay_ms).total_delay_ms
-        return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # pictures too old to be obeyed
+        return first_total_ms + delay_ms if math.isnan(measured_ms) else measured_ms  # NaN: pictures were too old
 
     theory_ms = theoretical_ms(config)
-    guess_ms = requested.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
-    onset = zero_bracket(functools.cache(growth), guess_ms, requested.longest_delay_ms, requested.within_ms)
+    guess_ms = search.longest_delay_ms / 2 if theory_ms is None else theory_ms - first_total_ms
+    onset = zero_bracket(functools.cache(growth), guess_ms, search.longest_delay_ms, search.within_ms)
     begun_ms = [delay_ms for delay_ms in grid_ms if began(drive(delay_ms))]
-    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, requested.within_ms)
-    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, requested.within_ms)
-    found: dict[str, tuple[Bracket, Totals]] = {
+    departure = first_bracket(lambda delay_ms: departed(drive(delay_ms)), begun_ms, search.within_ms)
+    completion = first_bracket(lambda delay_ms: not_completed(drive(delay_ms)), grid_ms, search.within_ms)
+    found: dict[str, tuple[Bracket, TotalDelay]] = {
         "onset": (onset, lambda delay_ms: delay_ms + float(np.nanmedian(added_ms))),
         "departure": (departure, total_ms),
         "completion": (completion, total_ms),
@@ -156,64 +157,64 @@ def search(requested: BoundarySearch) -> dict[str, Any]:
 
 
 def _grid(longest_ms: float, step_ms: float) -> list[float]:
-    """Give delays from 0 on, `step_ms` apart, and the longest."""
+    """Return delays from 0 on, `step_ms` apart, and the longest delay."""
     count = math.ceil(longest_ms / step_ms)
     return [*(number * step_ms for number in range(count)), longest_ms]
 
 
-def _middle_ms(bracket: Bracket, total: Totals) -> float | None:
-    """Give the total delay half-way between the ends of a bracket; None where the boundary is not within the range."""
+def _middle_ms(bracket: Bracket, total: TotalDelay) -> float | None:
+    """Return the total delay in the middle of a bracket; None where the boundary is not within the range."""
     if bracket.low_ms is None or bracket.high_ms is None:
         return None
     return (total(bracket.low_ms) + total(bracket.high_ms)) / 2
 
 
 def theoretical_ms(config: RunConfig) -> float | None:
-    """Give the critical total delay of the loop as configured; None where nothing is known of it, or there is none."""
+    """Return the delay margin of the configured loop; None for a loop without a model, and without a finite margin."""
     loop = configured_loop(config)
     critical_s = math.inf if loop is None else critical_delay_s(loop)
     return critical_s * 1000 if math.isfinite(critical_s) else None
 
 
-def search_all(
-    searches: Sequence[BoundarySearch], *, jobs: int | None, tell: Tell
+def run_searches(
+    searches: Sequence[BoundarySearch], *, jobs: int | None, on_progress: ProgressCallback
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]], bool]:
-    """Search them all, `jobs` at a time (None: one a core).
+    """Run all searches, `jobs` at a time (None: one per core).
 
-    Returns what was found, in the order asked for; what failed, with the reason; and whether all was done: not after
-    Ctrl-C, which lets the searches under way end, and takes what they found.
+    Returns the found boundaries in the order of `searches`, the failed searches with their reasons, and whether all
+    searches are done. After Ctrl-C they are not: the searches in progress are finished, and no others are started.
     """
-    work, done = _SearchProgress(tell), True
+    progress, done = _SearchProgress(on_progress), True
     try:
-        _search_in_processes(work, searches, jobs or os.cpu_count() or 1)
+        _search_in_processes(progress, searches, jobs or os.cpu_count() or 1)
     except KeyboardInterrupt:
         done = False
-    return [work.found[each.name] for each in searches if each.name in work.found], work.failed, done
+    return [progress.found[each.name] for each in searches if each.name in progress.found], progress.failed, done
 
 
 class _SearchProgress:
-    """What has become of the searches so far."""
+    """The finished and the failed searches so far."""
 
-    def __init__(self, tell: Tell) -> None:
+    def __init__(self, on_progress: ProgressCallback) -> None:
         self.found: dict[str, dict[str, Any]] = {}
         self.failed: list[dict[str, Any]] = []
-        self._tell = tell
+        self._on_progress = on_progress
 
     def search(self, workers: Workers, todo: Sequence[BoundarySearch]) -> list[BoundarySearch]:
-        """Have searches done; give those that were not, because a worker's process died, in the order of `todo`."""
-        futures = {workers.executor.submit(search, each): each for each in todo}
+        """Run searches, and return those that were not run because a worker's process died, in the order of `todo`."""
+        futures = {workers.executor.submit(run_search, each): each for each in todo}
         broken: set[str] = set()
 
         def take(future: Future[dict[str, Any]]) -> None:
-            requested = futures.pop(future)
+            search = futures.pop(future)
             try:
-                self.found[requested.name] = future.result()
+                self.found[search.name] = future.result()
             except BrokenExecutor:
-                broken.add(requested.name)
-            except Exception as error:  # whatever it is, the other searches have nothing to do with it
-                self.fail(requested, in_words(error))
+                broken.add(search.name)
+            except Exception as error:  # of any kind: the other searches are independent of it
+                self.fail(search, describe_error(error))
             else:
-                self._tell(f"{requested.name}: {_sentence(self.found[requested.name])}")
+                self._on_progress(f"{search.name}: {_format_boundaries(self.found[search.name])}")
 
         try:
             for future in as_completed(list(futures)):
@@ -225,42 +226,47 @@ class _SearchProgress:
             raise
         return [each for each in todo if each.name in broken]
 
-    def fail(self, requested: BoundarySearch, why: str) -> None:
-        """Note that a search failed."""
-        self.failed.append({"name": requested.name, "why": why})
-        self._tell(f"{requested.name}: failed: {why}")
+    def fail(self, search: BoundarySearch, reason: str) -> None:
+        """Add a failed search."""
+        self.failed.append({"name": search.name, "why": reason})
+        self._on_progress(f"{search.name}: failed: {reason}")
 
 
-def _search_in_processes(work: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
-    """Search, also when a process dies, which takes the pool with it: what may have been begun is searched alone."""
+def _search_in_processes(progress: _SearchProgress, todo: Sequence[BoundarySearch], jobs: int) -> None:
+    """Search in processes; a process that dies breaks the pool, and searches it may have begun are repeated alone."""
     while todo:
-        with processes(jobs) as workers:
-            broken = work.search(workers, todo)
-        for each in broken[:jobs]:  # they are begun in their order
-            with processes(1) as alone:
-                if work.search(alone, [each]):
-                    work.fail(each, "the process that searched it died")
+        with process_workers(jobs) as workers:
+            broken = progress.search(workers, todo)
+        for each in broken[:jobs]:  # searches begin in order, so only the first ones can have begun
+            with process_workers(1) as single:
+                if progress.search(single, [each]):
+                    progress.fail(each, "the process that searched it died")
         todo = broken[jobs:]
 
 
-def _sentence(run: Mapping[str, Any]) -> str:
+def _format_boundaries(run: Mapping[str, Any]) -> str:
     parts = [f"{name} {'-' if run[f'{name}_ms'] is None else format(run[f'{name}_ms'], '.0f')}" for name in CRITERIA]
     return ", ".join(parts) + " ms"
 
 
-def boundary(
-    config: BoundaryConfig, searches: Sequence[BoundarySearch], out: Path, *, jobs: int | None, tell: Tell
+def search_boundary(
+    config: BoundaryConfig,
+    searches: Sequence[BoundarySearch],
+    out: Path,
+    *,
+    jobs: int | None,
+    on_progress: ProgressCallback,
 ) -> tuple[dict[str, Any], bool]:
-    """Search, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also of what was found before Ctrl-C.
+    """Run the searches of `config`, and write `boundary.json`, `.csv`, `.svg` and `.png` into `out`, also after Ctrl-C.
 
-    `searches` are those of `config`. Returns what is in `boundary.json`, and whether all was done.
+    Returns the content of `boundary.json`, and whether all searches are done.
     """
-    runs, failed, done = search_all(searches, jobs=jobs, tell=tell)
+    runs, failed, done = run_searches(searches, jobs=jobs, on_progress=on_progress)
     entry = {
         "schema": 1,
         "config": config.model_dump(mode="json"),
         "runs": runs,
-        "groups": groups_of(runs),
+        "groups": summarize_groups(runs),
         "failed": failed,
     }
     write_json(out / BOUNDARY, entry)

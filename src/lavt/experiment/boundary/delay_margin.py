@@ -1,18 +1,18 @@
-"""How much delay the lateral loop bears, computed: a sampled-data model of lane keeping by pure pursuit.
+"""The theoretical delay margin of the lateral loop, from a sampled-data model of lane keeping by pure pursuit.
 
 The car is the linearised dynamic bicycle on a straight lane (R. Rajamani, Vehicle Dynamics and Control, chapter 2)
 behind a first-order steering lag; the controller is pure pursuit linearised about the lane's centre,
 
     command = -(2 wheelbase / lookahead^2) (lateral error + lookahead x heading error),
 
-computed once a frame from an exponential moving average and held until the next command takes effect. The total delay,
-from the middle of exposure to the wheel's command, splits into whole frames and a fraction: within one frame the old
-command acts first and the new one after it, so the sampled plant has two input matrices (Astrom and Wittenmark,
-Computer-Controlled Systems, section 3.2). The wait for the next picture, half a frame on average, is the hold of this
-model and must not be added to the delay again. A car's dead time of steering comes on top of the total delay.
+computed once per frame from an exponential moving average and constant until the next command takes effect. The total
+delay, from the middle of exposure to the wheel's command, splits into whole frames and a fraction: within one frame the
+old command acts first and then the new one, so the sampled plant has two input matrices (Astrom and Wittenmark,
+Computer-Controlled Systems, section 3.2). The wait for the next picture, half a frame on average, is this model's
+zero-order hold and must not be added to the delay again. A car's dead time of steering adds to the total delay.
 
-Without lag, filter, hold and tyres the bound is `DELAY_PER_LOOKAHEAD` x lookahead / speed (Heredia and Ollero, Advanced
-Robotics 21, 2007, analyse that case); it is two to three times too generous for a real car.
+Without lag, filter, hold and tyres the delay margin is `DELAY_PER_LOOKAHEAD` x lookahead / speed (Heredia and Ollero,
+Advanced Robotics 21, 2007, analyse that case), which is two to three times too large for a real car.
 """
 
 from __future__ import annotations
@@ -37,43 +37,43 @@ from lavt.vehicle.sim.rendering.cars import LINCOLN_MKZ
 ComplexArray = NDArray[np.complex128]
 
 DELAY_PER_LOOKAHEAD = math.acos(math.sqrt(2) - 1) / math.sqrt(2 + 2 * math.sqrt(2))
-"""Critical delay of the bare loop (2 a s + 2 a^2) / s^2 in units of 1 / a, a = speed / lookahead: 0.5205.
+"""The delay margin of the simplified loop (2 a s + 2 a^2) / s^2 in units of 1 / a, a = speed / lookahead: 0.5205.
 
-|L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase left there, atan(w / a), is acos(sqrt(2) - 1)."""
+|L(jw)| = 1 at (w / a)^2 = 2 + 2 sqrt(2); the phase margin there, atan(w / a), is acos(sqrt(2) - 1)."""
 
 DEFAULT_CAR = LINCOLN_MKZ
-"""The simulator's car; of its parameters the model takes those of the lateral motion at small slip."""
+"""The simulator's car; the model uses its parameters of the lateral motion at small slip."""
 
-_LONGEST_DELAY_S = 3.0  # past every delay that is of interest; the search ends there
+_LONGEST_DELAY_S = 3.0  # beyond every delay of interest; the search ends there
 _SEARCH_STEP_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class LateralLoop:
-    """A car at a speed, seen at a frame rate, steered by pure pursuit with lookahead = `lookahead_s` x speed."""
+    """A car at constant speed with a camera, steered by pure pursuit with a lookahead of `lookahead_s` x speed."""
 
     lookahead_s: float
     speed_mps: float = 30 / 3.6
     frame_rate_hz: float = 30.0
     smoothing: float = SMOOTHING
-    """Weight of the newest picture in the moving average; 1 is none."""
+    """The weight of the newest picture in the moving average; 1 is no averaging."""
     car: CarParameters = DEFAULT_CAR
-    supposed_wheelbase_m: float | None = None
-    """What the controller takes for the car's wheelbase; None: what it is."""
+    controller_wheelbase_m: float | None = None
+    """The wheelbase that the controller assumes; None: the car's."""
 
     @property
     def gain(self) -> FloatArray:
-        """Pure pursuit on (lateral error of the rear axle, heading error), a row of 2."""
+        """The gains of pure pursuit on (lateral error of the rear axle, heading error), (2,)."""
         distance_m = self.lookahead_s * self.speed_mps
-        wheelbase_m = self.supposed_wheelbase_m or self.car.wheelbase_m
+        wheelbase_m = self.controller_wheelbase_m or self.car.wheelbase_m
         return -2 * wheelbase_m / distance_m**2 * np.array([1.0, distance_m])
 
 
 def configured_loop(config: RunConfig) -> LateralLoop | None:
-    """Give the loop as a run has it: preset and what replaces its settings, frame rate, car with lags and dead time.
+    """Return the loop of a run: preset with its changed settings, frame rate, car with lags and dead time.
 
-    The lookahead is the one driven at the preset's speed, within the controller's bounds. None where the car or the
-    controller is not of LAVT: nothing is known of them. Raises `UserError` for a preset or car that does not exist.
+    The lookahead is that at the preset's speed, within the controller's bounds. None where the car or the controller is
+    not LAVT's, as there is no model of it. Raises `UserError` for a preset or car that does not exist.
     """
     controller, vehicle = config.controller, config.vehicle
     if (controller.kind, vehicle.kind) != ("lane_keeper", "simulator"):
@@ -84,12 +84,12 @@ def configured_loop(config: RunConfig) -> LateralLoop | None:
         speed_mps=preset.speed_mps,
         frame_rate_hz=config.camera.rate_hz,
         car=car_of(vehicle),
-        supposed_wheelbase_m=controller.wheelbase_m,
+        controller_wheelbase_m=controller.wheelbase_m,
     )
 
 
 def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
-    """Give A (5 x 5) and B (5,) of the car in continuous time.
+    """Return A (5 x 5) and B (5,) of the car in continuous time.
 
     States: lateral speed of the centre of gravity, yaw rate, lateral error of the rear axle, heading error, wheel
     angle.
@@ -110,17 +110,17 @@ def plant(loop: LateralLoop) -> tuple[FloatArray, FloatArray]:
 
 
 def _advance(a: FloatArray, b: FloatArray, duration_s: float) -> tuple[FloatArray, FloatArray]:
-    """Give the transition of the state over `duration_s`, and what a constant command of 1 adds in it."""
+    """Return the state transition over `duration_s`, and the state change by a constant command of 1 in it."""
     size = len(b)
-    joined = np.zeros((size + 1, size + 1))
-    joined[:size, :size], joined[:size, size] = a, b
-    moved = np.asarray(expm(joined * duration_s), dtype=np.float64)
-    return moved[:size, :size], moved[:size, size]
+    augmented = np.zeros((size + 1, size + 1))
+    augmented[:size, :size], augmented[:size, size] = a, b
+    transition = np.asarray(expm(augmented * duration_s), dtype=np.float64)
+    return transition[:size, :size], transition[:size, size]
 
 
 @dataclass(frozen=True, slots=True)
 class _SampledPlant:
-    """The plant from frame to frame: x' = transition x + by_old u[k - frames - 1] + by_new u[k - frames]."""
+    """The plant sampled once per frame: x' = transition x + by_old u[k - frames - 1] + by_new u[k - frames]."""
 
     transition: FloatArray
     by_old: FloatArray
@@ -141,17 +141,17 @@ def _sampled(loop: LateralLoop, total_delay_s: float) -> _SampledPlant:
 
 
 def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
-    """Give the matrix that takes the closed loop from one frame to the next.
+    """Return the state transition matrix of the closed loop over one frame.
 
-    The state is the car's five, then the commands u[k - 1], u[k - 2] .. as far back as one still acts. The newest of
-    them is the memory of the moving average, because averaging the command is averaging the lane it is linear in.
+    The state is the car's five states, followed by the commands u[k - 1], u[k - 2] .. that still act. The newest of
+    them is the state of the moving average: the command is linear in the lane, so averaging either is the same.
     """
     sampled = _sampled(loop, total_delay_s)
-    size, kept = 5, sampled.frames + 1
-    command = np.zeros(size + kept)  # u[k] as a row on (x[k], u[k - 1], ..)
+    size, past = 5, sampled.frames + 1
+    command = np.zeros(size + past)  # u[k] as a row on (x[k], u[k - 1], ..)
     command[2:4] = loop.smoothing * loop.gain
     command[size] = 1 - loop.smoothing
-    step = np.zeros((size + kept, size + kept))
+    step = np.zeros((size + past, size + past))
     step[:size, :size] = sampled.transition
     step[:size, size + sampled.frames] += sampled.by_old
     if sampled.frames == 0:
@@ -159,17 +159,17 @@ def closed_loop(loop: LateralLoop, total_delay_s: float) -> FloatArray:
     else:
         step[:size, size + sampled.frames - 1] += sampled.by_new
     step[size] = command
-    step[size + 1 :, size:-1] = np.eye(kept - 1)
+    step[size + 1 :, size:-1] = np.eye(past - 1)
     return step
 
 
 def spectral_radius(loop: LateralLoop, total_delay_s: float) -> float:
-    """Give the factor by which the slowest mode grows in one frame; below 1 the loop is stable."""
+    """Return the factor by which the slowest mode grows per frame; the loop is stable if it is below 1."""
     return float(np.max(np.abs(np.linalg.eigvals(closed_loop(loop, total_delay_s)))))
 
 
 def critical_delay_s(loop: LateralLoop) -> float:
-    """Give the smallest total delay in seconds at which `loop` is not stable any more; infinite past 3 s."""
+    """Return the delay margin: the smallest total delay in seconds at which `loop` is unstable; infinite above 3 s."""
     for number in range(int(_LONGEST_DELAY_S / _SEARCH_STEP_S)):
         if spectral_radius(loop, number * _SEARCH_STEP_S) >= 1:
             if number == 0:
@@ -183,7 +183,7 @@ def critical_delay_s(loop: LateralLoop) -> float:
 
 
 def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: FloatArray) -> ComplexArray:
-    """Give the frequency response from command to command, cut open at the controller's output, (n,)."""
+    """Return the frequency response of the open loop, cut at the controller's output, (n,)."""
     z = np.exp(1j * frequencies_radps / loop.frame_rate_hz)[:, np.newaxis]
     delayed = sampled.by_new * z**-sampled.frames + sampled.by_old * z ** -(sampled.frames + 1)
     resolvents = z[..., np.newaxis] * np.eye(5) - sampled.transition
@@ -193,7 +193,7 @@ def _response(loop: LateralLoop, sampled: _SampledPlant, frequencies_radps: Floa
 
 
 def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
-    """Give the phase in radians that is left at the highest frequency where the loop gain falls through 1.
+    """Return the phase margin in radians at the highest frequency where the loop gain falls through 1.
 
     Negative where the loop is unstable; infinite where the gain never reaches 1.
     """
@@ -211,16 +211,18 @@ def phase_margin_rad(loop: LateralLoop, total_delay_s: float) -> float:
         low=float(frequencies[last]),
         high=float(frequencies[last + 1]),
     )
-    # Unwrapped from the low end, where two integrations make it -180 degrees: a margin below -180 stays one.
+    # The phase is unwrapped from low frequencies, where two integrators make it -180 degrees, so that a margin below
+    # -180 degrees remains negative.
     upwards = np.append(frequencies[: last + 1], crossover)
     phases = np.unwrap(np.angle(_response(loop, sampled, upwards)))
     return float(math.pi + phases[-1] - (2 * math.pi if phases[0] > 0 else 0.0))
 
 
 def smallest_lookahead_s(margin_rad: float, total_delay_s: float) -> float:
-    """Give the smallest lookahead in seconds that leaves `margin_rad` of phase at `total_delay_s`.
+    """Return the smallest lookahead in seconds with a phase margin of `margin_rad` at `total_delay_s`.
 
-    Everything else is the default of `LateralLoop`. The margin grows with the lookahead, because the crossover falls.
+    Everything else is the default of `LateralLoop`. The margin grows with the lookahead, as the crossover frequency
+    falls.
     """
     return _crossing(
         lambda lookahead_s: phase_margin_rad(LateralLoop(lookahead_s), total_delay_s) - margin_rad, low=0.3, high=5.0
@@ -228,7 +230,7 @@ def smallest_lookahead_s(margin_rad: float, total_delay_s: float) -> float:
 
 
 def _crossing(function: Callable[[float], float], low: float, high: float) -> float:
-    """Bisect for the place in [low, high] where `function` rises through 0."""
+    """Find the value in [low, high] at which `function` rises through 0, by bisection."""
     for _ in range(30):
         middle = (low + high) / 2
         if function(middle) < 0:

@@ -1,4 +1,4 @@
-"""Whether the swing of a car on a straight road grows or dies away, measured on a drive without limits."""
+"""The oscillation growth of a loop: whether a car's oscillation on a straight road grows or decays, by measurement."""
 
 from __future__ import annotations
 
@@ -11,61 +11,61 @@ import numpy as np
 from lavt.assembly.entropy import run_seed
 from lavt.config import RunConfig
 from lavt.domain import FloatArray
-from lavt.experiment.runs.monitored_run import MonitoredRun, watch_drive
+from lavt.experiment.runs.monitored_run import MonitoredRun, drive_monitored
 from lavt.experiment.runs.plan import PlannedRun, plan_run
 from lavt.vehicle.sim.simulator import start_of
 
 ROAD = "straight"
-LONGEST_S = 45.0
-"""Of a drive, from before the arming on."""
+DRIVE_LIMIT_S = 45.0
+"""The longest drive, including the time before arming."""
 CALM_START = (0.02, math.radians(0.2))
-"""At most so far aside and turned a car begins: a swing that is small has room to grow."""
+"""The largest initial distance from the lane's centre (m) and heading error (rad): a small oscillation can grow."""
 
 SETTLED_SHARE = 0.01
-"""The speed has settled when it stays this near to the one the drive ends with."""
-SMALL_SWING_M = 0.2
-"""So far from the centre tyres, wheel and commands are far from every limit, and the loop is linear."""
-HALF_SWINGS_AT_LEAST = 4
+"""The speed has settled when it stays this close to the final speed."""
+LINEAR_RANGE_M = 0.2
+"""Within this distance from the centre, tyres, wheel and commands are far from every limit, and the loop is linear."""
+FEWEST_HALF_PERIODS = 4
 
 
-def half_swings(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Give time and size of the largest distance from the centre in each whole half swing.
+def half_period_peaks(time_s: FloatArray, cross_track_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return time and size of the largest distance from the centre in each complete half period.
 
-    A half swing reaches from one crossing of the centre to the next.
+    A half period reaches from one crossing of the centre to the next.
     """
     crossings = np.flatnonzero(np.diff(np.signbit(cross_track_m))) + 1
-    size_m = np.abs(cross_track_m)
-    largest = [begin + int(np.argmax(size_m[begin:end])) for begin, end in itertools.pairwise(crossings)]
-    return time_s[largest], size_m[largest]
+    distance_m = np.abs(cross_track_m)
+    peaks = [start + int(np.argmax(distance_m[start:end])) for start, end in itertools.pairwise(crossings)]
+    return time_s[peaks], distance_m[peaks]
 
 
 def growth_per_s(drive: MonitoredRun) -> float:
-    """Give the rate in 1/s at which the swing grows, negative where it dies away: d/dt of the logarithm of its size.
+    """Return the oscillation growth in 1/s: the derivative of the logarithm of its size, negative for a decay.
 
-    It is the slope of the straight line of least squares through the logarithms of the largest distances from the
-    centre in each half swing, from when the speed has settled until the swing is over `SMALL_SWING_M` or the vehicle's
-    safety changes a command. With fewer than four half swings in there it is infinite: positive where the swing was
-    over before, negative where it died away without swinging, or where nobody drove.
+    It is the slope of the least-squares line through the logarithms of the peaks of all half periods, from the time at
+    which the speed has settled until the distance from the centre exceeds `LINEAR_RANGE_M` or a safety limit changes a
+    command. With fewer than four half periods it is infinite: positive where the range was exceeded, negative where
+    there was no oscillation or no drive.
     """
     if len(drive.time_s) == 0:
         return -math.inf
     unsettled = np.flatnonzero(np.abs(drive.speed_mps / drive.speed_mps[-1] - 1) > SETTLED_SHARE)
-    begin = int(unsettled[-1]) + 1 if len(unsettled) else 0
-    begin_s = float(drive.time_s[min(begin, len(drive.time_s) - 1)])
-    limited_s = drive.limited_s[drive.limited_s >= begin_s]
-    large_s = drive.time_s[(drive.time_s >= begin_s) & (np.abs(drive.cross_track_m) > SMALL_SWING_M)]
+    start = int(unsettled[-1]) + 1 if len(unsettled) else 0
+    start_s = float(drive.time_s[min(start, len(drive.time_s) - 1)])
+    limited_s = drive.limited_s[drive.limited_s >= start_s]
+    large_s = drive.time_s[(drive.time_s >= start_s) & (np.abs(drive.cross_track_m) > LINEAR_RANGE_M)]
     end_s = min((float(times[0]) for times in (limited_s, large_s) if len(times)), default=math.inf)
-    within = (drive.time_s >= begin_s) & (drive.time_s < end_s)
-    time_s, size_m = half_swings(drive.time_s[within], drive.cross_track_m[within])
-    if len(time_s) < HALF_SWINGS_AT_LEAST:
+    within = (drive.time_s >= start_s) & (drive.time_s < end_s)
+    time_s, peak_m = half_period_peaks(drive.time_s[within], drive.cross_track_m[within])
+    if len(time_s) < FEWEST_HALF_PERIODS:
         return -math.inf if end_s == math.inf else math.inf
-    return float(np.polyfit(time_s, np.log(size_m), 1)[0])
+    return float(np.polyfit(time_s, np.log(peak_m), 1)[0])
 
 
 def straight_run(config: RunConfig) -> PlannedRun:
-    """Plan the drive of `config` on a straight road instead of its route, with a calm start.
+    """Plan the run of `config` on a straight road instead of its route, with a calm start.
 
-    Its seed is the first of a series that belongs to the run's own, for which the start lies within `CALM_START`.
+    Its seed is the first in a series derived from the run's own seed whose start lies within `CALM_START`.
     """
     vehicle = config.vehicle.model_copy(update={"route": ROAD})
     planned = plan_run(config.model_copy(update={"vehicle": vehicle}), name=ROAD)
@@ -74,18 +74,18 @@ def straight_run(config: RunConfig) -> PlannedRun:
 
 
 def calm_seed(seed: int) -> int:
-    """Give the first seed of a series, which belongs to `seed`, that has a calm start."""
-    most_m, most_rad = CALM_START
+    """Return the first seed with a calm start in the series that is derived from `seed`."""
+    limit_m, limit_rad = CALM_START
     seeds = (run_seed(seed, ROAD, number) for number in itertools.count())
     return next(
         each
         for each in seeds
-        for _, aside_m, turned_rad in [start_of(each)]
-        if abs(aside_m) <= most_m and abs(turned_rad) <= most_rad
+        for _, offset_m, heading_rad in [start_of(each)]
+        if abs(offset_m) <= limit_m and abs(heading_rad) <= limit_rad
     )
 
 
 def straight_growth(config: RunConfig) -> tuple[float, float]:
-    """Drive `config` straight on, and give the total delay in ms and the growth of the swing in 1/s."""
-    drive = watch_drive(straight_run(config), limit_s=LONGEST_S)
+    """Drive `config` on the straight road, and return the total delay in ms and the oscillation growth in 1/s."""
+    drive = drive_monitored(straight_run(config), limit_s=DRIVE_LIMIT_S)
     return drive.total_delay_ms, growth_per_s(drive)

@@ -1,1 +1,1 @@
-"""Single runs: planned, driven in real or virtual time, and joined from the records of both sides."""
+"""Single runs: planning, driving in real or virtual time, and joining the records of two machines."""

@@ -1,4 +1,4 @@
-"""Two machines' directories made into one run directory: what `lavt server` and `lavt client` left of a drive."""
+"""Joining the directories that `lavt server` and `lavt client` wrote on two machines into one run directory."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from lavt.recording.table import MISSING
 SIDES = ("server", "client")
 
 
-def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
-    """Make the run directory `out` of what two sides wrote, compute its result, and give that.
+def join_sides(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
+    """Create the run directory `out` from the directories of two sides, and return its result.
 
     Raises `UserError` where a directory is not that of its side, or the two were not written in the same drive.
     """
@@ -32,7 +32,7 @@ def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
     for side, directory in zip(SIDES, (server_dir, client_dir), strict=True):
         for name in (CONFIG, f"{side}.mcap"):
             if not (directory / name).is_file():
-                raise UserError(f"{directory} holds no {name}: name the --out of `lavt {side}`")
+                raise UserError(f"{directory} has no {name}: name the --out of `lavt {side}`")
     server, client = load_config(ServerConfig, server_dir / CONFIG), load_config(ClientConfig, client_dir / CONFIG)
     _check_same_drive(server_dir / "server.mcap", client_dir / "client.mcap")
     run = run_config(server, client)
@@ -45,7 +45,7 @@ def join(server_dir: Path, client_dir: Path, out: Path) -> dict[str, Any]:
 
 
 def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
-    """Give the config of the run that two sides have driven, as if it had been one machine's."""
+    """Return the config of a run of two sides, as if both had been on one machine."""
     requested = client.injection
     return RunConfig(
         vehicle=server.vehicle,
@@ -53,7 +53,7 @@ def run_config(server: ServerConfig, client: ClientConfig) -> RunConfig:
         camera=server.camera,
         video=VideoConfig(
             **{key: getattr(server.video, key) for key in VideoConfig.model_fields}
-            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client's is the one in force
+            | {"reorder_hold_ms": client.video.reorder_hold_ms}  # the client applies its own
         ),
         network=NetworkConfig(
             condition=requested.condition or "L0",
@@ -87,13 +87,13 @@ def _identity(name: str, run: RunConfig, client: ClientConfig) -> dict[str, Any]
 
 
 def _check_same_drive(server: Path, client: Path) -> None:
-    """Raise `UserError` where the client has read no stamp that the server wrote while it was driven."""
-    vehicle = read_record(server, channels=("event", "frame"))
-    began_ns, ended_ns, _ = driving_interval(vehicle)
-    written = frames_within(vehicle.table("frame"), began_ns, ended_ns).ints("stamp_ns")
+    """Raise `UserError` where the client has read no stamp that the server wrote during the drive."""
+    server_record = read_record(server, channels=("event", "frame"))
+    began_ns, ended_ns, _ = driving_interval(server_record)
+    written = frames_within(server_record.table("frame"), began_ns, ended_ns).ints("stamp_ns")
     read = read_record(client, channels=("picture",)).table("picture").ints("stamp_ns")
     if not np.isin(read[read != MISSING], written).any():
         raise UserError(
-            f"{client} has no picture of {server}: name two directories of the same drive; of a server that was "
-            "driven several times only the first drive is joined"
+            f"{client} has no picture of {server}: name two directories of the same drive; of a server with several "
+            "drives, only the first can be joined"
         )

@@ -1,4 +1,4 @@
-"""A drive in virtual time that leaves no record: what was seen of it, for searches that drive many hundred times."""
+"""A drive in virtual time that is monitored in memory instead of recorded, for searches with many hundred drives."""
 
 from __future__ import annotations
 
@@ -16,59 +16,59 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.virtual_run import EndingTap, build_loop, drive
 from lavt.nodes.payloads import Admission, FrameWritten
 
-KEPT = frozenset({"truth", "event", "frame", "admission"})
-
+CHANNELS = frozenset({"truth", "event", "frame", "admission"})
+"""The channels that are kept in memory."""
 
 NEVER_NS = 2**62
-"""When a drive began that did not."""
+"""The start of a drive that did not begin."""
 
 
 class InMemoryRecorder:
-    """A recorder that keeps the payloads of a few channels in memory."""
+    """A recorder that keeps the payloads of `CHANNELS` in memory."""
 
     def __init__(self) -> None:
         self.payloads: defaultdict[str, list[Any]] = defaultdict(list)
 
-    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (a recorder is told when)
-        """Keep one entry."""
-        if topic in KEPT:
+    def write(self, topic: str, payload: Any, now: Now) -> None:  # noqa: ARG002 (part of the protocol)
+        """Keep the payload if it is of one of `CHANNELS`."""
+        if topic in CHANNELS:
             self.payloads[topic].append(payload)
 
 
 @dataclass(frozen=True, slots=True)
 class MonitoredRun:
-    """What was seen of one drive, from its beginning to its ending; no rows where the vehicle was never armed."""
+    """The monitored quantities of one drive from its start to its ending; no rows where the vehicle was never armed."""
 
     ending: str | None
     lane_invasions: int
     total_delay_ms: float
-    """Median over frames from the middle of exposure to the first obeyed command made from them; NaN without one."""
+    """The median over frames from the middle of exposure to the first accepted command; NaN without any."""
     time_s: FloatArray
-    """Since the beginning; of each row of the three below."""
+    """The times since the start, for each row of `cross_track_m` and `speed_mps`."""
     cross_track_m: FloatArray
     speed_mps: FloatArray
     limited_s: FloatArray
-    """When commands were changed by a limit of the vehicle's safety."""
+    """The times since the start at which a safety limit of the vehicle changed a command."""
 
 
-def watch_drive(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
-    """Drive, keeping in memory what is watched.
+def drive_monitored(planned: PlannedRun, *, limit_s: float = 3600.0) -> MonitoredRun:
+    """Drive a run in virtual time without records, and return its monitored quantities.
 
-    It is the drive that `run_once` makes, but for its records: they are begun in a temporary directory that is removed.
+    The drive is the same as that of `run_once`. Its records are created in a temporary directory and stay empty.
     """
     cv2.setNumThreads(1)
-    keeper = InMemoryRecorder()
+    recorder = InMemoryRecorder()
     with TemporaryDirectory() as directory:
         loop = build_loop(planned, Path(directory) / "run")
-        tap = EndingTap(keeper)
+        tap = EndingTap(recorder)
         loop.runtime.hosts["server"].recorder = tap
         loop.runtime.hosts["client"].recorder = InMemoryRecorder()
         drive(replace(loop, tap=tap), limit_ns=round(limit_s * NS_PER_S))
-    return watched(keeper.payloads)
+    return summarize_drive(recorder.payloads)
 
 
-def watched(payloads: dict[str, list[Any]]) -> MonitoredRun:
-    """Make of the payloads of each channel of the server what is known of the drive."""
+def summarize_drive(payloads: dict[str, list[Any]]) -> MonitoredRun:
+    """Return the monitored quantities of a drive, from the payloads of each channel of the server."""
     began_ns = next((event.mono_ns for event in payloads["event"] if event.kind == "drive_began"), NEVER_NS)
     ended = next(((each.mono_ns, each.detail) for each in payloads["event"] if each.kind == "ending"), None)
     ended_ns, ending = ended or (payloads["truth"][-1].mono_ns, None)
@@ -92,7 +92,7 @@ def watched(payloads: dict[str, list[Any]]) -> MonitoredRun:
 
 
 def _total_delay_ms(frames: list[FrameWritten], accepted: list[Admission]) -> float:
-    """Give the median time from the middle of exposure to the first obeyed command that was made from the frame."""
+    """Return the median time from the middle of a frame's exposure to its first accepted command."""
     captured_ns = {frame.stamp_ns: frame.capture_ns for frame in frames if frame.capture_ns is not None}
     first_ns: dict[int, int] = {}
     for command in accepted:

@@ -1,4 +1,4 @@
-"""A run on one machine whose delay is the kernel's: netem on the loopback, measured before and after the drive."""
+"""A run on one machine with netem on the loopback interface, whose delay is measured before and after the drive."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from lavt.transport.netem.probe import ProbeResult, judge
 from lavt.transport.netem.state import flows_from
 
 NETEM = "netem.json"
-"""In a run directory: what was asked of netem, and what was measured before and after the drive."""
+"""In a run directory: the flows requested of netem, and the measurements before and after the drive."""
 LOOPBACK = "lo"
-DISCARD = 9
-"""A port that nobody uses (RFC 863)."""
+DISCARD_PORT = 9
+"""A port without traffic (RFC 863)."""
 
 
 def check_netem(planned: PlannedRun) -> list[str]:
-    """Raise `UserError` where a run wants netem and cannot have it; tell what was put back after a crash.
+    """Raise `UserError` where a run needs netem but it is unavailable; return what was restored after a crash.
 
-    It is tried, with nothing to hold: whether there are root, tc and a netem in the kernel is not known before.
+    The check applies netem to an unused port, because only that shows whether root, tc and the kernel's netem exist.
     """
-    if not by_netem(planned):
+    if not uses_netem(planned):
         return []
     with NetemInterface(LOOPBACK) as netem:
         restored = netem.check()
-        netem.apply([ImpairedFlow("video", "udp", DISCARD, "source", Impairment())])
+        netem.apply([ImpairedFlow("video", "udp", DISCARD_PORT, "source", Impairment())])
         return restored
 
 
-def by_netem(planned: PlannedRun) -> bool:
-    """Whether netem injects the delay of a run."""
+def uses_netem(planned: PlannedRun) -> bool:
+    """Return whether netem injects the delay of a run."""
     return planned.config.time == "real" and planned.config.network.injection == "netem"
 
 
 class NetemRun:
-    """Holds the flows of one run on the loopback while it is entered, and leaves the loopback as it was.
+    """A context manager that delays the flows of one run on the loopback, and restores the loopback at its end.
 
-    Raises `UserError` before anything is changed where netem cannot be had.
+    Entering it raises `UserError` where netem is unavailable, before anything is changed.
     """
 
     def __init__(self, planned: PlannedRun, netem: NetemInterface | None = None) -> None:
@@ -64,31 +64,38 @@ class NetemRun:
         self._netem.clear()
 
     def apply(self, *, video_port: int, control_port: int) -> None:
-        """Hold the flows of the condition from now on, and measure what happens to them."""
+        """Start to delay the flows of the condition, and measure their delay."""
         network = self._network
         self._flows = netem_flows(
-            self._requested, "both", video_port=video_port, control_port=control_port,
+            self._requested,
+            "both",
+            video_port=video_port,
+            control_port=control_port,
             state_delay=network.state_delay,
-        )  # fmt: skip
+        )
         commands = self._netem.apply(self._flows, condition=network.condition)
         self._report = {
             "restored": self._restored,
             "commands": commands,
             "flows": [asdict(flow) for flow in self._flows],
-            "before": self._measured(),
+            "before": self._measure(),
         }
 
     def report(self) -> dict[str, Any]:
-        """Measure again, and tell what was asked and what was measured: the content of `netem.json`."""
-        after = self._measured()
-        return {**self._report, "after": after, "read_back": self._netem.read_back(self._flows) + self._netem.doubts()}
+        """Measure again, and return the requested flows with all measurements: the content of `netem.json`."""
+        after = self._measure()
+        return {
+            **self._report,
+            "after": after,
+            "read_back": self._netem.read_back(self._flows) + self._netem.problems(),
+        }
 
-    def _measured(self) -> dict[str, Any]:
+    def _measure(self) -> dict[str, Any]:
         return {name: asdict(each) for name, each in self._netem.measure(self._flows).items()}
 
 
 def netem_reasons(report: Mapping[str, Any]) -> list[str]:
-    """Compare what netem did with what was asked of it (the content of `netem.json`), in sentences."""
+    """Return a reason for each difference between netem's requested and measured behaviour in `netem.json`."""
     try:
         flows = flows_from(report["flows"])
         reasons = [str(each) for each in report["read_back"]]

@@ -1,4 +1,4 @@
-"""What the network of a run does: the latency that is there anyway, and what is injected, as laws."""
+"""The network delays of a run: the inherent latency, and the injected delay or impairment."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from lavt.assembly.links import injected
 from lavt.config import Condition, Costs
-from lavt.transport.emulation.delay_line import DelayLaw, Lognormal
+from lavt.transport.emulation.delay_line import DelayModel, Lognormal
 from lavt.transport.emulation.link import LinkInjection
 
 US_PER_MS = 1000.0
@@ -19,14 +19,14 @@ STAMP_TO_STAMP = (
     ("driver", "decode"),
     ("driver", "read_stamp"),
 )
-"""Hops that tau_v contains: a profile's link delay is its total less these."""
+"""The stages in tau_v: the link delay of a profile is its total minus these."""
 SENT_TO_RECEIVED = (("driver", "command"),)
-"""Hops that tau_c contains."""
+"""The stages in tau_c."""
 
 
 @dataclass(frozen=True, slots=True)
 class BaselineLatency:
-    """A named profile of the latency that is there without injection: the whole of tau_v and tau_c."""
+    """The complete tau_v and tau_c of a network profile, without injection."""
 
     video_ms: float
     video_jitter: Lognormal
@@ -41,24 +41,25 @@ INHERENT = {
 
 @dataclass(frozen=True, slots=True)
 class NetworkDelays:
-    """How long things take: video, state (server to client), control (client to server), and what is never held.
+    """The delays of video, state (server to client), control (client to server), and traffic that is never delayed.
 
-    A constant delay that is injected is part of these. Where more is, all that is injected is beside them.
+    They include an injected constant delay. Any other injected impairment is in `video_injected` and
+    `control_injected`, with its constant part.
     """
 
-    video: DelayLaw
-    control: DelayLaw
-    state: DelayLaw
-    unheld: DelayLaw
+    video: DelayModel
+    control: DelayModel
+    state: DelayModel
+    never_delayed: DelayModel
     video_injected: LinkInjection | None = None
     control_injected: LinkInjection | None = None
 
 
 def injected_network(profile: str, condition: Condition, costs: Costs, seed: int, *, state_delay: str) -> NetworkDelays:
-    """Give what must be injected on a loopback to have `condition` on top of the inherent `profile`.
+    """Return the delays to inject on a loopback for `condition` on top of the inherent latency of `profile`.
 
-    `profile` "loopback" adds nothing: the machine's own latency is there anyway. Raises `UserError` for a condition
-    that contradicts itself, and for a trace that is missing or wrong.
+    The profile "loopback" adds nothing to the machine's own latency. Raises `UserError` for a contradictory condition,
+    and for a trace that is missing or invalid.
     """
     inherent = INHERENT.get(profile)
     video_ms, jitter, control_ms = 0.0, None, 0.0
@@ -70,28 +71,28 @@ def injected_network(profile: str, condition: Condition, costs: Costs, seed: int
     video = injected("video", condition.video_ms, condition.video, seed)
     control = injected("control", condition.control_ms, condition.control, seed)
     return NetworkDelays(
-        DelayLaw(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
-        DelayLaw(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
-        DelayLaw(max(0.0, control_ms) + state_ms),
-        DelayLaw(0.0),
+        DelayModel(max(0.0, video_ms) + (condition.video_ms if video is None else 0.0), jitter, seed, "video inherent"),
+        DelayModel(max(0.0, control_ms) + (condition.control_ms if control is None else 0.0)),
+        DelayModel(max(0.0, control_ms) + state_ms),
+        DelayModel(0.0),
         video,
         control,
     )
 
 
 def virtual_network(requested: NetworkDelays, costs: Costs) -> NetworkDelays:
-    """Add what a real loopback has by itself, as measured."""
+    """Return the delays plus the measured latency of a real loopback."""
     return replace(
         requested,
-        video=_later(requested.video, costs.links_us["video"]),
-        control=_later(requested.control, costs.links_us["control"]),
-        state=_later(requested.state, costs.links_us["state"]),
-        unheld=_later(requested.unheld, costs.links_us["state"]),
+        video=_add_delay(requested.video, costs.links_us["video"]),
+        control=_add_delay(requested.control, costs.links_us["control"]),
+        state=_add_delay(requested.state, costs.links_us["state"]),
+        never_delayed=_add_delay(requested.never_delayed, costs.links_us["state"]),
     )
 
 
-def _later(law: DelayLaw, by_us: float) -> DelayLaw:
-    return DelayLaw(law.constant_ms + by_us / US_PER_MS, law.jitter, law.seed, law.name)
+def _add_delay(law: DelayModel, delay_us: float) -> DelayModel:
+    return DelayModel(law.constant_ms + delay_us / US_PER_MS, law.jitter, law.seed, law.name)
 
 
 def _stages_ms(costs: Costs, stages: tuple[tuple[str, str], ...]) -> float:

@@ -1,4 +1,4 @@
-"""From a config to the runs it asks for, each with its name, its whole config and its identity."""
+"""Planning: the runs of a config, each with its name, its complete config and its identity."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from lavt.config_file import condition, parse_config
 from lavt.errors import UserError
 from lavt.transport.emulation.impairment import check_flows
 
-TAKEN = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
-"""What a sweep varies anyway, by keys of its own."""
+RESERVED_AXES = {"vehicle.route": "routes", "network.condition": "conditions", "repetition": "repetitions"}
+"""The config values that a sweep varies by keys of its own, and these keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """One run: `identity` is what its entry in the summary begins with, `seed` is the run's own."""
+    """A run to be driven: `identity` is the beginning of its `result.json`, `seed` the seed of this run."""
 
     name: str
     config: RunConfig
     identity: Mapping[str, Any]
     seed: int
     requested: Condition
-    """What is asked of the network."""
+    """The requested impairment of the network."""
 
 
 def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | None = None) -> PlannedRun:
-    """Plan one run; raises `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
+    """Plan one run; raise `UserError` for a condition, route, vehicle, controller or preset that does not exist."""
     requested = config.network.requested(condition(config.network.condition))
     check_names(config.vehicle, config.controller)
     _check_injection(config, requested)
-    nothing = config.network.inherent == "loopback" and requested == NO_CONDITION
-    if config.time == "real" and config.network.injection == "none" and not nothing:
+    is_unimpaired = config.network.inherent == "loopback" and requested == NO_CONDITION
+    if config.time == "real" and config.network.injection == "none" and not is_unimpaired:
         raise UserError(
             "network.injection is none, so nothing can delay this run in real time: choose relay, or condition L0 and "
             "inherent loopback"
@@ -73,13 +73,13 @@ def plan_run(config: RunConfig, *, name: str = "run", axes: Mapping[str, Any] | 
 
 
 def injected_entry(requested: Condition) -> dict[str, Any]:
-    """Say what is injected (None: a trace's) and, where that is not all, how much of it there must be at least."""
+    """Return `injected_ms` (None for the delay of a trace) and, where it differs, the least expected delay."""
     least = {} if requested.least_ms == requested.constant_ms else {"injected_least_ms": requested.least_ms}
     return {"injected_ms": requested.constant_ms, **least}
 
 
 def _check_injection(config: RunConfig, requested: Condition) -> None:
-    """Raise `UserError` where what injects cannot do what the condition or the profile asks, or nobody could."""
+    """Raise `UserError` where the chosen injection cannot do what the condition and the profile require."""
     network = config.network
     if network.state_delay == "with_video" and requested.video.trace:
         raise UserError(
@@ -99,13 +99,13 @@ def _check_injection(config: RunConfig, requested: Condition) -> None:
 
 
 def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
-    """Plan every route under every condition, repeated, over every combination of the further axes.
+    """Plan all runs of a sweep: routes x conditions x repetitions x all combinations of the further axes.
 
-    Raises `UserError` for what `plan_run` refuses, for a sweep of nothing, and for one that asks for a run twice.
+    Raises `UserError` for a run that `plan_run` rejects, for a sweep without runs, and for one with duplicate runs.
     """
-    for key, taken in itertools.product(sweep.axes, TAKEN):
-        if f"{taken}.".startswith(f"{key}."):  # a whole section would change what it holds, too
-            raise UserError(f"the axis {key!r} is not a further one: use {TAKEN[taken]!r} for {taken!r}")
+    for key, reserved in itertools.product(sweep.axes, RESERVED_AXES):
+        if f"{reserved}.".startswith(f"{key}."):  # an axis over a whole section would set the reserved value, too
+            raise UserError(f"the axis {key!r} is not a further one: use {RESERVED_AXES[reserved]!r} for {reserved!r}")
     base = sweep.model_dump(mode="json", exclude={"routes", "conditions", "repetition", "repetitions", "axes"})
     runs = []
     for values in itertools.product(*sweep.axes.values()):
@@ -115,10 +115,10 @@ def plan_sweep(sweep: SweepConfig) -> list[PlannedRun]:
             config = parse_config(RunConfig, _changed(base, changes), "the sweep")
             runs.append(plan_run(config, name=_name(route, name, repetition, axes), axes=axes))
     if not runs:
-        raise UserError("the sweep asks for no run: give routes, conditions and axes at least one value each")
-    twice = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
-    if twice:
-        raise UserError(f"the sweep asks for {twice[0]} more than once: give each route, condition and value once")
+        raise UserError("the sweep has no run: give routes, conditions and axes at least one value each")
+    duplicates = [name for name, count in Counter(run.name for run in runs).items() if count > 1]
+    if duplicates:
+        raise UserError(f"the sweep has the run {duplicates[0]} twice: give each route, condition and value once")
     return runs
 
 
@@ -128,21 +128,21 @@ def _name(route: str, condition_name: str, repetition: int, axes: Mapping[str, A
 
 
 def _changed(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Copy nested sections with some values changed; raises `UserError` for a section that does not exist."""
+    """Return a copy of nested sections with some values changed; raise `UserError` for a missing section."""
     result = dict(base)
     for key, value in changes.items():
-        _change(result, key.split("."), value, key)
+        _set_value(result, key.split("."), value, key)
     return result
 
 
-def _change(section: dict[str, Any], path: Sequence[str], value: Any, key: str) -> None:
+def _set_value(section: dict[str, Any], path: Sequence[str], value: Any, key: str) -> None:
     if len(path) == 1:
         section[path[0]] = value
         return
     inner = section.get(path[0])
     if not isinstance(inner, Mapping):
         raise UserError(
-            f"the axis {key!r} names no config value: write it as in the config, such as video.bit_rate_bps"
+            f"the axis {key!r} is not a config value: write it as in the config, such as video.bit_rate_bps"
         )
     section[path[0]] = dict(inner)
-    _change(section[path[0]], path[1:], value, key)
+    _set_value(section[path[0]], path[1:], value, key)

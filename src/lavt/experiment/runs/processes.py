@@ -1,6 +1,6 @@
-"""Processes of LAVT started by LAVT: each prints JSON lines, and is told to end with SIGINT when its run ends.
+"""Child processes of LAVT that run LAVT: each prints JSON lines, and is ended with SIGINT when its run ends.
 
-Only a run that is killed outright (SIGKILL) leaves its processes behind.
+Only a run that is killed with SIGKILL leaves its processes behind.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from typing import Any
 from lavt.errors import UserError, WorkError
 
 READY_S = 60.0
-"""Importing and preparing takes 1 to 5 s on a quiet machine."""
+"""The time limit of a process for its first line; importing and preparing takes 1 to 5 s on a quiet machine."""
 END_S = 15.0
+"""The time limit of a process for its end after SIGINT; then it is killed."""
 USER_ERROR = 2
-"""Exit code of a program whose input was wrong."""
+"""The exit code of a program whose input was wrong."""
 LAVT = ("-m", "lavt")
-"""What Python runs: the installed program. Tests give a program of their own that breaks a part on purpose."""
+"""Python's arguments for the installed program. Tests replace it by programs with deliberate faults."""
 
 
 class Process:
-    """`lavt ARGUMENTS --json`, its JSON lines on standard output, its messages in a log file."""
+    """A child process `lavt ARGUMENTS --json` with JSON lines on standard output and messages in a log file."""
 
     def __init__(self, name: str, arguments: Sequence[str], log_dir: Path, program: Sequence[str] = LAVT) -> None:
         self.name = name
         self.latest: dict[str, Any] = {}
-        """Newest line."""
+        """The newest line."""
         self._log = log_dir / f"{name}.log"
         self._first: queue.Queue[dict[str, Any] | None] = queue.Queue()
         with self._log.open("wb") as log:
@@ -43,16 +44,16 @@ class Process:
                 stdout=subprocess.PIPE,
                 stderr=log,
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C at the terminal goes to who started it, who ends it in order
+                start_new_session=True,  # the parent alone receives Ctrl-C, and ends its processes in order
                 env={**os.environ, "OPENCV_FOR_THREADS_NUM": "1"},
             )
         self._reader = threading.Thread(target=self._read, name=f"{name} lines", daemon=True)
         self._reader.start()
 
     def ready(self) -> dict[str, Any]:
-        """Wait for the first line.
+        """Wait for the first line, and return it.
 
-        Raises `WorkError` where the process says nothing or ends, and `UserError` where it ends for wrong input.
+        Raises `WorkError` where the process prints nothing or ends, and `UserError` where it ends for wrong input.
         """
         try:
             line = self._first.get(timeout=READY_S)
@@ -66,18 +67,18 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """True while the process has not ended."""
         return self.popen.poll() is None
 
     def said(self) -> str:
-        """Last words on standard error."""
+        """Return the last line on standard error."""
         lines = self._log.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "no message"
 
     def end(self) -> None:
-        """Tell it to end, and see that it does."""
+        """End the process with SIGINT, and kill it where it does not end in time."""
         if self.running:
-            self.popen.send_signal(signal.SIGCONT)  # one that was stopped could not hear
+            self.popen.send_signal(signal.SIGCONT)  # a stopped process would not handle SIGINT
             self.popen.send_signal(signal.SIGINT)
             try:
                 self.popen.wait(END_S)
@@ -89,12 +90,12 @@ class Process:
             self.popen.stdout.close()
 
     def last_line(self) -> dict[str, Any]:
-        """Give the last line that the process printed before it ended."""
+        """Return the last line that the process printed, after its end."""
         self._reader.join()
         return self.latest
 
     def _read(self) -> None:
-        assert self.popen.stdout is not None  # noqa: S101 (a pipe was asked for)
+        assert self.popen.stdout is not None  # noqa: S101 (it is a pipe)
         for text in self.popen.stdout:
             try:
                 line = json.loads(text)
@@ -106,14 +107,14 @@ class Process:
 
 
 class Processes:
-    """Several processes that end together, last started first."""
+    """A context manager of several processes, which it ends in reverse order of their start."""
 
     def __init__(self, log_dir: Path) -> None:
         self.started: list[Process] = []
         self._log_dir = log_dir
 
     def start(self, name: str, *arguments: str, program: Sequence[str] = LAVT) -> Process:
-        """Start one."""
+        """Start a process."""
         process = Process(name, arguments, self._log_dir, program)
         self.started.append(process)
         return process

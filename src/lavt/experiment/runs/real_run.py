@@ -1,6 +1,6 @@
 """One run in real time on this machine: two routers, a server, a client and a relay, each a process of its own.
 
-Or no relay, where netem on the loopback does its work.
+With netem on the loopback there is no relay.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import WorkError
 from lavt.experiment.analysis.results import write_json
 from lavt.experiment.analysis.validity import injection_reasons, lateness_reasons
-from lavt.experiment.runs.netem_run import NETEM, NetemRun, by_netem
+from lavt.experiment.runs.netem_run import NETEM, NetemRun, uses_netem
 from lavt.experiment.runs.network import NetworkDelays, injected_network
 from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.processes import LAVT, Process, Processes
 from lavt.experiment.runs.side_configs import client_config, server_config
 from lavt.experiment.runs.virtual_run import read_costs
-from lavt.transport.emulation.delay_line import DelayLaw
+from lavt.transport.emulation.delay_line import DelayModel
 
 RELAY = "relay.json"
-"""In a run directory: the delays asked of the relay, and for how long it held what it carried."""
-WAYS = {"video": "video downstream", "control": "control upstream"}
-"""The direction of a relayed flow that is delayed."""
+"""In a run directory: the delays requested of the relay, and those that it measured of its packets."""
+DELAYED_DIRECTIONS = {"video": "video downstream", "control": "control upstream"}
+"""The delayed direction of each relayed flow, as `relay.json` names it."""
 LOCAL_TCP = "tcp/127.0.0.1:0"
 SERVER_LISTENS = (LOCAL_TCP, "udp/127.0.0.1:0?rel=1;mixed_rel=1")
-BEGIN_S = 40
-"""The drive has begun by then, or the run has failed."""
-LONGEST_S = 900
-NOTHING = ImpairmentConfig()
+BEGIN_LIMIT_S = 40
+"""The time limit for the start of the drive."""
+RUN_LIMIT_S = 900
+UNIMPAIRED = ImpairmentConfig()
 STATUS_PERIOD_NS = 200 * NS_PER_MS
 
 Progress = Callable[[dict[str, Any], dict[str, Any]], None]
-"""(status of the server, status of the client), several times a second."""
+"""A callback with the status of the server and of the client, called several times a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopProcesses:
-    """The processes of a run. With the relay, the client's side knows nothing of the server's ports but through it."""
+    """The processes of a run. With a relay, the client's side reaches the server's video and control only by it."""
 
     server_router: Process
     server: Process
@@ -58,11 +58,11 @@ class LoopProcesses:
     client_router: Process
     client: Process
     router: str
-    """Endpoint of the client's router: for whoever else is on the client's machine."""
+    """The endpoint of the client's router, for other programs on the client's machine."""
     dialled: str
-    """Endpoint that the client's router dials: the server's router, or the relay in front of it."""
+    """The endpoint to which the client's router connects: the server's router, or the relay in front of it."""
     server_ready: Mapping[str, Any]
-    """What the server told of itself when it was ready."""
+    """The server's `ready` message, with its ports."""
 
 
 def start_loop(
@@ -76,16 +76,15 @@ def start_loop(
     server_program: Sequence[str] = LAVT,
     netem: NetemRun | None = None,
 ) -> LoopProcesses:
-    """Start everything in order, each part told the ports of those before; records go into `out`.
+    """Start all processes in order, each with the ports of those before it; the sides write their records into `out`.
 
-    Without `once` the server stays after the first drive's end. `netem` holds the flows from before the client starts.
+    Without `once` the server keeps running after the first drive. `netem` is applied before the client starts.
     """
     run = planned.config
     server_router, local, remote = _start_router(processes, "server-router", "router-server.json5", SERVER_LISTENS)
-    server = processes.start(
-        "server", "server", _write(work, "server", server_config(run, planned.seed, router=local)),
-        *(["--once"] if once else []), "--out", str(out / "server"), program=server_program,
-    )  # fmt: skip
+    server_yaml = _write(work, "server", server_config(run, planned.seed, router=local))
+    arguments = ("server", server_yaml, *(["--once"] if once else []), "--out", str(out / "server"))
+    server = processes.start("server", *arguments, program=server_program)
     ready = server.ready()["ready"]
     video_port, probe_port = ready["video_port"], ready["probe_port"]
     relay = None
@@ -108,25 +107,25 @@ def start_loop(
 
 
 def start_client_router(processes: Processes, dialled: str, listen: str = LOCAL_TCP) -> tuple[Process, str]:
-    """Start the client's router and tell its endpoint; naming that in `listen` starts it again where it was."""
+    """Start the client's router, and return it with its endpoint; as `listen`, this endpoint restarts it there."""
     router, local, _ = _start_router(processes, "client-router", "router-client.json5", [listen], [dialled])
     return router, local
 
 
 def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = None, clock: Clock | None = None) -> None:
-    """Drive once, leaving the two records in `out` and, of relay or netem, what was asked of it and what it did.
+    """Drive once, and write the two records into `out`, with the requests and measurements of the relay or netem.
 
-    Raises `WorkError` where a part ends or nobody gets to drive; what was recorded by then is left in `out` too.
+    Raises `WorkError` where a process ends early or the drive does not begin; the records up to then stay in `out`.
     """
     clock = clock or MachineClock()
     with TemporaryDirectory(prefix="lavt-") as folder:
         work = Path(folder)
         try:
             with ExitStack() as stack:
-                netem = stack.enter_context(NetemRun(planned)) if by_netem(planned) else None
+                netem = stack.enter_context(NetemRun(planned)) if uses_netem(planned) else None
                 processes = stack.enter_context(Processes(work))
                 loop = start_loop(processes, planned, work, work, netem=netem)
-                _wait_for_the_end(processes, loop, clock, progress)
+                _wait_for_ending(processes, loop, clock, progress)
                 for process in reversed(processes.started):
                     process.end()
                 if loop.relay is not None:
@@ -139,17 +138,18 @@ def drive_real(planned: PlannedRun, out: Path, *, progress: Progress | None = No
                 shutil.move(record, out / record.name)
 
 
-def _wait_for_the_end(processes: Processes, loop: LoopProcesses, clock: Clock, progress: Progress | None) -> None:
+def _wait_for_ending(processes: Processes, loop: LoopProcesses, clock: Clock, progress: Progress | None) -> None:
     start_ns = clock.now().mono_ns
     while loop.server.running and loop.server.latest.get("ending") is None:
-        gone_s = (clock.now().mono_ns - start_ns) / NS_PER_S
+        elapsed_s = (clock.now().mono_ns - start_ns) / NS_PER_S
         status = loop.server.latest.get("status", {})
         ended = next((each for each in processes.started if not each.running and each is not loop.server), None)
         if ended is not None:
             code = ended.popen.returncode  # negative: the signal that ended it
-            raise WorkError(f"{ended.name} ended in the middle of the run with {code}: {ended.said()}")
-        if gone_s > LONGEST_S or (gone_s > BEGIN_S and status.get("safety") in (None, "disarmed", "arming")):
-            raise WorkError(f"the drive did not begin or end within {gone_s:.0f} s: {loop.client.latest} {status}")
+            raise WorkError(f"{ended.name} ended during the run with {code}: {ended.said()}")
+        not_begun = status.get("safety") in (None, "disarmed", "arming")
+        if elapsed_s > RUN_LIMIT_S or (elapsed_s > BEGIN_LIMIT_S and not_begun):
+            raise WorkError(f"the drive did not begin or end within {elapsed_s:.0f} s: {loop.client.latest} {status}")
         if progress is not None:
             progress(status, loop.client.latest.get("status", {}))
         pause(STATUS_PERIOD_NS)
@@ -158,9 +158,9 @@ def _wait_for_the_end(processes: Processes, loop: LoopProcesses, clock: Clock, p
 
 
 def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
-    """Tell the median delay asked of the relay in each direction, that of the inherent profile included.
+    """Return the median delay requested of the relay per flow, including the inherent profile.
 
-    None where more than a constant delay is asked: its median depends on what else is sent.
+    None for a flow with more than a constant delay: its median depends on the other traffic.
     """
     laws = _injected(planned)
     return {
@@ -170,16 +170,16 @@ def _requested_ms(planned: PlannedRun) -> dict[str, float | None]:
 
 
 def relay_reasons(relay: Mapping[str, Any]) -> list[str]:
-    """Compare for how long the relay held what it carried with what was asked of it (the content of `relay.json`).
+    """Return a reason for each flow whose delay in the relay differs from the request (the content of `relay.json`).
 
-    Where more than a constant delay was asked, the times at which packets left are compared with what the law gave.
+    For a flow with more than a constant delay, the send times of packets are compared with those that were planned.
     """
     requested_ms = relay.get("requested_ms", {"video": 0.0, "control": 0.0})
     constant = {flow: delay_ms for flow, delay_ms in requested_ms.items() if delay_ms is not None}
     held, late = relay.get("held_ms", {}), relay.get("late_ms", {})
     return [
-        *injection_reasons(constant, {flow: held.get(WAYS[flow]) for flow in constant}),
-        *lateness_reasons({flow: late.get(WAYS[flow]) for flow in requested_ms if flow not in constant}),
+        *injection_reasons(constant, {flow: held.get(DELAYED_DIRECTIONS[flow]) for flow in constant}),
+        *lateness_reasons({flow: late.get(DELAYED_DIRECTIONS[flow]) for flow in requested_ms if flow not in constant}),
     ]
 
 
@@ -193,7 +193,7 @@ def _injected(planned: PlannedRun) -> NetworkDelays:
 def _start_router(
     processes: Processes, name: str, file: str, listen: Sequence[str], dialled: Sequence[str] = ()
 ) -> tuple[Process, str, str]:
-    """Start a router and tell its local and, for the server's, its remote endpoint."""
+    """Start a router, and return it with its local endpoint and, for the server's router, its remote endpoint."""
     endpoints = {"listen": listen, "connect": dialled}
     changes = [part for key, each in endpoints.items() for part in ("--set", f"{key}.endpoints={json.dumps(each)}")]
     router = processes.start(name, "router", f"zenoh-configs/{file}", *changes)
@@ -214,9 +214,9 @@ def _relay_config(planned: PlannedRun, video_port: int, control_port: int) -> Re
     )
 
 
-def _delay(law: DelayLaw, delay_ms: float = 0.0, impairment: ImpairmentConfig = NOTHING) -> DelayConfig:
+def _delay(law: DelayModel, delay_ms: float = 0.0, impairment: ImpairmentConfig = UNIMPAIRED) -> DelayConfig:
     link = LinkConfig()
-    if impairment != NOTHING:
+    if impairment != UNIMPAIRED:
         requested = impairment.model_dump()
         requested["trace"] = str(trace_path(impairment.trace).absolute()) if impairment.trace else ""
         link = LinkConfig(delay_ms=delay_ms, **requested)

@@ -1,4 +1,4 @@
-"""Driving one planned run into a run directory: config, records, result."""
+"""Driving one planned run, and writing its run directory: config, records, result."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import yaml
 
 from lavt.errors import WorkError
-from lavt.experiment.analysis.drive_data import DriveData, drive_of
+from lavt.experiment.analysis.drive_data import DriveData, extract_drive
 from lavt.experiment.analysis.injection_validity import recorded_reasons
 from lavt.experiment.analysis.results import read_json, run_result, write_json
 from lavt.experiment.runs.netem_run import NETEM, netem_reasons
@@ -23,17 +23,17 @@ from lavt.recording.record import read_record
 CONFIG = "config.yaml"
 RESULT = "result.json"
 NETWORK = "network"
-"""What `inherent` is of a run on two machines: the latency of whatever lies between them."""
+"""The value of `inherent` for a run on two machines: the latency is that of the network between them."""
 
 
 def run_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Drive, compute the result, and leave everything in `out`; raises `WorkError` where nobody got to drive."""
+    """Drive, write everything into `out`, and return the result; raise `WorkError` where the drive did not begin."""
     return dict(drive_once(planned, out, progress=progress).result)
 
 
 def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = None) -> DriveData:
-    """Do what `run_once` does, and give with the result what a report's figures need: the records were read anyway."""
-    cv2.setNumThreads(1)  # with more, sums are in another order, and runs would not repeat
+    """Drive as `run_once`, and return the result with the data for figures, as the records are in memory anyway."""
+    cv2.setNumThreads(1)  # more threads would change the order of summation, and runs would not be reproducible
     check_directory(out)
     digest = None
     if planned.config.time == "virtual":
@@ -51,7 +51,7 @@ def drive_once(planned: PlannedRun, out: Path, *, progress: Progress | None = No
 
 
 def config_text(planned: PlannedRun) -> str:
-    """Write the whole config of a run as YAML."""
+    """Return the complete config of a run as YAML."""
     return yaml.safe_dump(planned.config.model_dump(mode="json"), sort_keys=False)
 
 
@@ -60,7 +60,7 @@ def _write_config(planned: PlannedRun, out: Path) -> None:
 
 
 def compute_result(out: Path, identity: Mapping[str, Any], digest: str | None) -> dict[str, Any]:
-    """Compute `result.json` from what the run left in `out`: its records and what the relay or netem said."""
+    """Compute and write `result.json` from the files in `out`: records, and `relay.json` or `netem.json`."""
     return dict(_compute(out, identity, digest).result)
 
 
@@ -77,4 +77,4 @@ def _compute(out: Path, identity: Mapping[str, Any], digest: str | None) -> Driv
         reasons = netem_reasons(read_json(out / NETEM) if (out / NETEM).is_file() else {})
     result = run_result(identity, server, client, digest=digest, reasons=reasons)
     write_json(out / RESULT, result)
-    return drive_of(server, out, result)
+    return extract_drive(server, out, result)

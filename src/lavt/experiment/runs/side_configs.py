@@ -1,4 +1,4 @@
-"""From the config of a run on one machine to the configs of its two sides."""
+"""The configs of the two sides, from the config of a run on one machine."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lavt.transport.clock_sync import probe
 
 
 def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfig:
-    """Give the server's part of a run: any free port, loopback only."""
+    """Return the server's config of a run, with any free port on the loopback."""
     return ServerConfig(
         vehicle=run.vehicle,
         camera=ServerCameraConfig(**run.camera.model_dump()),
@@ -34,7 +34,7 @@ def server_config(run: RunConfig, seed: int, *, router: str = "") -> ServerConfi
 def client_config(
     run: RunConfig, *, router: str = "", video_port: int = 0, probe_port: int = probe.DEFAULT_PORT
 ) -> ClientConfig:
-    """Give the client's part of a run."""
+    """Return the client's config of a run."""
     return ClientConfig(
         controller=run.controller,
         camera=ClientCameraConfig(**run.camera.model_dump()),

@@ -1,4 +1,4 @@
-"""One run in virtual time: the two sides of the real thing, joined by simulated links."""
+"""One run in virtual time: the nodes of both sides, connected by simulated links."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from lavt.recording.provenance import provenance
 from lavt.recording.record import RecordWriter
 from lavt.runtime.recorder import Recorder
 from lavt.runtime.virtual import HostClock, VirtualHost, VirtualLink, VirtualRuntime, modelled_clock_source
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.emulation.relay import video_index
 
 SERVER_MONO_NS = 1_000 * NS_PER_S
 CLIENT_MONO_NS = 7_000 * NS_PER_S
-"""The monotonic clocks of two machines have nothing to do with each other."""
+"""The monotonic clocks of two machines are unrelated."""
 WALL_NS = 1_790_000_000 * NS_PER_S
-"""True time at the begin of every virtual run: a day of 2026."""
+"""The true time at the start of every virtual run: a day of 2026."""
 CLIENT_ADDRESS = ("198.51.100.2", 40_000)
-"""Of the documentation range (RFC 5737): what the server sees the client's datagrams come from."""
+"""The source address of the client's datagrams, from the documentation range (RFC 5737)."""
 SERVER_VIDEO_PORT = 5600
 ARMING_LIMIT_NS = 30 * NS_PER_S
-LONGEST_NS = 3600 * NS_PER_S
-AFTERWARDS_NS = NS_PER_S // 5
-"""So much is recorded after the ending."""
+RUN_LIMIT_NS = 3600 * NS_PER_S
+AFTER_ENDING_NS = NS_PER_S // 5
+"""The time that is still recorded after the ending."""
 
 
 class EndingTap:
-    """A recorder that passes everything on and notes when the drive has begun and ended."""
+    """A recorder that passes everything on and observes the start and the ending of the drive."""
 
     def __init__(self, writer: Recorder) -> None:
         self.began = False
@@ -54,12 +54,12 @@ class EndingTap:
         self._write = writer.write
 
     def status(self) -> dict[str, Any]:
-        """Tell what a person wants to see of a drive while it goes on."""
+        """Return the newest figures of the drive for display."""
         truth = self._truth
         return {} if truth is None else {"speed_mps": truth.speed_mps, "cross_track_m": truth.cross_track_m}
 
     def write(self, topic: str, payload: Any, now: Now) -> None:
-        """Write one entry."""
+        """Write one entry, and observe it."""
         if topic == "truth":
             self._truth = payload
         elif topic == "event":
@@ -71,7 +71,7 @@ class EndingTap:
 
 @dataclass(frozen=True, slots=True)
 class VirtualLoop:
-    """Everything of a virtual run, before it is run: tests reach in here."""
+    """All parts of a virtual run before it is driven; tests modify them."""
 
     runtime: VirtualRuntime
     server: ServerNodes
@@ -83,12 +83,12 @@ class VirtualLoop:
 
 @functools.cache
 def read_costs() -> Costs:
-    """Read what the loop costs, once."""
+    """Return the shipped costs of the stages and links, which are read only once."""
     return load_config(Costs, shipped("configs/costs.yaml"))
 
 
 def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
-    """Give the clocks of server and client: the client's is true, the server's has an offset and drifts."""
+    """Return the clocks of server and client: the client's is true, the server's has an offset and a drift."""
     return (
         HostClock(SERVER_MONO_NS, WALL_NS, round(config.clocks.offset_ms * 1e6), round(config.clocks.drift_ppm * 1000)),
         HostClock(CLIENT_MONO_NS, WALL_NS),
@@ -96,18 +96,23 @@ def host_clocks(config: RunConfig) -> tuple[HostClock, HostClock]:
 
 
 def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostClock] | None = None) -> VirtualLoop:
-    """Make both sides of a run and the links between them, recording into `out`, which is made where it is not there.
+    """Build both sides of a run and the links between them, which record into `out`; create `out` if needed.
 
-    Raises `UserError` for a config of which nothing can be made, and then leaves no directory behind.
+    Raises `UserError` for an invalid config, before the directory is created.
     """
     config, seed, costs = planned.config, planned.seed, read_costs()
     requested = planned.requested
     server_clock, client_clock = clocks or host_clocks(config)
     fidelity = FIDELITIES[config.fidelity]()
     server = build_server(
-        server_config(config, seed), lambda: server_clock.at(0), SeededEntropy(seed, "server"),
-        host="virtual-server", video_port=SERVER_VIDEO_PORT, fidelity=fidelity, lives_on_demand=True,
-    )  # fmt: skip
+        server_config(config, seed),
+        lambda: server_clock.at(0),
+        SeededEntropy(seed, "server"),
+        host="virtual-server",
+        video_port=SERVER_VIDEO_PORT,
+        fidelity=fidelity,
+        lazy_physics=True,
+    )
     client = build_client(
         client_config(config), lambda: client_clock.at(0), SeededEntropy(seed, "client"), fidelity=fidelity
     )
@@ -138,15 +143,25 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
     error_s, bound_s = config.clocks.error_us / 1e6, config.clocks.bound_us / 1e6
     hosts = [
         VirtualHost(
-            "server", server_clock, server.all, tap, costs_ns,
-            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s), left_out=left_out,
-        ),
-        VirtualHost(
-            "client", client_clock, client.all, writers[1], costs_ns,
-            modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s), CLIENT_ADDRESS,
+            "server",
+            server_clock,
+            server.all,
+            tap,
+            costs_ns,
+            modelled_clock_source(server_clock, "virtual-server", error_s, bound_s),
             left_out=left_out,
         ),
-    ]  # fmt: skip
+        VirtualHost(
+            "client",
+            client_clock,
+            client.all,
+            writers[1],
+            costs_ns,
+            modelled_clock_source(client_clock, "virtual-client", -error_s, bound_s),
+            CLIENT_ADDRESS,
+            left_out=left_out,
+        ),
+    ]
     injected = injected_network(
         config.network.inherent,
         requested,
@@ -159,17 +174,17 @@ def build_loop(planned: PlannedRun, out: Path, *, clocks: tuple[HostClock, HostC
 
 
 def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
-    """Make the links of all channels that cross the network.
+    """Return the links of all channels that cross the network.
 
-    Commands and requests for the session share a path in reality; here each has a line and streams of its own, so that
-    neither changes what happens to the other.
+    In reality, commands and session requests share a path. Here each has its own delay line and random streams, so that
+    neither affects the other.
     """
 
-    def counted(_payload: bytes, count: int) -> int:
+    def packet_count(_payload: bytes, count: int) -> int:
         return count
 
     def link(
-        law: DelayLaw, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = counted
+        law: DelayModel, injected: LinkInjection | None = None, index: Callable[[bytes, int], int] = packet_count
     ) -> VirtualLink:
         return VirtualLink(DelayLine(law, None if injected is None else EmulatedLink(injected)), index)
 
@@ -178,27 +193,27 @@ def virtual_links(network: NetworkDelays) -> dict[str, VirtualLink]:
         "rtp": link(network.video, network.video_injected, lambda payload, _count: video_index(payload)),
         "control": link(network.control, network.control_injected),
         "state": link(network.state),
-        "feedback": link(network.unheld),
+        "feedback": link(network.never_delayed),
         "session": link(network.control, session),
         "session_reply": link(network.state),
-        "probe_request": link(network.unheld),
-        "probe_reply": link(network.unheld),
+        "probe_request": link(network.never_delayed),
+        "probe_reply": link(network.never_delayed),
     }
 
 
-def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS, progress: Callable[[int], None] | None = None) -> None:
-    """Run until the drive has ended and a little longer, until nobody has armed in time, or to the limit.
+def drive(loop: VirtualLoop, *, limit_ns: int = RUN_LIMIT_NS, progress: Callable[[int], None] | None = None) -> None:
+    """Run until shortly after the ending of the drive, until the limit for arming, or until `limit_ns`.
 
-    `progress` is told every second of virtual time, in nanoseconds.
+    `progress` is called with the virtual time in ns, once per second of virtual time.
     """
     runtime, tap = loop.runtime, loop.tap
     if progress is not None:
-        _tell_every_second(runtime, progress)
-    gc.freeze()  # what was built stays to the end: to look through it again and again took 3 % of the time and more
+        _report_every_second(runtime, progress)
+    gc.freeze()  # these objects exist until the end: garbage collections that visit them took over 3 % of the time
     try:
         armed = runtime.run(min(ARMING_LIMIT_NS, limit_ns), lambda: tap.began)
         if armed and runtime.run(limit_ns, lambda: tap.ending is not None):
-            runtime.run(runtime.true_ns + AFTERWARDS_NS, lambda: False)
+            runtime.run(runtime.true_ns + AFTER_ENDING_NS, lambda: False)
         runtime.close()
     finally:
         gc.unfreeze()
@@ -206,9 +221,9 @@ def drive(loop: VirtualLoop, *, limit_ns: int = LONGEST_NS, progress: Callable[[
             writer.close()
 
 
-def _tell_every_second(runtime: VirtualRuntime, progress: Callable[[int], None]) -> None:
-    def tell() -> None:
+def _report_every_second(runtime: VirtualRuntime, progress: Callable[[int], None]) -> None:
+    def report() -> None:
         progress(runtime.true_ns)
-        runtime.at(runtime.true_ns + NS_PER_S, tell)
+        runtime.at(runtime.true_ns + NS_PER_S, report)
 
-    runtime.at(NS_PER_S, tell)
+    runtime.at(NS_PER_S, report)

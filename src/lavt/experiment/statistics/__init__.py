@@ -1,1 +1,1 @@
-"""Summaries of runs: means with confidence intervals, contrasts between conditions, survival."""
+"""Statistics over runs: means with confidence intervals, contrasts between conditions, survival."""

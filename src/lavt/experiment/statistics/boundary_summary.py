@@ -1,4 +1,4 @@
-"""What many seeds say together of a boundary: median, quartiles, and an exact interval of the median."""
+"""Summary of a boundary over many seeds: median, quartiles, and an exact confidence interval of the median."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ CRITERIA = ("onset", "departure", "completion")
 Run = Mapping[str, Any]
 
 
-def groups_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Summarise the runs of each route with each preset, and of all routes together where there are several."""
+def summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Summarize the runs of each route with each preset, and of all routes together where there are several."""
     presets = list(dict.fromkeys(run["preset"] for run in runs))
     routes: list[str | None] = list(dict.fromkeys(run["route"] for run in runs))
     if len(routes) > 1:
@@ -32,37 +32,37 @@ def groups_of(runs: Sequence[Run]) -> list[dict[str, Any]]:
 def _group(runs: Sequence[Run]) -> dict[str, Any]:
     return {
         "n": len(runs),
-        "theory_ms": runs[0]["theory_ms"],  # of the loop, which is one for all routes
-        **{f"{name}_ms": summary([ordered_ms(run, name) for run in runs]) for name in CRITERIA},
+        "theory_ms": runs[0]["theory_ms"],  # a property of the loop, equal for all routes
+        **{f"{name}_ms": summarize_boundaries([ranked_ms(run, name) for run in runs]) for name in CRITERIA},
         "not_monotone": {name: sum(name in run["not_monotone"] for run in runs) for name in CRITERIA},
     }
 
 
-def ordered_ms(run: Run, name: str) -> float:
-    """Give a run's boundary, or where it is among others that were found: infinite beyond the range, or below it."""
+def ranked_ms(run: Run, name: str) -> float:
+    """Return a run's boundary, or an infinite value for one outside the searched range, which has a rank only."""
     value_ms = run[f"{name}_ms"]
     if value_ms is not None:
         return float(value_ms)
     return -math.inf if name in run["below"] else math.inf
 
 
-def summary(values_ms: Sequence[float]) -> dict[str, Any]:
-    """Give quartiles, median and its interval; values out of the searched range are infinite, and have their rank.
+def summarize_boundaries(values_ms: Sequence[float]) -> dict[str, Any]:
+    """Return quartiles, median and the median's confidence interval; values outside the searched range are infinite.
 
-    A quantile is null where it falls among those. The interval is of the two order statistics that hold the median of
-    what the values were drawn from with at least 95 %, whatever their distribution (`scipy.stats.quantile_test`; W. J.
-    Conover, Practical Nonparametric Statistics, section 3.2): null for fewer than six values, and an end is null where
-    it is out of range. `n` is how many values lie in the range.
+    A quantile that falls among infinite values is null. The interval consists of the two order statistics that include
+    the median of the population with at least 95 %, for any distribution (`scipy.stats.quantile_test`; W. J. Conover,
+    Practical Nonparametric Statistics, section 3.2). It is null for fewer than six values, and an end is null where it
+    is out of range. `n` is the number of values in the range.
     """
     quartiles = {f"p{share}": _quantile_ms(values_ms, share / 100) for share in (25, 50, 75)}
     return {**quartiles, "interval": _interval(values_ms), "n": sum(math.isfinite(value) for value in values_ms)}
 
 
 def _quantile_ms(values_ms: Sequence[float], share: float) -> float | None:
-    """Interpolate linearly between neighbours; None where one that counts is out of range."""
+    """Return the quantile, interpolated linearly; None where a value that it depends on is out of range."""
     ordered = sorted(values_ms)
-    place = share * (len(ordered) - 1)
-    first, rest = int(place), place - int(place)
+    position = share * (len(ordered) - 1)
+    first, rest = int(position), position - int(position)
     value = ordered[first] if rest == 0 else (1 - rest) * ordered[first] + rest * ordered[first + 1]
     return float(value) if math.isfinite(value) else None
 

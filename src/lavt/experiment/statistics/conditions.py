@@ -1,4 +1,4 @@
-"""The runs of one condition as one entry of `summary.json`. `docs/metrics.md` has the meaning of every number."""
+"""The summary of a condition's runs, an entry of `summary.json`. `docs/metrics.md` defines every number."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from lavt.experiment.statistics.intervals import bootstrap_interval, exact_interval
-from lavt.experiment.statistics.paired_error import common_p95_m, common_place, worst_rank_m
+from lavt.experiment.statistics.paired_error import common_distances, common_p95_m, worst_rank_m
 from lavt.experiment.statistics.survival import survival
 
 Run = Mapping[str, Any]
-"""An entry of `runs`, as `results.run_result` makes it. One of an older version lacks some keys."""
+"""An entry of `runs`, as `results.run_result` returns it. Entries of older versions lack some keys."""
 
-Places = Mapping[tuple[Any, ...], int]
-"""How far runs are compared, from `compared_error.common_place`."""
+CommonDistances = Mapping[tuple[Any, ...], int]
+"""The distances at which runs are compared, from `paired_error.common_distances`."""
 
 KEY_PART = "_key"
-"""Ends the name of a route that is a part of another: the two are the same road."""
+"""The suffix of a route that is the key part of another: the two are the same road."""
 
 MEANS = (
     "mae_m",
@@ -29,27 +29,27 @@ MEANS = (
     "steering_reversals_per_s",
     "oscillation_hz",
 )
-"""Of these a condition has the mean over its valid runs, as far as they are known."""
+"""The measures whose mean over the valid runs that have them is in a condition's summary."""
 
 
-def by_condition(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
-    """Aggregate runs condition by condition, in order of the conditions' names; they are compared with each other."""
-    members = by_name(runs, "condition")
-    places = common_place([run for each in members.values() for run in each])
-    return {name: condition_summary(members[name], places) for name in sorted(members)}
+def summarize_conditions(runs: Iterable[Run]) -> dict[str, dict[str, Any]]:
+    """Summarize runs by condition, sorted by name; all conditions have the same common distances."""
+    members = group_by(runs, "condition")
+    distances = common_distances([run for each in members.values() for run in each])
+    return {name: summarize_condition(members[name], distances) for name in sorted(members)}
 
 
-def condition_summary(all_runs: Sequence[Run], places: Places) -> dict[str, Any]:
-    """Aggregate the runs of one condition. Runs that are not valid are left out of everything."""
+def summarize_condition(all_runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:
+    """Summarize the valid runs of one condition."""
     runs = [run for run in all_runs if run["valid"]]
-    routes = by_name(runs, "route")
-    p95_m, p95_common_m = _completed_p95_m(runs), common_p95_m(runs, places)
+    routes = group_by(runs, "route")
+    p95_m, p95_common_m = _completed_p95_m(runs), common_p95_m(runs, distances)
     curves = {name: survival(routes[name]) for name in sorted(routes)}
     return {
         **completion(runs),
         "completion_such_roads": bootstrap_interval(road_rates(runs)),
         "endings": dict(sorted(Counter(str(run["ending"]) for run in runs).items())),
-        "routes": {name: _route(routes[name], places) for name in sorted(routes)},
+        "routes": {name: _summarize_route(routes[name], distances) for name in sorted(routes)},
         "collisions_per_run": _mean([run["collisions"] for run in runs]),
         "lane_invasions_per_run": _mean([run["lane_invasions"] for run in runs]),
         "collisions_per_km": _per_km(runs, "collisions"),
@@ -72,7 +72,7 @@ def condition_summary(all_runs: Sequence[Run], places: Places) -> dict[str, Any]
 
 
 def completion(runs: Sequence[Run]) -> dict[str, Any]:
-    """Count how many of these valid runs were completed, with the exact interval."""
+    """Return the completion rate of these valid runs, with its exact interval."""
     completed = sum(run["ending"] == "completed" for run in runs)
     return {
         "runs": len(runs),
@@ -83,36 +83,36 @@ def completion(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def stem_of(route: str) -> str:
-    """Give a route's name, or the path of its file without ".yaml"."""
+    """Return a route's name, or the path of its file without ".yaml"."""
     return route.removesuffix(".yaml").removesuffix(".yml")
 
 
 def road_of(route: str) -> str:
-    """Give the name of the road that a route, or a key part, is of."""
+    """Return the name of the road to which a route or its key part belongs."""
     return stem_of(route).removesuffix(KEY_PART)
 
 
 def road_rates(runs: Sequence[Run]) -> list[float]:
-    """Completion rate of each road: a route and its key part are one, by name or by path."""
+    """Return the completion rate of each road, to which a route and its key part belong, by name or by path."""
     members: dict[str, list[bool]] = {}
     for run in runs:
         members.setdefault(road_of(str(run["route"])), []).append(run["ending"] == "completed")
     return [sum(members[road]) / len(members[road]) for road in sorted(members)]
 
 
-def by_name(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
-    """Sort runs into lists by the text of one of their keys."""
+def group_by(runs: Iterable[Run], key: str) -> dict[str, list[Run]]:
+    """Group runs by the text of one of their keys."""
     members: dict[str, list[Run]] = {}
     for run in runs:
         members.setdefault(str(run[key]), []).append(run)
     return members
 
 
-def _route(runs: Sequence[Run], places: Places) -> dict[str, Any]:
+def _summarize_route(runs: Sequence[Run], distances: CommonDistances) -> dict[str, Any]:
     return {
         **completion(runs),
         "p95_m": _mean(_completed_p95_m(runs)),
-        "p95_common_m": _mean(common_p95_m(runs, places)),
+        "p95_common_m": _mean(common_p95_m(runs, distances)),
     }
 
 
@@ -125,19 +125,19 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _per_km(runs: Sequence[Run], name: str) -> float | None:
-    """All events over all kilometres: a run that ended after a few metres does not outweigh one that drove far."""
+    """Return all events over all kilometres, so that a run of a few metres has no more weight than its distance."""
     driven = [run for run in runs if run.get("distance_m")]
     return sum(run[name] for run in driven) / (sum(run["distance_m"] for run in driven) / 1000) if driven else None
 
 
 def _injected_ms(runs: Sequence[Run]) -> dict[str, Any]:
-    """Say what was asked of the network; the runs of a condition were all asked the same."""
+    """Return the requested delay, which is the same for all runs of a condition."""
     requested: Mapping[str, Any] = next((run["injected_ms"] for run in runs if run.get("injected_ms")), {})
     return {"video": requested.get("video"), "control": requested.get("control")}
 
 
 def _latency(entries: Sequence[Mapping[str, Any]], *, bounded: bool = False) -> dict[str, Any]:
-    """Median over runs of each run's percentiles; the largest bound, null as soon as one run has none."""
+    """Return the median over runs of each percentile, and the largest bound, or None where a run has no bound."""
     known = [entry for entry in entries if entry["n"]]
     summary: dict[str, Any] = {
         name: float(np.median([entry[name] for entry in known])) if known else None for name in ("p5", "p50", "p95")
@@ -155,9 +155,9 @@ def _picture_age_ms(runs: Sequence[Run]) -> dict[str, float | None]:
 
 
 def _stages_ms(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Median over runs of each hop's median, in the order of a frame's life."""
+    """Return the median over runs of each stage's median latency, in the order of the pipeline."""
     p50_ms: dict[tuple[str, str], list[float]] = {}
-    for run in sorted(runs, key=lambda run: -len(run.get("stages_ms") or [])):  # the fullest tells the order
+    for run in sorted(runs, key=lambda run: -len(run.get("stages_ms") or [])):  # the one with most stages is the order
         for entry in run.get("stages_ms") or []:
             p50_ms.setdefault((entry["node"], entry["stage"]), []).append(entry["p50"])
     return [{"node": node, "stage": stage, "p50": float(np.median(each))} for (node, stage), each in p50_ms.items()]

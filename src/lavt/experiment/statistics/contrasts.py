@@ -1,4 +1,4 @@
-"""Planned contrasts between conditions: McNemar's exact test for paired runs, Fisher's for counts alone."""
+"""Planned contrasts between conditions: McNemar's exact test for paired runs, Fisher's exact test for counts."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ PLANNED = (("L0", "L1"), ("L1", "L2"), ("L2", "L3"), ("L2", "L4"), ("L3", "L4"),
 """Chosen before any run was driven: each step of the injected delay, and L3 with L4, whose total delays are equal."""
 
 PAIRED_BY = ("route", "repetition", "seed", "participant", "block")
-"""What two runs of a pair have in common: all but the condition."""
+"""The keys that the two runs of a pair have in common: all but the condition."""
 
 
 def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare completion between conditions, pair by pair, with Holm's correction over all contrasts of the list.
+    """Compare completion between conditions by pairs of runs, with Holm's correction over all returned contrasts.
 
-    A contrast is there where both its conditions were driven. Invalid runs make no pair, and neither do runs that
-    nothing tells apart under one condition. `p` is null without any pair.
+    A contrast is returned if both its conditions were driven. Invalid runs and runs of one condition with equal keys
+    form no pairs. `p` is None without pairs.
     """
     driven = {str(run["condition"]) for run in runs}
     completed = {name: _completed(runs, name) for name in driven}
@@ -36,26 +36,26 @@ def paired_contrasts(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def with_holm(contrasts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Add `p_holm` to contrasts that were planned together."""
+    """Return contrasts that were planned together with the corrected `p_holm` of each."""
     corrected = holm([contrast["p"] for contrast in contrasts])
     return [{**contrast, "p_holm": p} for contrast, p in zip(contrasts, corrected, strict=True)]
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """McNemar's exact p value, two-sided: of the pairs that differ, each way has the chance of a coin's side."""
+    """Return McNemar's exact two-sided p value; null hypothesis: both kinds of differing pairs are equally likely."""
     differing = only_a + only_b
     return float(binomtest(only_a, differing, 0.5).pvalue) if differing else 1.0
 
 
 def fisher(a_completed: int, a_runs: int, b_completed: int, b_runs: int) -> float:
-    """Fisher's exact p value, two-sided, of two counts that are not paired."""
+    """Return Fisher's exact two-sided p value of two unpaired counts."""
     table = [[a_completed, a_runs - a_completed], [b_completed, b_runs - b_completed]]
     return float(fisher_exact(table)[1])
 
 
 def _completed(runs: Sequence[Mapping[str, Any]], condition: str) -> dict[tuple[Any, ...], bool]:
-    """Tell of each valid run of a condition whether it was completed, by what makes it one of a pair."""
+    """Return for each valid run of a condition, by its `PAIRED_BY` keys, whether it was completed."""
     valid = [run for run in runs if run["valid"] and run["condition"] == condition]
     keys = [tuple(run.get(name) for name in PAIRED_BY) for run in valid]
-    alike = Counter(keys)
-    return {key: run["ending"] == "completed" for key, run in zip(keys, valid, strict=True) if alike[key] == 1}
+    counts = Counter(keys)
+    return {key: run["ending"] == "completed" for key, run in zip(keys, valid, strict=True) if counts[key] == 1}

@@ -1,4 +1,4 @@
-"""Intervals and corrections: how far a number from few runs can be trusted. `docs/metrics.md` says what they mean."""
+"""Confidence intervals and corrections for numbers from few runs. `docs/metrics.md` explains their meaning."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ RESAMPLES = 10_000
 
 
 def exact_interval(successes: int, trials: int) -> list[float] | None:
-    """Clopper-Pearson interval of a proportion, 95 %; None without trials.
+    """Return the 95 % Clopper-Pearson interval of a proportion; None without trials.
 
-    It holds for the mean of the trials' probabilities, whatever each of them is (Hoeffding, Annals of Mathematical
+    It is valid for the mean of the trials' probabilities, even if they differ (Hoeffding, Annals of Mathematical
     Statistics 27, 1956, theorem 4): trials on different routes may be pooled.
     """
     if trials == 0:
@@ -24,16 +24,16 @@ def exact_interval(successes: int, trials: int) -> list[float] | None:
     return list(_clopper_pearson(successes, trials))
 
 
-@cache  # a sweep asks for few different ones, many times each
+@cache  # a sweep needs few different intervals, many times each
 def _clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
     interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
     return float(interval.low), float(interval.high)
 
 
 def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
-    """Percentile bootstrap interval of the mean, 95 %; None for fewer than two values.
+    """Return the 95 % percentile bootstrap interval of the mean; None for fewer than two values.
 
-    The resampling has a fixed seed: the same values give the same interval.
+    The resampling has a fixed seed, so the interval is reproducible.
     """
     if len(values) < 2:
         return None
@@ -49,7 +49,7 @@ def bootstrap_interval(values: Sequence[float]) -> list[float] | None:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Correct p values of tests planned together by Holm's method; None, where nothing was tested, stays None."""
+    """Return the p values of tests that were planned together, corrected by Holm's method; None stays None."""
     tested = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0

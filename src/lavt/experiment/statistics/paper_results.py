@@ -1,7 +1,7 @@
-"""The paper's own figures, to stand beside ours, with the intervals and tests that its counts allow.
+"""The paper's results, for comparison with ours, with the intervals and tests that its counts allow.
 
 A. Khalil, J. Kwon, "Nonlinear Performance Degradation of Vision-Based Teleoperation under Network Latency", 2026.
-Six routes, five repetitions: 30 runs a condition. Its completion in percent is given here as the count of 30.
+Six routes, five repetitions: 30 runs per condition. Its completion in percent is converted to a count of 30.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ TABLE = {
     "L4": (150, 75, 211, 83, 9, 0.77, 18.80, 4.64),
     "L5": (225, 100, 287, 108, 3, 0.97, 16.83, 13.15),
 }
-"""Delay injected into video and control (ms), medians measured (ms; control is "about 8 to 10" for L0 to L3)."""
+"""The injected delays of video and control (ms), the measured medians (ms; tau_c is "about 8 to 10" for L0 to L3), and
+the results."""
 
 
 def paper() -> dict[str, Any]:
-    """Give the paper's conditions under the names that ours have, with exact intervals, and its planned contrasts.
+    """Return the paper's conditions with our keys and exact intervals, and its planned contrasts.
 
-    The paper's runs cannot be paired: it publishes no more than counts, so that Fisher's test is what is left.
+    The contrasts are by Fisher's test, as the paper publishes only counts and its runs cannot be paired.
     """
     conditions = {name: _condition(dict(zip(COLUMNS, row, strict=True))) for name, row in TABLE.items()}
     contrasts = [

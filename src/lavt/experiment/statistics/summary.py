@@ -1,4 +1,4 @@
-"""`summary.json`: many runs as conditions. `docs/metrics.md` has the meaning of every number."""
+"""`summary.json`: many runs, summarized by condition. `docs/metrics.md` defines every number."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lavt.experiment.statistics.conditions import Run, by_condition
+from lavt.experiment.statistics.conditions import Run, summarize_conditions
 from lavt.experiment.statistics.contrasts import paired_contrasts
 from lavt.experiment.statistics.paper_results import paper
 
 SCHEMA = 1
 
 GROUPING = ("fidelity", "inherent", "changes", "controller", "preset", "driver")
-"""Besides a sweep's own axes, what runs of one group have in common."""
+"""The keys, besides a sweep's axes, that the runs of one group have in common."""
 
 SWEEP = "sweep"
-"""The same, where runs of several sweeps are reported together: the name of each run's sweep."""
+"""A further such key, the name of a run's sweep, where several sweeps are reported together."""
 
 
 def summarize(
@@ -26,11 +26,11 @@ def summarize(
     base: Mapping[str, Any] | None = None,
     failed: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
-    """Make the whole of `summary.json` of a sweep's runs.
+    """Return the content of `summary.json` for the runs of a sweep.
 
-    `base` names keys of a run (or of its `axes`) and the value each has in the sweep's base config; `conditions` holds
-    the virtual runs that have them all. Without it every virtual run belongs to the base config. `failed` says which
-    runs have no result (`run`), and why (`reason`).
+    `base` has keys of a run (or of its `axes`) with their values in the sweep's base config. `conditions` summarizes
+    the virtual runs with all these values, or all virtual runs without `base`. `failed` lists the runs without a result
+    (`run`, `reason`).
     """
     virtual = [run for run in runs if run["time"] == "virtual"]
     wanted = dict(base or {})
@@ -40,10 +40,10 @@ def summarize(
         "speed": dict(speed) if speed else {"simulated_s": None, "wall_s": None, "jobs": None},
         "runs": [dict(run) for run in runs],
         "failed": [dict(each) for each in failed],
-        "conditions": by_condition(of_base),
+        "conditions": summarize_conditions(of_base),
         "contrasts": paired_contrasts(of_base),
-        "real": by_condition(run for run in runs if run["time"] == "real"),
-        "groups": _groups(virtual),
+        "real": summarize_conditions(run for run in runs if run["time"] == "real"),
+        "groups": _summarize_groups(virtual),
         "paper": paper(),
     }
 
@@ -53,8 +53,8 @@ def _settings(run: Run, names: Iterable[str]) -> dict[str, Any]:
     return {name: axes[name] if name in axes else run.get(name) for name in names}
 
 
-def _groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Every combination of the grouping keys and the further axes that was driven, in the order of the sweep."""
+def _summarize_groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Summarize each driven combination of the grouping keys and the further axes, in the order of the sweep."""
     axes = list(dict.fromkeys(name for run in runs for name in run.get("axes") or {}))
     sweeps = [SWEEP] if any(SWEEP in run for run in runs) else []
     names = [*GROUPING, *sweeps, *(name for name in axes if name not in GROUPING)]
@@ -62,6 +62,6 @@ def _groups(runs: Sequence[Run]) -> list[dict[str, Any]]:
     for run in runs:
         members.setdefault(json.dumps(_settings(run, names), sort_keys=True, default=str), []).append(run)
     return [
-        {**_settings(group[0], names), "conditions": by_condition(group), "contrasts": paired_contrasts(group)}
+        {**_settings(group[0], names), "conditions": summarize_conditions(group), "contrasts": paired_contrasts(group)}
         for group in members.values()
     ]

@@ -1,4 +1,4 @@
-"""How far runs came before they ended early, route by route."""
+"""Survival: the distances at which runs ended early, by route."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from lavt.experiment.statistics.intervals import exact_interval
 
 
 def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Share of the valid runs of one route that still drive, by distance, and the share that has ended in each way.
+    """Return the share of one route's valid runs that still drive, by distance, and the incidence of each ending.
 
-    Steps: each value holds from its `distance_m` on, to the next. Any ending but `completed` is an event at the
-    distance driven; a completed run is censored at the route's length, where the steps end. Runs of unknown distance
-    are left out; None where none is left.
+    Both are step functions: a value applies from its `distance_m` to the next. Any ending but `completed` is an event
+    at the distance driven; a completed run is censored at the route's length, where the steps end. Runs of unknown
+    distance are left out. None without runs.
     """
     runs = [run for run in runs if run.get("distance_m") is not None]
     if not runs:
@@ -24,24 +24,24 @@ def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     length_m = _length_m(runs)
     ended_m = [min(float(run["distance_m"]), length_m) for run in ended]
     lifetimes = CensoredData(uncensored=ended_m, right=[length_m] * (len(runs) - len(ended)))
-    places_m = sorted({0.0, *ended_m, length_m})
-    surviving = [float(share) for share in ecdf(lifetimes).sf.evaluate(places_m)]
-    # Nobody is censored before the end, so those who still drive at a place are a binomial count of all.
+    distances_m = sorted({0.0, *ended_m, length_m})
+    surviving = [float(share) for share in ecdf(lifetimes).sf.evaluate(distances_m)]
+    # No run is censored before the end, so the number of runs that still drive at a distance is binomial.
     bands = [
-        exact_interval(sum(end_m > place_m for end_m in ended_m) + len(runs) - len(ended), len(runs))
-        for place_m in places_m
+        exact_interval(sum(end_m > distance_m for end_m in ended_m) + len(runs) - len(ended), len(runs))
+        for distance_m in distances_m
     ]
     endings = sorted({str(run["ending"]) for run in ended})
     return {
-        "distance_m": places_m,
+        "distance_m": distances_m,
         "surviving": surviving,
         "low": [band[0] for band in bands if band],
         "high": [band[1] for band in bands if band],
         "incidence": {
             ending: [
-                sum(run["ending"] == ending and end_m <= place_m for run, end_m in zip(ended, ended_m, strict=True))
+                sum(run["ending"] == ending and end_m <= distance_m for run, end_m in zip(ended, ended_m, strict=True))
                 / len(runs)
-                for place_m in places_m
+                for distance_m in distances_m
             ]
             for ending in endings
         },
@@ -49,6 +49,6 @@ def survival(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
 
 
 def _length_m(runs: Sequence[Mapping[str, Any]]) -> float:
-    """Length of the route; where no run knows it, as far as any came."""
+    """Return the length of the route; where no run has it, the longest distance of any run."""
     lengths_m = [run["route_length_m"] for run in runs if run.get("route_length_m")]
     return float(max(lengths_m or [run["distance_m"] for run in runs]))

@@ -1,1 +1,1 @@
-"""Sweeps: many runs, on one machine or on a cluster."""
+"""Sweeps: many runs on one machine or on a cluster, with summary and report."""

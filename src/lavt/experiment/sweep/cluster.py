@@ -1,4 +1,4 @@
-"""Dask's workers, on this machine or on many, as those who drive the runs of a sweep."""
+"""Dask workers, on this machine or on many, that drive the runs of a sweep."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from importlib import import_module
 from typing import Any
 
 from lavt.errors import UserError
-from lavt.experiment.sweep.workers import Workers, ignore_terminal, terminal_held
+from lavt.experiment.sweep.workers import Workers, ignore_terminal_signals, terminal_signals_blocked
 from lavt.recording.provenance import provenance
 
 LOCAL = "local"
-"""Instead of an address: Dask's workers on this machine."""
+"""The address of Dask workers on this machine."""
 CONNECT_S = 10
 
 
 @contextmanager
-def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
-    """Give the workers of the Dask scheduler at `address`, or `LOCAL` ones, `jobs` of them.
+def cluster_workers(address: str, jobs: int | None) -> Iterator[Workers]:
+    """Yield the workers of the Dask scheduler at `address`, or `jobs` workers on this machine for `LOCAL`.
 
-    Raises `UserError` where `jobs` are asked of a scheduler, where there is no Dask, no scheduler or no worker, or
-    where a worker has other versions: the same digests are promised for equal versions only.
+    Raises `UserError` where `jobs` is given with a scheduler, where Dask, the scheduler or its workers are missing, or
+    where a worker has other versions: digests are only reproducible with equal versions.
     """
     if address != LOCAL and jobs is not None:
-        raise UserError(f"--jobs is for this machine, and {address} has the workers it has: leave --jobs away")
+        raise UserError(f"--jobs is for this machine, and {address} has its own number of workers: omit --jobs")
     dask = _dask()
     if address == LOCAL:
         jobs = jobs or os.cpu_count() or 1
-        with terminal_held():
+        with terminal_signals_blocked():
             started = dask.LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
@@ -39,8 +39,8 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
                 silence_logs=logging.CRITICAL,
             )
         with started, dask.Client(started) as client:
-            client.run(ignore_terminal)
-            yield _of_client(client, address)
+            client.run(ignore_terminal_signals)
+            yield _checked_workers(client, address)
         return
     try:
         client = dask.Client(address, timeout=CONNECT_S)
@@ -49,48 +49,51 @@ def cluster(address: str, jobs: int | None) -> Iterator[Workers]:
             f"no Dask scheduler answers at {address} ({error}): start one with 'dask scheduler', or name another"
         ) from error
     with client:
-        yield _of_client(client, address)
+        yield _checked_workers(client, address)
 
 
 def check_cluster(address: str, jobs: int | None) -> None:
-    """Raise the `UserError` that `cluster` would, before anything is begun."""
+    """Raise the `UserError` that `cluster_workers` would, before any work begins."""
     if address == LOCAL:
         _dask()
     else:
-        with cluster(address, jobs):
+        with cluster_workers(address, jobs):
             pass
 
 
 def _dask() -> Any:
     try:
-        return import_module("distributed")  # an extra
+        return import_module("distributed")  # an optional dependency
     except ImportError as error:
         raise UserError(f"--cluster needs Dask ({error}): pip install 'lavt[cluster]'") from error
 
 
-def _of_client(client: Any, address: str) -> Workers:
+def _checked_workers(client: Any, address: str) -> Workers:
+    """Return the workers of a Dask client; raise `UserError` unless each has one thread and the same versions."""
     threads: Mapping[str, int] = client.nthreads()
     if not threads:
         raise UserError(f"the Dask scheduler at {address} has no worker: start some with 'dask worker --nthreads 1'")
     crowded = [worker for worker, count in threads.items() if count != 1]
     if crowded:
         raise UserError(
-            f"the Dask worker {crowded[0]} has {threads[crowded[0]]} threads, and a run takes a process of its own: "
+            f"the Dask worker {crowded[0]} has {threads[crowded[0]]} threads, but a run needs a process of its own: "
             "start it with --nthreads 1, and --nworkers for more"
         )
     try:
-        versions: Mapping[str, Mapping[str, str]] = client.run(versions_here)
+        versions: Mapping[str, Mapping[str, str]] = client.run(local_versions)
     except ImportError as error:
         raise UserError(f"a Dask worker has no LAVT ({error}): install the same version there as here") from error
-    for worker, there in versions.items():
-        different = {name: (here, there.get(name)) for name, here in versions_here().items() if here != there.get(name)}
+    for worker, remote in versions.items():
+        different = {
+            name: (here, remote.get(name)) for name, here in local_versions().items() if here != remote.get(name)
+        }
         if different:
             name, (here, other) = next(iter(different.items()))
             raise UserError(f"the Dask worker {worker} has {name} {other}, not {here} as here: install the same there")
-    return Workers(client.get_executor(), len(threads), far=True)
+    return Workers(client.get_executor(), len(threads), remote=True)
 
 
-def versions_here() -> dict[str, str]:
-    """Give the versions of what a run's digest depends on."""
+def local_versions() -> dict[str, str]:
+    """Return the versions on which the digest of a run depends."""
     here = provenance()
     return {**here["versions"], "python": here["machine"]["python"]}

@@ -1,7 +1,7 @@
-"""Who drives the runs of a sweep: processes of this machine, or Dask's workers on many.
+"""The workers that drive the runs of a sweep: processes of this machine, or Dask workers on many.
 
-Either is a `concurrent.futures` executor (`cluster.py` has Dask's). Processes write a run's directory where it belongs;
-workers elsewhere, which need not see this machine's files, drive into a directory of their own and send it back.
+Both are `concurrent.futures` executors (`cluster.py` has Dask's). Local processes write a run into its directory.
+Remote workers need no access to this machine's files: they write into a temporary directory and send its files back.
 """
 
 from __future__ import annotations
@@ -23,93 +23,93 @@ from lavt.experiment.runs.plan import PlannedRun
 from lavt.experiment.runs.run import RESULT, drive_once
 from lavt.recording.output_directory import prepare_directory
 
-TERMINAL = (signal.SIGINT, signal.SIGHUP)
-"""What Ctrl-C and a closed terminal send."""
+TERMINAL_SIGNALS = (signal.SIGINT, signal.SIGHUP)
+"""The signals of Ctrl-C and of a closed terminal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """An executor with room for `jobs` runs at a time; `far` ones send back what they have written."""
+    """An executor for `jobs` runs at a time; `remote` workers send back the files of a run."""
 
     executor: Executor
     jobs: int
-    far: bool
+    remote: bool
 
     def submit(self, planned: PlannedRun, directory: Path) -> Future[Any]:
-        """Have a run driven; `collect` takes what comes of it."""
-        if self.far:
-            return self.executor.submit(run_elsewhere, planned)
+        """Start a run; its future's result is for `collect`."""
+        if self.remote:
+            return self.executor.submit(drive_remotely, planned)
         return self.executor.submit(drive_once, planned, directory)
 
     def collect(self, done: Any, directory: Path) -> DriveData:
-        """Give a run whose files are then in `directory`."""
+        """Return the data of a finished run, after writing its files into `directory` if it was remote."""
         drive: DriveData = done
-        if self.far:
+        if self.remote:
             drive, files = done
-            put_files(files, directory)
+            write_files(files, directory)
         return replace(drive, directory=directory)
 
     def stop(self) -> None:
-        """Begin nothing more; wait for what is under way, but for `far` runs, which are lost."""
-        if self.far:
-            self.executor.shutdown(wait=False)  # Dask's cancels all then, and knows no cancel_futures
+        """Start no more runs, and wait for the local runs in progress; remote runs in progress are lost."""
+        if self.remote:
+            self.executor.shutdown(wait=False)  # Dask's executor then cancels all, and has no cancel_futures
         else:
             self.executor.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
-def processes(jobs: int) -> Iterator[Workers]:
-    """Give processes of this machine, which end with this one, whatever ends it."""
-    context = multiprocessing.get_context("spawn")  # a fork copies locks that nobody will ever release
-    with terminal_held():
+def process_workers(jobs: int) -> Iterator[Workers]:
+    """Yield processes of this machine, which end with this process, however it ends."""
+    context = multiprocessing.get_context("spawn")  # a fork would copy locks that are never released
+    with terminal_signals_blocked():
         executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_process)
-    with terminal_held():  # again: Python's resource tracker, which has been started now, lets Ctrl-C through
+    with terminal_signals_blocked():  # again, as the start of Python's resource tracker has unblocked SIGINT
         for _ in range(jobs):
-            executor.submit(os.getpid)  # which starts a process
+            executor.submit(os.getpid)  # starts a process
     with executor:
-        yield Workers(executor, jobs, far=False)
+        yield Workers(executor, jobs, remote=False)
 
 
 @contextmanager
-def terminal_held() -> Iterator[None]:
-    """Hold Ctrl-C and a closed terminal back; from processes that are started meanwhile, until `ignore_terminal`."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL)
+def terminal_signals_blocked() -> Iterator[None]:
+    """Block the terminal's signals; processes started meanwhile inherit this until `ignore_terminal_signals`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, TERMINAL_SIGNALS)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def ignore_terminal() -> None:
-    """Let Ctrl-C and a closed terminal be: they go to all processes of the terminal, but only the parent decides."""
-    for number in TERMINAL:
+def ignore_terminal_signals() -> None:
+    """Ignore the terminal's signals: all its processes receive them, but only the parent handles them."""
+    for number in TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, TERMINAL_SIGNALS)
 
 
 def _begin_process() -> None:
-    ignore_terminal()
+    ignore_terminal_signals()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End when the parent is gone, so that nobody writes into a sweep that is resumed."""
+    """Exit when the parent has ended, so that no old process writes into a resumed sweep."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def run_elsewhere(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
-    """Drive a run into a directory that is gone afterwards; give what came of it, and its files by name."""
+def drive_remotely(planned: PlannedRun) -> tuple[DriveData, dict[str, bytes]]:
+    """Drive a run in a temporary directory, and return its data and its files by name."""
     with TemporaryDirectory(prefix="lavt-") as scratch:
         directory = Path(scratch) / "run"
         drive = drive_once(planned, directory)
         return drive, {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-def put_files(files: Mapping[str, bytes], directory: Path) -> None:
-    """Write a run's files, the result last: what says that a run is finished must not be there before the rest."""
+def write_files(files: Mapping[str, bytes], directory: Path) -> None:
+    """Write the files of a run; the result comes last, because its existence marks the run as finished."""
     prepare_directory(directory)
     for name in sorted(files, key=lambda name: name == RESULT):
         unfinished = directory / f"{name}.part"

@@ -1,1 +1,1 @@
-"""The clock offset between two machines: chrony, PTP and our own probe."""
+"""Estimates of the clock offset between two machines: by chrony, by PTP and by a probe."""

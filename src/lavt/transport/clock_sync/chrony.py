@@ -1,6 +1,6 @@
-"""What chrony says of the host's clock: `chronyc -c` (comma-separated values, in the order of chronyc's manual).
+"""Clock reports from chrony: parses the output of `chronyc -c` (comma-separated values, as in chronyc's manual).
 
-One chronyc stays and is asked again and again: it answers within 0.3 ms, and nothing has to be started for it.
+One persistent chronyc answers each query within 0.3 ms, without starting a process.
 """
 
 from __future__ import annotations
@@ -11,17 +11,23 @@ from typing import Final
 
 from lavt.clock import Clock
 from lavt.domain import NS_PER_S, Now
-from lavt.transport.clock_sync.clock_report import ClockReport, ask, host_addresses, plain_address, unknown_clock
+from lavt.transport.clock_sync.clock_report import (
+    ClockReport,
+    host_addresses,
+    plain_address,
+    query_clock,
+    unknown_clock,
+)
 from lavt.transport.clock_sync.persistent_process import Completed, PersistentProcess, Run
 
 SOURCE = "chrony"
 REPORTS = ("tracking", "ntpdata")
-"""Who may not see the second (it needs root) still gets the first."""
+"""Without root only the first of these is available."""
 TRACKING_FIELDS = 14
 NTPDATA_FIELDS = 34
 SYNCHRONISED = {"Normal", "Insert second", "Delete second"}
 LOCAL_REFERENCE = "7F7F0101"
-"""Reference of a chronyd that follows nobody and says that its own clock is the reference ("local")."""
+"""Reference of a chronyd without a source whose own clock is the reference (directive `local`)."""
 
 ABSENT = "chrony is not installed"
 NOT_RUNNING = "chrony is not running"
@@ -29,37 +35,37 @@ NOT_SYNCHRONISED = "chrony is not synchronised"
 
 
 class Chronyc(PersistentProcess):
-    """chrony's own client, obeying one command a line."""
+    """A persistent chronyc, chrony's own client, that executes one command per line."""
 
     program = ("chronyc", "-n", "-c")
-    NO_COMMAND: Final = "lavt"
+    UNKNOWN_COMMAND: Final = "lavt"
     END: Final = "Unrecognized command\n"
-    """What chronyc itself answers to that, after all else that it was told to do."""
+    """chronyc's answer to the unknown command, which follows its answers to all others."""
 
-    def lines(self, command: Sequence[str]) -> str:
-        """Write each word as a command of its own, and behind them one that chronyc does not know."""
-        return "".join(f"{each}\n" for each in (*command, self.NO_COMMAND))
+    def encode(self, command: Sequence[str]) -> str:
+        """Return each word as a command of its own, followed by a command that chronyc does not know."""
+        return "".join(f"{each}\n" for each in (*command, self.UNKNOWN_COMMAND))
 
-    def ended(self, answer: bytes) -> Completed | None:
-        """Read what it said until then."""
-        said = answer.decode(errors="replace")
-        return Completed(0, said.removesuffix(self.END)) if said.endswith(self.END) else None
+    def parse_answer(self, answer: bytes) -> Completed | None:
+        """Return the output before chronyc's answer to the unknown command; None: that answer is not there yet."""
+        output = answer.decode(errors="replace")
+        return Completed(0, output.removesuffix(self.END)) if output.endswith(self.END) else None
 
 
 def read_chrony(clock: Clock, run: Run) -> ClockReport | None:
-    """Ask chrony on this host through `Chronyc`; where it cannot tell, the report says so and has no correction.
+    """Query chrony on this host through `Chronyc`. If chrony does not know the correction, the report says why.
 
-    None where no answer came in time: that says nothing of the clock, and is a missed poll.
+    Return None if there was no answer in time: that is a missed poll, and no statement about the clock.
     """
-    return ask(REPORTS, clock, run, source=SOURCE, absent=ABSENT, parse=parse_chrony)
+    return query_clock(REPORTS, clock, run, source=SOURCE, absent=ABSENT, parse=parse_chrony)
 
 
 def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport:
-    """Read chronyc's answer to `REPORTS`, asked between two readings of the clocks; never raises.
+    """Parse chronyc's answer to `REPORTS`, queried between two readings of the clocks; never raises.
 
-    Field 5 of "tracking" is the correction, positive where the local clock is slow; the bound is the root distance:
-    half the root delay plus the root dispersion. Of "ntpdata" the source that is followed counts. Before chrony has
-    synchronised, and where the lines are not what chrony writes, the correction is not known.
+    Field 5 of "tracking" is the correction, positive if the local clock is slow. The bound is the root distance: half
+    the root delay plus the root dispersion. The "ntpdata" line of the selected source is used. The correction is
+    unknown before chrony has synchronised, and if the lines are not chrony's.
     """
     asking_ns = after.mono_ns - before.mono_ns
     middle = before.later(asking_ns // 2)
@@ -67,7 +73,9 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     tracking = next((row for row in rows if len(row) == TRACKING_FIELDS), None)
     if tracking is None:
         return unknown_clock(middle, host, SOURCE, NOT_RUNNING)
-    reference_s, correction_s, skew_ppm, delay_s, dispersion_s = (_number(tracking[at]) for at in (3, 4, 9, 10, 11))
+    reference_s, correction_s, skew_ppm, delay_s, dispersion_s = (
+        _parse_number(tracking[at]) for at in (3, 4, 9, 10, 11)
+    )
     if (
         tracking[13] not in SYNCHRONISED
         or tracking[0] == "00000000"
@@ -78,8 +86,8 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
     age_s = None if reference_s is None else max(0.0, middle.wall_ns / NS_PER_S + correction_s - reference_s)
     follows = plain_address(tracking[1])
     peer = next((row for row in rows if len(row) == NTPDATA_FIELDS and plain_address(row[0]) == follows != ""), None)
-    peer_delay_s, peer_dispersion_s = _numbers_of(peer, (19, 20))
-    poll_log2 = None if peer is None else _number(peer[9])
+    peer_delay_s, peer_dispersion_s = _parse_numbers(peer, (19, 20))
+    poll_log2 = None if peer is None else _parse_number(peer[9])
     return ClockReport(
         middle.mono_ns,
         middle.wall_ns,
@@ -95,19 +103,19 @@ def parse_chrony(host: str, answer: str, before: Now, after: Now) -> ClockReport
         peer_delay_s=peer_delay_s,
         peer_dispersion_s=peer_dispersion_s,
         good_samples=int(peer[33]) if peer and peer[33].isascii() and peer[33].isdigit() else None,
-        # Not the field after it: that one is a whole number, and 0 where chrony polls twice a second.
+        # Not the next field: that is a whole number, and 0 if chrony polls twice a second.
         poll_s=2.0**poll_log2 if poll_log2 is not None and -7 <= poll_log2 <= 24 else None,
         status="its own clock is the reference" if tracking[0] == LOCAL_REFERENCE else "",
     )
 
 
-def _numbers_of(row: Sequence[str] | None, places: Sequence[int]) -> list[float | None]:
-    """Read quantities that cannot be negative; None where there is no row, or where one is not what it should be."""
-    found = [None if row is None else _number(row[at]) for at in places]
+def _parse_numbers(row: Sequence[str] | None, columns: Sequence[int]) -> list[float | None]:
+    """Return columns that cannot be negative, with None for invalid values and for all if there is no row."""
+    found = [None if row is None else _parse_number(row[at]) for at in columns]
     return [each if _not_negative(each) else None for each in found]
 
 
-def _number(text: str) -> float | None:
+def _parse_number(text: str) -> float | None:
     try:
         number = float(text)
     except ValueError:

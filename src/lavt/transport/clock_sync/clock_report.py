@@ -1,4 +1,4 @@
-"""What a host can say of its own clock: which kernel's clock it is, and how far its source of time finds it off."""
+"""Clock reports: which kernel's clock a host uses, and the correction that its time source reports for it."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ TIMEOUT_S = 2.0
 
 @value
 class ClockReport:
-    """What a host's source of time says of its clock, beside the reading of both clocks that it belongs to."""
+    """A report of a host's time source on the host's clock, with the clock readings at which it was made."""
 
     mono_ns: int
     wall_ns: int
     host: str
     """Identity of the kernel whose clock this is."""
     source: str
-    """Who says it: "chrony", "ptp", "external", "probe" (the host leaves it to the probe), "model" in virtual time."""
+    """"chrony", "ptp", "external", "probe" (the host relies on the probe), or "model" in virtual time."""
     correction_s: float | None = None
     """Reference time less the host's wall clock; None: the source does not know it."""
     bound_s: float | None = None
-    """How far the correction can be from the truth; None: nobody knows."""
+    """The largest error of the correction; None: unknown."""
     status: str = ""
-    """What the source says instead, in words, where there is no correction."""
+    """Why there is no correction, for people."""
     asking_s: float = 0.0
-    """For how long the source was asked; the reading of the clocks is that of the middle."""
+    """How long the query took; the clocks were read in its middle."""
     follows: str = ""
-    """Address of the host, or identity of the PTP grandmaster, that the clock is compared with."""
+    """Address of the host, or identity of the PTP grandmaster, that the clock is synchronised to."""
     addresses: tuple[str, ...] = ()
-    """The host's own, without loopback: whether the other side follows this host."""
+    """The host's own addresses without loopback; they show whether the other side follows this host."""
     skew_ppm: float | None = None
-    """How wrong the source's estimate of the clock's rate can be."""
+    """Largest error of the source's estimate of the clock's rate."""
     age_s: float | None = None
-    """Since the source last heard what it follows."""
+    """Time since the source last received a sample."""
     peer_delay_s: float | None = None
-    """Round trip to what it follows, in the source's last sample."""
+    """Round trip to the source's peer, in its last sample."""
     peer_dispersion_s: float | None = None
-    """What else that sample can be wrong by."""
+    """Further error of that sample."""
     good_samples: int | None = None
     """How many samples the source has accepted so far."""
     poll_s: float | None = None
-    """How often the source asks for one."""
+    """The source's polling interval."""
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -57,18 +57,18 @@ IPV6_ADDRESSES = Path("/proc/net/if_inet6")
 
 
 def kernel_identity() -> str:
-    """Identity of the running kernel: processes that share it share a clock; empty where the system has none."""
-    return _text_of(BOOT_ID).strip()
+    """Return the identity of the running kernel, or "" without one. Processes on one kernel share its clock."""
+    return _read_text(BOOT_ID).strip()
 
 
 def host_addresses() -> tuple[str, ...]:
-    """Addresses of this host, without loopback, in order; empty where the system does not tell."""
-    return _addresses(_text_of(IPV4_ROUTES), _text_of(IPV6_ADDRESSES))
+    """Return the addresses of this host without loopback, sorted; empty if the system does not list them."""
+    return _addresses(_read_text(IPV4_ROUTES), _read_text(IPV6_ADDRESSES))
 
 
-@lru_cache(maxsize=4)  # asked every second; they hardly ever change
+@lru_cache(maxsize=4)  # called every second, and the addresses hardly ever change
 def _addresses(ipv4_routes: str, ipv6_addresses: str) -> tuple[str, ...]:
-    """Read the kernel's tables: an address is the line before "/32 host LOCAL", or 32 hex digits at a line's start."""
+    """Parse the kernel's tables: an address is the line before "/32 host LOCAL", or 32 leading hex digits."""
     lines = ipv4_routes.splitlines()
     found = {
         before.removeprefix("|--").strip()
@@ -86,7 +86,7 @@ _LOOPBACK = {"127.0.0.1", "::1"}
 
 
 def plain_address(text: str) -> str:
-    """Write an address as all write it who must be compared; empty where it is none."""
+    """Return an address in canonical form, so that addresses can be compared; "" if it is not one."""
     try:
         return str(ipaddress.ip_address(text))
     except ValueError:
@@ -94,28 +94,29 @@ def plain_address(text: str) -> str:
 
 
 def unknown_clock(now: Now, host: str, source: str, status: str) -> ClockReport:
-    """Make the report of a source that cannot tell."""
+    """Return the report of a source that does not know the correction."""
     return ClockReport(now.mono_ns, now.wall_ns, host, source, status=status, addresses=host_addresses())
 
 
-def ask(
+def query_clock(
     command: Sequence[str], clock: Clock, run: Run, *, source: str, absent: str, parse: Callable[..., ClockReport]
 ) -> ClockReport | None:
-    """Have a program tell of this host's clock: `parse(host, its output, clocks before, clocks after)`.
+    """Run a program that reports on this host's clock, and parse its output.
 
-    None where no answer came in time: that says nothing of the clock, and is a missed poll.
+    `parse` gets the host, the output, and the clocks before and after. Return None if there was no answer in time: that
+    is a missed poll, and no statement about the clock.
     """
     host, before = kernel_identity(), clock.now()
-    ended = run(command, TIMEOUT_S)
+    completed = run(command, TIMEOUT_S)
     after = clock.now()
-    if ended is None or after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # it was in time, but this thread not
+    if completed is None or after.mono_ns - before.mono_ns > TIMEOUT_S * NS_PER_S:  # or this thread was delayed
         return None
-    if ended.code == NOT_FOUND:
+    if completed.code == NOT_FOUND:
         return unknown_clock(before, host, source, absent)
-    return parse(host, ended.output, before, after)
+    return parse(host, completed.output, before, after)
 
 
-def _text_of(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text(errors="replace")
     except OSError:

@@ -1,7 +1,8 @@
-"""Asking a program again and again without starting it from here.
+"""A persistent process that answers queries, so that no query starts a process from here.
 
-To start a process holds up every thread of this one until the new program has been loaded (Python keeps its lock over
-vfork(2)): 10 ms and more on a slow machine, once a second. So one that stays is asked, or a shell that stays starts it.
+Starting a process blocks every thread of this one until the new program is loaded (Python keeps its lock over
+vfork(2)): 10 ms and more on a slow machine, once a second. So a persistent program is queried, or a persistent shell
+starts the program.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lavt.clock import Clock, MachineClock
 from lavt.domain import NS_PER_S
 
 NOT_FOUND: Final = 127
-"""Exit code where there is no such program (POSIX, shell command language, 2.8.2)."""
+"""Exit code if there is no such program (POSIX, shell command language, 2.8.2)."""
 
 
 class Completed(NamedTuple):
@@ -32,11 +33,11 @@ class Completed(NamedTuple):
 
 
 Run = Callable[[Sequence[str], float], Completed | None]
-"""Runs a program for so many seconds at most; None where it has not ended by then."""
+"""Runs a program for at most this many seconds; None: it did not complete in time."""
 
 
 class PersistentProcess(ABC):
-    """A program that stays and obeys one command after the other, started with the first one; to be closed."""
+    """A process that executes one command after the other. The first command starts it; `close` ends it."""
 
     program: tuple[str, ...]
     niceness = 0
@@ -44,83 +45,85 @@ class PersistentProcess(ABC):
     def __init__(self, clock: Clock | None = None) -> None:
         self._clock = clock or MachineClock()
         self._process: subprocess.Popen[bytes] | None = None
-        self._one_at_a_time = threading.Lock()
+        self._lock = threading.Lock()
 
     @abstractmethod
-    def lines(self, command: Sequence[str]) -> str:
-        """Write a command as the program reads it, with one behind it that marks where its answer ends."""
+    def encode(self, command: Sequence[str]) -> str:
+        """Return a command in the program's input format, followed by one that marks the end of the answer."""
 
     @abstractmethod
-    def ended(self, answer: bytes) -> Completed | None:
-        """Read an answer; None as long as its end has not come."""
+    def parse_answer(self, answer: bytes) -> Completed | None:
+        """Return the parsed answer, or None if it is not complete yet."""
 
     def run(self, command: Sequence[str], timeout_s: float) -> Completed | None:
-        """Run a command to its end; None where that takes too long, or where the program has died."""
-        with self._one_at_a_time:
+        """Run a command to completion. Return None if it takes too long or the process has died."""
+        with self._lock:
             try:
-                return self._ask(self.lines(command), timeout_s)
+                return self._query(self.encode(command), timeout_s)
             except FileNotFoundError:
                 return Completed(NOT_FOUND, "")
-            except OSError:  # it was killed: the next question starts another
-                self._end()
+            except OSError:  # it was killed: the next query starts another
+                self._kill()
                 return None
 
     def close(self) -> None:
-        """End the program."""
-        with self._one_at_a_time:
-            self._end()
+        """End the process."""
+        with self._lock:
+            self._kill()
 
-    def _ask(self, lines: str, timeout_s: float) -> Completed | None:
+    def _query(self, encode: str, timeout_s: float) -> Completed | None:
         if self._process is None:
             self._process = subprocess.Popen(  # noqa: S603 (the program is one of the two in the code)
                 self.program,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C at the terminal is for us
-            )  # fmt: skip
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C at the terminal must not reach it
+            )
             if self.niceness:
                 with suppress(OSError):
                     os.setpriority(os.PRIO_PROCESS, self._process.pid, self.niceness)
-        assert self._process.stdin is not None  # noqa: S101 (a pipe was asked for)
+        assert self._process.stdin is not None  # noqa: S101 (Popen was called with a pipe)
         assert self._process.stdout is not None  # noqa: S101
-        os.write(self._process.stdin.fileno(), lines.encode())
+        os.write(self._process.stdin.fileno(), encode.encode())
         limit_ns = self._clock.now().mono_ns + round(timeout_s * NS_PER_S)
         answer, output = b"", self._process.stdout.fileno()
-        while (ended := self.ended(answer)) is None:
-            left_s = (limit_ns - self._clock.now().mono_ns) / NS_PER_S
-            if left_s <= 0 or not select.select([output], [], [], left_s)[0]:
-                self._end()  # what it still says would be taken for the next answer
+        while (completed := self.parse_answer(answer)) is None:
+            remaining_s = (limit_ns - self._clock.now().mono_ns) / NS_PER_S
+            if remaining_s <= 0 or not select.select([output], [], [], remaining_s)[0]:
+                self._kill()  # its late output would be taken for the next answer
                 return None
-            piece = os.read(output, 65_536)
-            if not piece:
+            chunk = os.read(output, 65_536)
+            if not chunk:
                 raise OSError
-            answer += piece
-        return ended
+            answer += chunk
+        return completed
 
-    def _end(self) -> None:
+    def _kill(self) -> None:
         if self._process is not None:
             with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # what it runs too, in its session
+                os.killpg(self._process.pid, signal.SIGKILL)  # including its children, in its session
             for pipe in (self._process.stdin, self._process.stdout):
                 if pipe is not None:
-                    pipe.close()  # unread: who escaped from the session may hold the other end for ever
+                    pipe.close()  # without reading: a child outside the session may keep the other end open for ever
             self._process.wait()
             self._process = None
 
 
 class Shell(PersistentProcess):
-    """A shell that starts one program after the other; what they say on standard error is not heard."""
+    """A persistent shell that runs one program after the other and discards their standard error."""
 
     program = ("/bin/sh",)
     niceness = 10
-    """Less of the processor than others get: the start of a program must not hold up who drives."""
+    """The start of a program must not delay the processes that drive."""
     END: Final = "lavt: ended with"
-    """Begins the line after a program's output."""
+    """Prefix of the line after a program's output."""
 
-    def lines(self, command: Sequence[str]) -> str:
-        """Write a command line whose words mean only themselves."""
+    def encode(self, command: Sequence[str]) -> str:
+        """Return a command line with every argument quoted."""
         return f"{shlex.join(command)} 2>/dev/null </dev/null; printf '\\n{self.END} %s\\n' $?\n"
 
-    def ended(self, answer: bytes) -> Completed | None:
-        """Read a program's output and its exit code."""
-        said, end, code = answer.decode(errors="replace").rpartition(f"\n{self.END} ")
-        return Completed(int(code), said) if end and code.endswith("\n") else None
+    def parse_answer(self, answer: bytes) -> Completed | None:
+        """Return a program's output and exit code."""
+        output, end, code = answer.decode(errors="replace").rpartition(f"\n{self.END} ")
+        return Completed(int(code), output) if end and code.endswith("\n") else None

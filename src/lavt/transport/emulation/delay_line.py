@@ -1,8 +1,8 @@
-"""Delay as a law and as a queue; the relay and the virtual runtime use the same two.
+"""Delays: a `DelayModel` computes the delay of an item, and a `DelayLine` queues items until they are due.
 
-A law says how long the thing with a given index takes; its randomness is a named stream indexed by that number, so that
-runs with one seed stay paired whatever else is drawn. A line keeps order: no packet overtakes another
-unless an `EmulatedLink` does more than delay.
+The relay and the virtual runtime both use these. A model draws its jitter by the item's index from a named stream, so
+that runs with one seed stay paired whatever else is drawn. A line keeps the order of its items, unless an
+`EmulatedLink` reorders them.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from lavt.transport.emulation.link import EmulatedLink
 
 @dataclass(frozen=True, slots=True)
 class Lognormal:
-    """A delay that is lognormal: its median, and the standard deviation of its logarithm."""
+    """A lognormal delay: its median, and the standard deviation of its logarithm."""
 
     median_ms: float
     sigma: float
 
 
 @dataclass(frozen=True, slots=True)
-class DelayLaw:
-    """A constant delay and, on top, one drawn for each index from the stream `name` of `seed`."""
+class DelayModel:
+    """A constant delay plus optional jitter, which is drawn for each index from the stream `name` of `seed`."""
 
     constant_ms: float
     jitter: Lognormal | None = None
@@ -35,19 +35,19 @@ class DelayLaw:
     name: str = ""
 
     def median_ms(self) -> float:
-        """Give the median delay."""
+        """Return the median delay."""
         return max(0.0, self.constant_ms + (0.0 if self.jitter is None else self.jitter.median_ms))
 
     def delay_ns(self, index: int) -> int:
-        """Delay of the thing with number `index`, in nanoseconds; never negative."""
+        """Return the delay of the item with this index in nanoseconds; it is never negative."""
         jitter_ms = 0.0 if self.jitter is None else _lognormal_ms(self.seed, self.name, index, self.jitter)
         return max(0, round((self.constant_ms + jitter_ms) * NS_PER_MS))
 
 
 @lru_cache(maxsize=256)
-def _lognormal_ms(seed: int, name: str, index: int, law: Lognormal) -> float:
-    """The packets of one frame ask for the same index one after the other, hence the cache."""
-    return law.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, law.sigma))
+def _lognormal_ms(seed: int, name: str, index: int, delay: Lognormal) -> float:
+    """Draw a lognormal delay. The packets of one frame share an index, hence the cache."""
+    return delay.median_ms * float(_jitter(seed, name).at(index).lognormal(0.0, delay.sigma))
 
 
 @lru_cache(maxsize=4)
@@ -58,22 +58,22 @@ def _jitter(seed: int, name: str) -> IndexedStream:
 class DelayLine:
     """A queue that delays each item and keeps order; an `EmulatedLink` may also drop, spread or reorder items."""
 
-    def __init__(self, law: DelayLaw, link: EmulatedLink | None = None) -> None:
-        self.law = law
+    def __init__(self, delay: DelayModel, link: EmulatedLink | None = None) -> None:
+        self.delay = delay
         self.link = link
         self._waiting: list[tuple[int, int, Any]] = []
         self._number = 0
         self._last_ns = 0
 
     def push(self, item: Any, now_ns: int, index: int, size_bytes: int = 0) -> int | None:
-        """Let `item` in at `now_ns` and tell when it is due; None: it is lost.
+        """Queue `item`, which arrived at `now_ns`, and return when it is due; None: the link lost it.
 
-        Without a link that is after its delay, and not before what came in earlier.
+        Without a link an item is due after its delay, but not before any earlier item.
         """
-        delay_ns = self.law.delay_ns(index)
+        delay_ns = self.delay.delay_ns(index)
         if self.link is None:
             due_ns = self._last_ns = max(now_ns + delay_ns, self._last_ns)
-        elif (left_ns := self.link.leaves_ns(now_ns, delay_ns, size_bytes)) is None:
+        elif (left_ns := self.link.departure_ns(now_ns, delay_ns, size_bytes)) is None:
             return None
         else:
             due_ns = left_ns
@@ -82,11 +82,11 @@ class DelayLine:
         return due_ns
 
     def next_due_ns(self) -> int | None:
-        """When the first item is due; None when nothing waits."""
+        """Return when the first item is due, or None when the queue is empty."""
         return self._waiting[0][0] if self._waiting else None
 
     def pop_due(self, now_ns: int) -> list[Any]:
-        """Take out all that is due at `now_ns`, in order."""
+        """Remove and return all items that are due at `now_ns`, in order."""
         due = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             due.append(heapq.heappop(self._waiting)[2])

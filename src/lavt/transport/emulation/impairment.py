@@ -1,4 +1,4 @@
-"""What netem is to do: laws, the flows that they are for, and what is refused. `netem_tc.py` says it to tc."""
+"""Impairments of a network and the flows that they apply to. `transport/netem/tc.py` translates them for tc."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavt.errors import UserError
 from lavt.value import value
 
 ORDER_RATE_BPS: Final = 10_000_000_000
-"""The rate of a flow without one: netem keeps order only where it has a rate. A packet costs a microsecond."""
+"""The rate of a flow without a rate limit. netem keeps order only with a rate; this one costs 1 us per packet."""
 
 Distribution = Literal["normal", "uniform", "pareto", "paretonormal"]
 DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto", "paretonormal")
@@ -19,124 +19,128 @@ DISTRIBUTIONS: Final[tuple[Distribution, ...]] = ("normal", "uniform", "pareto",
 
 @value
 class Impairment:
-    """What happens to the packets of a flow; all zero is nothing."""
+    """What a network does to the packets of a flow; by default nothing."""
 
     delay_ms: float = 0.0
     jitter_ms: float = 0.0
-    """Standard deviation; of a uniform law the half width."""
+    """Standard deviation of the delay; for a uniform distribution half the width."""
     jitter_correlation: float = 0.0
-    """Of the delay with itself 20 ms before; see `netem_wander.py`."""
+    """Correlation of the delay with the delay 20 ms before; see `transport/netem/correlated_jitter.py`."""
     jitter_distribution: Distribution = "normal"
     loss: float = 0.0
     loss_burst_packets: float = 0.0
-    """Mean length of a burst (Gilbert and Elliott's model); 0 or 1: each packet is lost by itself."""
+    """Mean length of a loss burst (Gilbert-Elliott model); with 0 or 1 each packet is lost independently."""
     rate_bps: int = 0
     """0: no limit."""
     reorder: float = 0.0
-    """Share of packets that are not delayed, and so overtake."""
+    """Share of packets that are not delayed and therefore overtake others."""
 
     @property
-    def is_nothing(self) -> bool:
-        """Whether nothing happens to a packet."""
+    def is_transparent(self) -> bool:
+        """Whether packets pass unchanged."""
         return not (self.delay_ms or self.jitter_ms or self.loss or self.rate_bps or self.reorder)
 
     @property
     def longest_ms(self) -> float:
-        """A delay that next to no packet exceeds."""
+        """A delay that hardly any packet exceeds."""
         return self.delay_ms + 4 * self.jitter_ms
 
 
 @value
 class ImpairedFlow:
-    """Packets of one protocol from (`source`) or to (`destination`) a port, as one machine sends them."""
+    """The packets of one protocol that a machine sends from (`source`) or to (`destination`) a port."""
 
     name: Literal["video", "control", "state"]
     protocol: Literal["udp", "tcp"]
     port: int
     end: Literal["source", "destination"]
-    law: Impairment
+    impairment: Impairment
 
     @property
-    def words(self) -> str:
-        """The flow in words."""
+    def description(self) -> str:
+        """Name, protocol and port of the flow, for messages."""
         return f"{self.name} ({self.protocol} {self.end} port {self.port})"
 
 
 @value
 class ExemptPort:
-    """A port that must never be held, and whose it is."""
+    """A port whose packets must never be delayed, and the service that uses it."""
 
     protocol: Literal["udp", "tcp"]
     port: int
-    whose: str
+    service: str
 
 
-NEVER: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
-"""Never held on any machine; the clock probe's port is added by whoever knows it."""
+ALWAYS_EXEMPT: Final = (ExemptPort("udp", 123, "NTP"), ExemptPort("tcp", 22, "ssh"))
+"""Exempt on every machine; callers add the port of the clock probe."""
 
 
-def check_sense(name: str, law: Impairment) -> None:
-    """Raise `UserError` for what contradicts itself, whoever is to do it."""
-    numbers = [getattr(law, each.name) for each in fields(law) if each.name != "jitter_distribution"]
+def check_impairment(name: str, impairment: Impairment) -> None:
+    """Raise `UserError` for values that are out of range or contradict each other."""
+    numbers = [getattr(impairment, each.name) for each in fields(impairment) if each.name != "jitter_distribution"]
     if not all(math.isfinite(number) and number >= 0 for number in numbers):
-        raise UserError(f"{name}: no quantity of a law is below zero or infinite: correct {law}")
-    if max(law.loss, law.reorder, law.jitter_correlation) >= 1:
-        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {law}")
-    if law.jitter_distribution not in DISTRIBUTIONS:
+        raise UserError(f"{name}: the values of an impairment are finite and not negative: correct {impairment}")
+    if max(impairment.loss, impairment.reorder, impairment.jitter_correlation) >= 1:
+        raise UserError(f"{name}: loss, reorder and jitter_correlation are shares below 1: correct {impairment}")
+    if impairment.jitter_distribution not in DISTRIBUTIONS:
         raise UserError(f"{name}: jitter_distribution is one of {', '.join(DISTRIBUTIONS)}")
-    if law.jitter_correlation and law.jitter_distribution != "normal":
+    if impairment.jitter_correlation and impairment.jitter_distribution != "normal":
         raise UserError(f"{name}: correlated jitter is normal: give jitter_distribution normal, or no correlation")
-    if law.loss_burst_packets > 1 and gilbert(law)[0] > 1:
+    if impairment.loss_burst_packets > 1 and gilbert(impairment)[0] > 1:
         raise UserError(
-            f"{name}: a loss of {law.loss:g} in bursts of {law.loss_burst_packets:g} packets leaves no room between "
-            "them: give longer bursts or less loss"
+            f"{name}: a loss of {impairment.loss:g} in bursts of {impairment.loss_burst_packets:g} packets leaves "
+            "no room between them: give longer bursts or less loss"
         )
-    if law.rate_bps and not 8 <= law.rate_bps <= ORDER_RATE_BPS:
-        raise UserError(f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {law.rate_bps}")
+    if impairment.rate_bps and not 8 <= impairment.rate_bps <= ORDER_RATE_BPS:
+        raise UserError(
+            f"{name}: rate_bps is between 8 and {ORDER_RATE_BPS}, or 0 for no limit, not {impairment.rate_bps}"
+        )
 
 
-def check_law(name: str, law: Impairment) -> None:
-    """Raise `UserError` for what contradicts itself, and for what netem cannot do."""
-    check_sense(name, law)
-    if law.jitter_ms > law.delay_ms:
+def check_netem_impairment(name: str, impairment: Impairment) -> None:
+    """Raise `UserError` for an inconsistent impairment, and for one that netem cannot produce."""
+    check_impairment(name, impairment)
+    if impairment.jitter_ms > impairment.delay_ms:
         raise UserError(
-            f"{name}: a jitter of {law.jitter_ms:g} ms on a delay of {law.delay_ms:g} ms would need delays below zero: "
-            "give a longer delay or less jitter"
+            f"{name}: a jitter of {impairment.jitter_ms:g} ms on a delay of {impairment.delay_ms:g} ms would need "
+            "negative delays: give a longer delay or less jitter"
         )
-    if law.reorder and not law.delay_ms:
+    if impairment.reorder and not impairment.delay_ms:
         raise UserError(f"{name}: packets overtake by not being delayed, so reorder needs a delay: give one")
-    if law.jitter_correlation and not law.jitter_ms:
+    if impairment.jitter_correlation and not impairment.jitter_ms:
         raise UserError(f"{name}: correlated jitter needs jitter_ms: give it, or no correlation")
 
 
-def check_flows(flows: Sequence[ImpairedFlow], never: Sequence[ExemptPort] = ()) -> None:
-    """Raise `UserError` for a law that netem cannot do, and for a flow that covers what must never be held."""
+def check_flows(flows: Sequence[ImpairedFlow], exempt: Sequence[ExemptPort] = ()) -> None:
+    """Raise `UserError` for an impairment that netem cannot produce, or a flow that covers an exempt port."""
     if not flows:
-        raise UserError("there is no flow to hold: name at least one")
+        raise UserError("there is no flow to delay: name at least one")
     taken: dict[tuple[str, int, str], ImpairedFlow] = {}
     for flow in flows:
-        check_law(flow.name, flow.law)
+        check_netem_impairment(flow.name, flow.impairment)
         if not 1 <= flow.port <= 65_535:
-            raise UserError(f"{flow.name}: {flow.port} is no port: give one between 1 and 65535")
-        for port in (*NEVER, *never):
+            raise UserError(f"{flow.name}: {flow.port} is not a port number: give one between 1 and 65535")
+        for port in (*ALWAYS_EXEMPT, *exempt):
             if (flow.protocol, flow.port) == (port.protocol, port.port):
                 raise UserError(
-                    f"{flow.words} would cover {port.whose} (port {port.port}), which must never be delayed: "
+                    f"{flow.description} would cover {port.service} (port {port.port}), which must never be delayed: "
                     "give one of the two another port"
                 )
         other = taken.setdefault((flow.protocol, flow.port, flow.end), flow)
         if other is not flow:
-            raise UserError(f"{flow.words} has the same packets as {other.words}: give one of the two another port")
+            raise UserError(
+                f"{flow.description} selects the same packets as {other.description}: give one of them another port"
+            )
     if len({flow.name for flow in flows}) < len(flows):
-        raise UserError("two flows have one name: name each once")
+        raise UserError("two flows have the same name: name each once")
 
 
-def bursts(law: Impairment) -> bool:
-    """Whether packets are lost in bursts."""
-    return law.loss > 0 and law.loss_burst_packets > 1
+def has_loss_bursts(impairment: Impairment) -> bool:
+    """Return whether packets are lost in bursts."""
+    return impairment.loss > 0 and impairment.loss_burst_packets > 1
 
 
-def gilbert(law: Impairment) -> tuple[float, float]:
-    """Give the chances of a burst's begin and end at a packet that lead to a law's loss and mean burst."""
-    ends = 1 / law.loss_burst_packets
-    return law.loss * ends / (1 - law.loss), ends
+def gilbert(impairment: Impairment) -> tuple[float, float]:
+    """Return the probabilities per packet that a burst begins and ends, for the impairment's loss and mean burst."""
+    ends = 1 / impairment.loss_burst_packets
+    return impairment.loss * ends / (1 - impairment.loss), ends

@@ -1,7 +1,7 @@
-"""Chance on a link: numbers drawn by index from named streams, and netem's distributions of jitter.
+"""Random processes of a link: numbers drawn by index from named streams, and netem's distributions of jitter.
 
-Numbers are drawn in blocks, because a generator of its own for each packet would cost 20 us. A distribution is a table
-of 4096 quantiles in standard deviations, as netem's are (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
+Numbers are drawn in blocks, because a generator for each packet would cost 20 us. A distribution is a table of 4096
+quantiles in standard deviations, like netem's tables (tc's `normal.dist`, `pareto.dist` and `paretonormal.dist`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lavt.transport.emulation.impairment import Distribution
 BLOCK: Final = 256
 QUANTILES: Final = 4096
 LARGEST: Final = 32767 / 8192
-"""netem's tables are 16-bit integers, and 8192 is one standard deviation."""
+"""netem's tables contain 16-bit integers; 8192 is one standard deviation."""
 PARETO_SHAPE: Final = 3.0
 
 Draw = Callable[[np.random.Generator, int], NDArray[np.float64]]
@@ -37,7 +37,7 @@ def normal(generator: np.random.Generator, count: int) -> NDArray[np.float64]:
 
 
 class Draws:
-    """One number for each index of the stream `name` of `seed`, whatever the order in which they are asked for."""
+    """A sequence of random numbers: one for each index of the stream `name` of `seed`, in any order of access."""
 
     def __init__(self, seed: int, name: str, draw: Draw = uniform) -> None:
         self._seed, self._name, self._draw = seed, name, draw
@@ -45,7 +45,7 @@ class Draws:
         self._values: list[float] = []
 
     def at(self, index: int) -> float:
-        """Give the number of an index."""
+        """Return the number of this index."""
         block = index // BLOCK
         if block != self._block:
             self._block = block
@@ -55,11 +55,11 @@ class Draws:
 
 @lru_cache
 def quantiles(distribution: Distribution) -> tuple[float, ...]:
-    """Give a value of each of 4096 equally likely parts of a distribution, in netem's standard deviations.
+    """Return one value for each of 4096 equally likely parts of a distribution, in netem's standard deviations.
 
-    It is the middle of the part and, of `pareto`, its lower end. That of `uniform` is its half width. netem's `pareto`
-    (shape 3) and `paretonormal` are cut at 4 of them and so are not quite what they are called: their standard
-    deviations are 0.82 and 0.83, their means -0.03.
+    The value is the middle of the part; for `pareto` it is the lower end. `uniform` is in units of its half width.
+    netem cuts `pareto` (shape 3) and `paretonormal` off at 4 standard deviations, so their true standard deviations are
+    0.82 and 0.83, and their means -0.03.
     """
     if distribution == "uniform":
         return tuple((2 * part + 1) / QUANTILES - 1 for part in range(QUANTILES))
@@ -80,7 +80,7 @@ def _normal() -> tuple[float, ...]:
 
 
 class CorrelatedProcess:
-    """A deviation that is correlated with itself one step before, by step: Gauss and Markov's process, first order."""
+    """A first-order Gauss-Markov process: a deviation that is correlated with the deviation one step before."""
 
     def __init__(self, seed: int, name: str, correlation: float) -> None:
         self._draws = Draws(seed, name, normal)
@@ -90,7 +90,7 @@ class CorrelatedProcess:
         self._value = self._draws.at(0)
 
     def at(self, step: int) -> float:
-        """Give the deviation at a step, in standard deviations; it never goes back."""
+        """Return the deviation at a step, in standard deviations; an earlier step returns the latest deviation."""
         while self._step < step:
             self._step += 1
             self._value = self._correlation * self._value + self._share * self._draws.at(self._step)
@@ -98,19 +98,19 @@ class CorrelatedProcess:
 
 
 class LossProcess:
-    """Which packets are lost, asked for in order: each by itself, or in bursts (Gilbert and Elliott's model)."""
+    """A loss process that is queried in order: independent losses, or bursts (Gilbert-Elliott model)."""
 
     def __init__(self, seed: int, name: str, loss: float, bursts: tuple[float, float] | None) -> None:
         self._draws = Draws(seed, name)
         self._loss, self._bursts = loss, bursts
         self._bad = False
 
-    def takes(self, index: int) -> bool:
-        """Tell whether the packet with this number is lost."""
+    def is_lost(self, index: int) -> bool:
+        """Return whether the packet with this number is lost."""
         drawn = self._draws.at(index)
         if self._bursts is None:
             return drawn < self._loss
         begins, ends = self._bursts
-        lost = self._bad  # as the kernel has it: what is drawn at a packet counts from the next one
-        self._bad = drawn < (1 - ends if lost else begins)  # small draws lose in either state: more loss adds to less
+        lost = self._bad  # like the kernel: a packet's draw decides on the state of the next packet
+        self._bad = drawn < (1 - ends if lost else begins)  # small draws lose in both states: a higher loss adds losses
         return lost

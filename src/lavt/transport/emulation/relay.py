@@ -1,8 +1,8 @@
-"""Delay without netem: a process with one thread that carries two UDP flows and holds back what the design names.
+"""A relay that delays without netem: one thread carries two UDP flows and delays the packets that netem would delay.
 
-Video, server to client: RTP and sender reports wait; the rest of that flow (challenges) does not. Control: what the
-client's router sends to the server's waits; what comes back waits only where the state is to be delayed too. Nothing
-upstream of the video (hellos, RTCP) ever waits.
+Video, server to client: RTP and sender reports are delayed; the rest of that flow (challenges) is not. Control: packets
+from the client's router to the server's are delayed; packets back are delayed only where the state is to be delayed,
+too. Nothing upstream of the video (hellos, RTCP) is ever delayed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from statistics import median
 from lavt.clock import Clock
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.errors import UserError
-from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, want_arrival_times
-from lavt.transport.emulation.delay_line import DelayLaw, DelayLine
+from lavt.transport.arrival import ANCILLARY_BYTES, Ancillary, arrival, enable_arrival_times
+from lavt.transport.emulation.delay_line import DelayLine, DelayModel
 from lavt.transport.emulation.link import EmulatedLink, LinkInjection
 from lavt.transport.rtp.rtcp import is_rtcp
 
@@ -28,26 +28,26 @@ LONGEST_DATAGRAM = 65_535
 BUFFER_BYTES = 4 * 1024 * 1024
 LONGEST_PAUSE_S = 0.05
 MOST_CLIENTS = 64
-"""Of a flow; each has a socket."""
+"""For each flow; every client has a socket."""
 CLIENT_SILENCE_NS = 30 * NS_PER_S
-"""A client that sent nothing for so long loses its socket."""
+"""A client that sends nothing for this long loses its socket."""
 
-REMEMBERED = 20_000
-"""So many datagrams count for what the relay says it did."""
+SAMPLES = 20_000
+"""How many of the last datagrams the relay's medians cover."""
 
 Address = tuple[str, int]
-NONE = DelayLaw(0.0)
+NONE = DelayModel(0.0)
 
 
 def is_delayed_video(datagram: bytes) -> bool:
-    """Whether a datagram from the server is RTP or RTCP (version 2) and not part of proving the path."""
+    """Return whether a datagram from the server is RTP or RTCP (version 2), and not part of path validation."""
     return len(datagram) >= 2 and datagram[0] >> 6 == 2
 
 
 def video_index(datagram: bytes) -> int:
-    """Index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay.
+    """Return the index of a video packet's delay: its RTP timestamp, so that the packets of a frame share one delay.
 
-    A sender report says the timestamp of the frame that it was sent with, and shares its delay.
+    A sender report has the timestamp of the frame that it was sent with, and shares that frame's delay.
     """
     at = 16 if is_rtcp(datagram) else 4
     return int(struct.unpack_from(">I", datagram, at)[0]) if len(datagram) >= at + 4 else 0
@@ -55,244 +55,246 @@ def video_index(datagram: bytes) -> int:
 
 @dataclass(frozen=True, slots=True)
 class RelayedFlow:
-    """One UDP flow through the relay: where clients reach it, where the server is, and what waits in each direction."""
+    """One UDP flow through the relay: the address for clients, the server's, and the delay in each direction."""
 
     name: str
     listen: Address
     server: Address
-    upstream: DelayLaw
-    downstream: DelayLaw
-    held_downstream: Callable[[bytes], bool] = lambda _datagram: True
+    upstream: DelayModel
+    downstream: DelayModel
+    delays_downstream: Callable[[bytes], bool] = lambda _datagram: True
     index_downstream: Callable[[bytes], int] | None = None
-    """From a datagram to the index of its delay; None: datagrams are counted."""
+    """Maps a datagram to the index of its delay; None: datagrams are numbered."""
     upstream_injected: LinkInjection | None = None
     downstream_injected: LinkInjection | None = None
-    """More than a delay; each client has a link of its own."""
+    """Impairments beyond a delay; each client has links of its own."""
 
 
 @dataclass
-class _Way:
-    """One direction of a client's flow: its delay line, and how what comes out of it is sent."""
+class _DelayedPath:
+    """One direction of a client's flow: its delay line, and how to send the datagrams that leave the line."""
 
     line: DelayLine
     send: Callable[[bytes], object]
     index: Callable[[bytes], int] | None
-    held: Callable[[bytes], bool]
+    is_delayed: Callable[[bytes], bool]
     count: int = 0
-    looked_at_ns: int | None = None
-    held_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """For how long the last datagrams were held, from their arrival to their leaving."""
-    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    """How much later they left than they were due."""
+    scheduled_ns: int | None = None
+    held_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+    """How long the last datagrams were delayed, from arrival to departure."""
+    late_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SAMPLES))
+    """How much later than due they left."""
 
 
 @dataclass
 class _Client:
-    """A client of a flow: the socket that stands for it towards the server."""
+    """A client of a flow, with the socket that represents it towards the server."""
 
     upstream_socket: socket.socket
-    up: _Way
-    down: _Way
-    heard_ns: int
+    up: _DelayedPath
+    down: _DelayedPath
+    last_received_ns: int
 
 
 class Relay:
-    """Carries flows, one upstream socket for each client, in one thread."""
+    """A relay for UDP flows in one thread, with one upstream socket for each client."""
 
     def __init__(self, clock: Clock, flows: list[RelayedFlow]) -> None:
         self._clock = clock
         self._selector = selectors.SelectSelector()  # epoll's timeouts are whole milliseconds, rounded up
-        self._heap: list[tuple[int, int, _Way]] = []
+        self._heap: list[tuple[int, int, _DelayedPath]] = []
         self._number = 0
         self.start_ns = clock.now().mono_ns
-        """When traces begin."""
+        """The time at which traces begin."""
         self.not_sent = 0
-        self._flows: list[_OpenFlow] = []
+        self._flows: list[_ActiveFlow] = []
         try:
             for flow in flows:
-                self._flows.append(_OpenFlow(self, flow))
+                self._flows.append(_ActiveFlow(self, flow))
         except UserError:
             self.close()
             raise
 
     def ports(self) -> dict[str, int]:
-        """Tell the port that was opened for each flow."""
+        """Return the port that was opened for each flow."""
         return {each.flow.name: each.port for each in self._flows}
 
     def held_ms(self) -> dict[str, float | None]:
-        """Tell for each flow and direction the median of how long its datagrams were held; None where none came.
+        """Return for each flow and direction the median delay of its datagrams, or None if there were none.
 
-        Of the clients that it has now, and their last datagrams.
+        The medians cover the current clients and their last datagrams.
         """
-        return {name: _median_ms([each for way in ways for each in way.held_ns]) for name, ways in self._ways()}
+        return {name: _median_ms([each for path in paths for each in path.held_ns]) for name, paths in self._paths()}
 
     def late_ms(self) -> dict[str, float | None]:
-        """Tell the same of how much later they left than they were due."""
-        return {name: _median_ms([each for way in ways for each in way.late_ns]) for name, ways in self._ways()}
+        """Return the same for how much later than due the datagrams left."""
+        return {name: _median_ms([each for path in paths for each in path.late_ns]) for name, paths in self._paths()}
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Tell what became of the packets of each flow and direction that are not only delayed; of all clients ever."""
-        counts = {name: _counted(ways) for name, ways in self._ways()}
+        """Return the packet counters of each flow and direction that has a link, over all clients so far."""
+        counts = {name: _counted(paths) for name, paths in self._paths()}
         for each in self._flows:
-            for direction, gone in each.gone.items():
-                counts[f"{each.flow.name} {direction}"].update(gone)
+            for direction, past_counts in each.past_counts.items():
+                counts[f"{each.flow.name} {direction}"].update(past_counts)
         return {name: dict(each) for name, each in counts.items() if each}
 
-    def _ways(self) -> Iterator[tuple[str, list[_Way]]]:
+    def _paths(self) -> Iterator[tuple[str, list[_DelayedPath]]]:
         for each in self._flows:
-            for direction, ways in each.ways().items():
-                yield f"{each.flow.name} {direction}", ways
+            for direction, paths in each.paths().items():
+                yield f"{each.flow.name} {direction}", paths
 
     def step(self, longest_pause_s: float = LONGEST_PAUSE_S) -> None:
-        """Wait for what comes first, a datagram, one that is due or the longest pause, and deal with it."""
-        self._release()
+        """Wait for a datagram, a due time or the longest pause, whichever comes first, and handle it."""
+        self._send_due()
         pause_s = longest_pause_s
         if self._heap:
             pause_s = max(0.0, min(pause_s, (self._heap[0][0] - self._clock.now().mono_ns) / NS_PER_S))
         for key, _events in self._selector.select(pause_s):
             key.data()
-        self._release()
+        self._send_due()
 
     def close(self) -> None:
-        """Close all sockets; what waits is lost."""
+        """Close all sockets; queued datagrams are lost."""
         for each in self._flows:
             each.close()
         self._selector.close()
 
-    def watch(self, opened: socket.socket, ready: Callable[[], None]) -> None:
-        """Call `ready` when a socket has something."""
-        opened.setblocking(False)
-        self._selector.register(opened, selectors.EVENT_READ, ready)
+    def add_socket(self, sock: socket.socket, ready: Callable[[], None]) -> None:
+        """Call `ready` whenever a socket is readable."""
+        sock.setblocking(False)
+        self._selector.register(sock, selectors.EVENT_READ, ready)
 
-    def unwatch(self, opened: socket.socket) -> None:
-        """Forget a socket and close it."""
-        self._selector.unregister(opened)
-        opened.close()
+    def remove_socket(self, sock: socket.socket) -> None:
+        """Stop watching a socket and close it."""
+        self._selector.unregister(sock)
+        sock.close()
 
     def now_ns(self) -> int:
-        """Read the monotonic clock."""
+        """Return the time of the monotonic clock."""
         return self._clock.now().mono_ns
 
     def arrived_ns(self, ancillary: Ancillary) -> int:
-        """Tell when a datagram arrived, on the monotonic clock."""
+        """Return when a datagram arrived, on the monotonic clock."""
         return arrival(ancillary, self._clock.now()).mono_ns
 
-    def pass_on(self, way: _Way, datagram: bytes, arrived_ns: int) -> None:
-        """Send a datagram its way, at once or when it is due: its delay counts from its arrival."""
-        if not way.held(datagram):
-            self._send(way, datagram)
+    def forward(self, path: _DelayedPath, datagram: bytes, arrived_ns: int) -> None:
+        """Send a datagram inline, or when its delay, counted from its arrival, has passed."""
+        if not path.is_delayed(datagram):
+            self._send(path, datagram)
             return
-        way.count += 1
-        index = way.count if way.index is None else way.index(datagram)
-        way.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
-        self._schedule(way)
+        path.count += 1
+        index = path.count if path.index is None else path.index(datagram)
+        path.line.push((datagram, arrived_ns), arrived_ns, index, len(datagram))
+        self._schedule(path)
 
-    def _schedule(self, way: _Way) -> None:
-        """Look at a way when its first is due, unless that is asked for already."""
-        due_ns = way.line.next_due_ns()
-        if due_ns is not None and (way.looked_at_ns is None or due_ns < way.looked_at_ns):
+    def _schedule(self, path: _DelayedPath) -> None:
+        """Schedule a path for when its first datagram is due, unless it is already scheduled by then."""
+        due_ns = path.line.next_due_ns()
+        if due_ns is not None and (path.scheduled_ns is None or due_ns < path.scheduled_ns):
             self._number += 1
-            way.looked_at_ns = due_ns
-            heapq.heappush(self._heap, (due_ns, self._number, way))
+            path.scheduled_ns = due_ns
+            heapq.heappush(self._heap, (due_ns, self._number, path))
 
-    def _release(self) -> None:
+    def _send_due(self) -> None:
         while self._heap and self._heap[0][0] <= (now_ns := self.now_ns()):
-            look_ns, _, way = heapq.heappop(self._heap)
-            if look_ns != way.looked_at_ns:
-                continue  # one that overtook had it looked at earlier
-            way.looked_at_ns = None
-            while (due_ns := way.line.next_due_ns()) is not None and due_ns <= now_ns:
-                for datagram, arrived_ns in way.line.pop_due(due_ns):
-                    self._send(way, datagram)
+            due_at_ns, _, path = heapq.heappop(self._heap)
+            if due_at_ns != path.scheduled_ns:
+                continue  # a reordered datagram had this path scheduled earlier
+            path.scheduled_ns = None
+            while (due_ns := path.line.next_due_ns()) is not None and due_ns <= now_ns:
+                for datagram, arrived_ns in path.line.pop_due(due_ns):
+                    self._send(path, datagram)
                     sent_ns = self.now_ns()
-                    way.held_ns.append(sent_ns - arrived_ns)
-                    way.late_ns.append(sent_ns - due_ns)
-            self._schedule(way)
+                    path.held_ns.append(sent_ns - arrived_ns)
+                    path.late_ns.append(sent_ns - due_ns)
+            self._schedule(path)
 
-    def _send(self, way: _Way, datagram: bytes) -> None:
+    def _send(self, path: _DelayedPath, datagram: bytes) -> None:
         try:
-            way.send(datagram)
-        except OSError:  # the other end is not there, or its buffer is full: as on any network, it is lost
+            path.send(datagram)
+        except OSError:  # the peer is gone or its buffer is full: the datagram is lost, as on any network
             self.not_sent += 1
 
 
-class _OpenFlow:
-    """A flow at work: the socket that clients reach, and what is known of each of them."""
+class _ActiveFlow:
+    """A flow in operation: the socket for clients, and the state of each client."""
 
     def __init__(self, relay: Relay, flow: RelayedFlow) -> None:
         self.flow = flow
         self._relay = relay
         self._clients: dict[Address, _Client] = {}
-        self.gone: dict[str, Counter[str]] = {"upstream": Counter(), "downstream": Counter()}
-        """What became of the packets of clients that it has no more."""
+        self.past_counts: dict[str, Counter[str]] = {"upstream": Counter(), "downstream": Counter()}
+        """Packet counters of former clients."""
         self._socket = _bound_socket(flow.listen, flow.name)
         self.port = int(self._socket.getsockname()[1])
-        relay.watch(self._socket, self._from_clients)
+        relay.add_socket(self._socket, self._from_clients)
 
-    def ways(self) -> dict[str, list[_Way]]:
+    def paths(self) -> dict[str, list[_DelayedPath]]:
         clients = self._clients.values()
         return {"upstream": [client.up for client in clients], "downstream": [client.down for client in clients]}
 
     def close(self) -> None:
         for client in self._clients.values():
-            self._relay.unwatch(client.upstream_socket)
-        self._relay.unwatch(self._socket)
+            self._relay.remove_socket(client.upstream_socket)
+        self._relay.remove_socket(self._socket)
 
     def _from_clients(self) -> None:
         for datagram, ancillary, address in _drain(self._socket):
             client = self._clients.get(address) or self._new_client(address)
-            client.heard_ns = self._relay.now_ns()
-            self._relay.pass_on(client.up, datagram, self._relay.arrived_ns(ancillary))
+            client.last_received_ns = self._relay.now_ns()
+            self._relay.forward(client.up, datagram, self._relay.arrived_ns(ancillary))
 
     def _new_client(self, address: Address) -> _Client:
-        self._forget_silent()
+        self._remove_idle_clients()
         towards_server = _bound_socket(("", 0), self.flow.name)
         flow = self.flow
         upstream = self._line(flow.upstream, flow.upstream_injected)
         downstream = self._line(flow.downstream, flow.downstream_injected)
         client = _Client(
             towards_server,
-            _Way(upstream, lambda data: towards_server.sendto(data, flow.server), None, _always),
-            _Way(
-                downstream, lambda data: self._socket.sendto(data, address), flow.index_downstream,
-                flow.held_downstream,
+            _DelayedPath(upstream, lambda data: towards_server.sendto(data, flow.server), None, _always),
+            _DelayedPath(
+                downstream,
+                lambda data: self._socket.sendto(data, address),
+                flow.index_downstream,
+                flow.delays_downstream,
             ),
             self._relay.now_ns(),
-        )  # fmt: skip
+        )
         self._clients[address] = client
-        self._relay.watch(towards_server, lambda: self._from_server(client))
+        self._relay.add_socket(towards_server, lambda: self._from_server(client))
         return client
 
-    def _line(self, law: DelayLaw, injected: LinkInjection | None) -> DelayLine:
-        return DelayLine(law, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
+    def _line(self, delay: DelayModel, injected: LinkInjection | None) -> DelayLine:
+        return DelayLine(delay, None if injected is None else EmulatedLink(injected, self._relay.start_ns))
 
     def _from_server(self, client: _Client) -> None:
         for datagram, ancillary, address in _drain(client.upstream_socket):
             if address == self.flow.server:
-                self._relay.pass_on(client.down, datagram, self._relay.arrived_ns(ancillary))
+                self._relay.forward(client.down, datagram, self._relay.arrived_ns(ancillary))
 
-    def _forget_silent(self) -> None:
-        """Let clients go that are silent and, where there are too many, the one that has been silent for longest."""
+    def _remove_idle_clients(self) -> None:
+        """Remove idle clients and, where there are too many, the client that has been idle for longest."""
         now_ns = self._relay.now_ns()
         if len(self._clients) >= MOST_CLIENTS:
-            self._release(min(self._clients, key=lambda address: self._clients[address].heard_ns))
+            self._remove_client(min(self._clients, key=lambda address: self._clients[address].last_received_ns))
         for address, client in list(self._clients.items()):
-            if now_ns - client.heard_ns > CLIENT_SILENCE_NS:
-                self._release(address)
+            if now_ns - client.last_received_ns > CLIENT_SILENCE_NS:
+                self._remove_client(address)
 
-    def _release(self, address: Address) -> None:
+    def _remove_client(self, address: Address) -> None:
         client = self._clients.pop(address)
-        self.gone["upstream"].update(_counted([client.up]))
-        self.gone["downstream"].update(_counted([client.down]))
-        self._relay.unwatch(client.upstream_socket)
+        self.past_counts["upstream"].update(_counted([client.up]))
+        self.past_counts["downstream"].update(_counted([client.down]))
+        self._relay.remove_socket(client.upstream_socket)
 
 
-def _counted(ways: Sequence[_Way]) -> Counter[str]:
-    """Add up what the links of some ways counted; nothing where there is no link."""
+def _counted(paths: Sequence[_DelayedPath]) -> Counter[str]:
+    """Add up the counters of the links of some paths."""
     counts: Counter[str] = Counter()
-    for way in ways:
-        if way.line.link is not None:
-            counts.update(way.line.link.counts)
+    for path in paths:
+        if path.line.link is not None:
+            counts.update(path.line.link.counts)
     return counts
 
 
@@ -305,29 +307,29 @@ def _always(_datagram: bytes) -> bool:
 
 
 def _bound_socket(address: Address, name: str) -> socket.socket:
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    want_arrival_times(opened)
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    enable_arrival_times(sock)
     for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
-        opened.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+        sock.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
     try:
-        opened.bind(address)
+        sock.bind(address)
     except OSError as error:
-        opened.close()
+        sock.close()
         raise UserError(
-            f"the relay's {name} port {address[0]}:{address[1]} cannot be opened ({error.strerror}): name another, or 0"
+            f"cannot open the relay's {name} port {address[0]}:{address[1]} ({error.strerror}): name another port, or 0"
         ) from error
-    return opened
+    return sock
 
 
-def _drain(opened: socket.socket) -> list[tuple[bytes, Ancillary, Address]]:
-    """Take all datagrams that wait, up to a number that lets the other sockets have their turn."""
+def _drain(sock: socket.socket) -> list[tuple[bytes, Ancillary, Address]]:
+    """Return all waiting datagrams, up to a limit that lets the other sockets have their turn."""
     datagrams = []
     for _ in range(64):
         try:
-            datagram, ancillary, _flags, address = opened.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
+            datagram, ancillary, _flags, address = sock.recvmsg(LONGEST_DATAGRAM, ANCILLARY_BYTES)
         except BlockingIOError:
             break
-        except OSError:  # an ICMP error of an earlier datagram
+        except OSError:  # an ICMP error caused by an earlier datagram
             continue
         datagrams.append((datagram, ancillary, address))
     return datagrams

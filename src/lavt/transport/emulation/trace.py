@@ -1,7 +1,8 @@
-"""Traces: what a link did over time, read from a file and replayed; pure functions of the time since the beginning.
+"""Traces: recorded delays or capacities of a link, read from a file and replayed by the time since the start.
 
-Two kinds. A capacity in Mahimahi's format: one whole number of milliseconds a line, each an opportunity to deliver 1500
-bytes. A delay in CSV: `time_s,delay_ms`, straight lines between the points. Both begin anew at their last time.
+Two formats. A capacity trace in Mahimahi's format has one whole number of milliseconds per line, each an opportunity
+to deliver 1500 bytes. A delay trace is CSV, `time_s,delay_ms`, with linear interpolation between the points. Both
+repeat after their last time.
 """
 
 from __future__ import annotations
@@ -25,94 +26,94 @@ LONGEST_DELAY_MS: Final = 60_000
 
 @value
 class CapacityTrace:
-    """Opportunities to deliver 1500 bytes each, at these times in order, and again after the last of them."""
+    """A capacity over time: opportunities to deliver 1500 bytes each, in order, repeated after the last."""
 
     times_ns: tuple[int, ...]
 
-    def first_from(self, time_ns: int) -> int:
-        """Number of the first opportunity at or after a time."""
+    def first_at(self, time_ns: int) -> int:
+        """Return the number of the first opportunity at or after a time."""
         period_ns = self.times_ns[-1]
         lap = max(0, time_ns - 1) // period_ns
         return lap * len(self.times_ns) + bisect_left(self.times_ns, time_ns - lap * period_ns)
 
     def time_ns(self, number: int) -> int:
-        """Time of the opportunity with a number; there is no last one."""
+        """Return the time of the opportunity with this number; numbers continue through repetitions."""
         lap, index = divmod(number, len(self.times_ns))
         return lap * self.times_ns[-1] + self.times_ns[index]
 
 
 @value
 class DelayTrace:
-    """A delay over time: points at strictly increasing times from 0, joined by straight lines, again and again."""
+    """A delay over time: points at strictly increasing times from 0, interpolated linearly and repeated."""
 
     times_ns: tuple[int, ...]
     delays_ns: tuple[int, ...]
 
     def delay_ns(self, time_ns: int) -> int:
-        """Delay of what comes at a time."""
-        gone_ns = max(0, time_ns) % self.times_ns[-1]
-        after = bisect_right(self.times_ns, gone_ns)
+        """Return the delay of a packet that arrives at a time."""
+        elapsed_ns = max(0, time_ns) % self.times_ns[-1]
+        after = bisect_right(self.times_ns, elapsed_ns)
         begin_ns, end_ns = self.times_ns[after - 1 : after + 1]
         first_ns, last_ns = self.delays_ns[after - 1 : after + 1]
-        return first_ns + (last_ns - first_ns) * (gone_ns - begin_ns) // (end_ns - begin_ns)
+        return first_ns + (last_ns - first_ns) * (elapsed_ns - begin_ns) // (end_ns - begin_ns)
 
 
 Trace = CapacityTrace | DelayTrace
 
 
-def parse_mahimahi(text: str, where: str) -> CapacityTrace:
-    """Read a capacity in Mahimahi's format; raises `UserError`, which names `where` it is from, for what is not."""
+def parse_mahimahi(text: str, source: str) -> CapacityTrace:
+    """Parse a capacity in Mahimahi's format. Raise `UserError`, which names `source`, for anything else."""
     times_ms = []
     for number, line in enumerate(text.splitlines(), 1):
-        word = line.strip()
-        if word:
-            times_ms.append(_whole_ms(word, f"{where}, line {number}"))
+        entry = line.strip()
+        if entry:
+            times_ms.append(_parse_ms(entry, f"{source}, line {number}"))
     for number, (before, after) in enumerate(pairwise(times_ms), 2):
         if after < before:
-            raise UserError(f"{where}: entry {number} is {after} ms, after one of {before} ms: sort the times")
+            raise UserError(f"{source}: entry {number} is {after} ms, after one of {before} ms: sort the times")
     if not times_ms or times_ms[-1] == 0:
-        raise UserError(f"{where} lasts no time, so it cannot be repeated: give it an opportunity after 0 ms")
+        raise UserError(f"{source} has no duration, so it cannot be repeated: give it an opportunity after 0 ms")
     return CapacityTrace(tuple(each * NS_PER_MS for each in times_ms))
 
 
-def _whole_ms(word: str, where: str) -> int:
-    if not (word.isascii() and word.isdigit() and len(word) <= 9 and int(word) <= LONGEST_S * 1000):
+def _parse_ms(entry: str, source: str) -> int:
+    if not (entry.isascii() and entry.isdigit() and len(entry) <= 9 and int(entry) <= LONGEST_S * 1000):
         raise UserError(
-            f"{where}: {word[:20]!r} is no time of a Mahimahi trace: give whole milliseconds up to a day, one a line "
-            "(a CSV of delays has a name that ends in .csv)"
+            f"{source}: {entry[:20]!r} is not a time of a Mahimahi trace: give whole milliseconds up to a day, one "
+            "per line (a CSV file of delays needs a name that ends in .csv)"
         )
-    return int(word)
+    return int(entry)
 
 
-def parse_delays(text: str, where: str) -> DelayTrace:
-    """Read a delay over time in CSV; raises `UserError`, which names `where` it is from, for what is not."""
+def parse_delays(text: str, source: str) -> DelayTrace:
+    """Parse a delay over time from CSV. Raise `UserError`, which names `source`, for anything else."""
     try:
         rows = [row for row in csv.reader(text.splitlines()) if row]
     except csv.Error as error:
-        raise UserError(f"{where} is not CSV: {error}") from error
+        raise UserError(f"{source} is not CSV: {error}") from error
     if not rows or [cell.strip() for cell in rows[0]] != CSV_HEADER:
-        raise UserError(f"{where} must begin with the line {','.join(CSV_HEADER)}: add it")
-    points = [_point(row, f"{where}, row {number}") for number, row in enumerate(rows[1:], 2)]
+        raise UserError(f"{source} must begin with the header line {','.join(CSV_HEADER)}: add it")
+    points = [_parse_point(row, f"{source}, row {number}") for number, row in enumerate(rows[1:], 2)]
     if len(points) < 2 or points[0][0] != 0:
-        raise UserError(f"{where} needs at least two rows, the first of them at time_s 0: add them")
+        raise UserError(f"{source} needs at least two rows, the first of them at time_s 0: add them")
     for before, after in pairwise(points):
         if after[0] <= before[0]:
             raise UserError(
-                f"{where}: time_s {after[0] / NS_PER_S:g} comes after {before[0] / NS_PER_S:g}: let the times increase"
+                f"{source}: time_s {after[0] / NS_PER_S:g} comes after {before[0] / NS_PER_S:g}: let the times increase"
             )
     times_ns, delays_ns = zip(*points, strict=True)
     return DelayTrace(times_ns, delays_ns)
 
 
-def _point(row: Sequence[str], where: str) -> tuple[int, int]:
-    """Read one row as time and delay in nanoseconds."""
+def _parse_point(row: Sequence[str], source: str) -> tuple[int, int]:
+    """Return one row as time and delay in nanoseconds."""
     try:
         time_s, delay_ms = map(float, row)
     except ValueError:
         time_s = delay_ms = math.nan
     if not (0 <= time_s <= LONGEST_S and 0 <= delay_ms <= LONGEST_DELAY_MS):
         raise UserError(
-            f"{where}: {','.join(row)[:40]!r} is not a time in seconds up to a day and a delay in milliseconds up to "
+            f"{source}: {','.join(row)[:40]!r} is not a time in seconds up to a day and a delay in milliseconds up to "
             f"{LONGEST_DELAY_MS}: correct it"
         )
     return round(time_s * NS_PER_S), round(delay_ms * NS_PER_MS)

@@ -1,1 +1,1 @@
-"""Delay by the Linux kernel: tc netem applied, verified and cleared."""
+"""Delay and other impairments by the Linux kernel: tc netem is applied, verified and cleared."""

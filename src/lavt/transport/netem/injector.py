@@ -1,4 +1,4 @@
-"""This machine's own queues as a link: carries out what the injection node wants, in a thread, and measures it."""
+"""The injector: a thread that applies and measures the impairments that the injection node orders, with netem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lavt.value import value
 Deliver = Callable[[str, Any, Now, Any], None]
 
 FRAMES = 10
-"""So many measure a flow, in a fifth of a second."""
+"""How many frames measure a flow; they take a fifth of a second."""
 NO_INTERFACE = "no interface is configured for it: set injection.interface"
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @value
 class InjectionOrder:
-    """What shall be in force from now on; no flows: nothing."""
+    """The flows whose impairments are in force from now on; without flows there are none."""
 
     number: int
     condition: str
@@ -37,113 +37,113 @@ class InjectionOrder:
 
 @value
 class InjectionResult:
-    """What became of an order."""
+    """The result of an order."""
 
     number: int
     reason: str
-    """Why it is not in force; empty: it is."""
-    doubts: str
-    """What was measured to be otherwise than asked."""
+    """Why the order is not in force; empty if it is."""
+    problems: str
+    """Where the measurement differs from the order."""
     measured_ms: tuple[tuple[str, float | None], ...]
-    """The median of each flow."""
+    """The median delay of each flow."""
 
 
 class NetemQueues(Protocol):
-    """What can delay what this machine sends."""
+    """An interface to the queues that delay packets from this machine."""
 
-    def apply(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], condition: str) -> object:
-        """Put flows in force, or change them; raises `LavtError`."""
+    def apply(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], condition: str) -> object:
+        """Apply flows, or change the flows in force; raises `LavtError`."""
         ...
 
-    def verify(self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int) -> Verification:
-        """Read back what is in force, and measure what happens to packets of flows, and of what must not be held."""
+    def verify(self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int) -> Verification:
+        """Read back what is in force, and measure packets of the flows and of the exempt ports."""
         ...
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort], count: int
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort], count: int
     ) -> dict[str, ProbeResult]:
-        """Measure the same, and read nothing back."""
+        """Measure the same without reading back."""
         ...
 
-    def doubts(self) -> list[str]:
-        """Tell what is known to be otherwise than asked without measuring."""
+    def problems(self) -> list[str]:
+        """Return the differences from the order that are known without measuring."""
         ...
 
     def clear(self) -> object:
-        """Put everything back."""
+        """Restore the interface."""
         ...
 
 
 class Injector:
-    """Does one order after the other, where there are `queues`; without them only no delay can be ordered.
+    """A link that executes injection orders one after the other; without `queues` only transparent flows are possible.
 
-    `never` are ports that no order may cover.
+    No order may cover a port of `exempt`.
     """
 
     def __init__(
-        self, clock: Clock, deliver: Deliver, queues: NetemQueues | None, never: Sequence[ExemptPort] = ()
+        self, clock: Clock, deliver: Deliver, queues: NetemQueues | None, exempt: Sequence[ExemptPort] = ()
     ) -> None:
         self._clock = clock
         self._deliver = deliver
         self._queues = queues
-        self._never = tuple(never)
+        self._exempt = tuple(exempt)
         self._applied = 0
-        """Number of the order in force: one that comes again is only measured."""
+        """Number of the order in force; if it is repeated, its flows are only measured."""
         self._orders: queue.Queue[InjectionOrder | None] = queue.Queue()
-        self._thread = threading.Thread(target=self._work, name="injector", daemon=True)
+        self._thread = threading.Thread(target=self._process_orders, name="injector", daemon=True)
         self._thread.start()
 
     def send(self, *sends: Send) -> None:
-        """Take orders."""
+        """Queue orders."""
         for send in sends:
             self._orders.put(send.payload)
 
     def close(self) -> None:
-        """Put everything back."""
+        """Stop the thread and restore the interface."""
         self._orders.put(None)
         self._thread.join()
         if self._queues is not None:
             try:
                 self._queues.clear()
             except LavtError as error:
-                log.error("the delay could not be taken away: %s", error)
+                log.error("could not remove the injected delay: %s", error)
 
-    def _work(self) -> None:
-        while (order := self._newest()) is not None:
+    def _process_orders(self) -> None:
+        while (order := self._wait_for_newest()) is not None:
             try:
-                done = self._do(order)
-            except Exception as error:  # whatever it was, the next order, which may be to put all back, must be done
+                result = self._execute(order)
+            except Exception as error:  # the next order must be executed after any failure: it may be the one to clear
                 log.exception("netem failed")
-                done = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
-            self._deliver("injected", done, self._clock.now(), None)
+                result = InjectionResult(order.number, f"{type(error).__name__}: {error}", "", ())
+            self._deliver("injected", result, self._clock.now(), None)
 
-    def _newest(self) -> InjectionOrder | None:
-        """Wait for an order; of several that wait only the last counts, and after None nothing does."""
+    def _wait_for_newest(self) -> InjectionOrder | None:
+        """Wait for an order and return the newest one in the queue; None ends the thread."""
         order = self._orders.get()
         while order is not None and not self._orders.empty():
             order = self._orders.get()
         return order
 
-    def _do(self, order: InjectionOrder) -> InjectionResult:
+    def _execute(self, order: InjectionOrder) -> InjectionResult:
         flows = order.flows
         if self._queues is None:
             return InjectionResult(
-                order.number, "" if all(flow.law.is_nothing for flow in flows) else NO_INTERFACE, "", ()
+                order.number, "" if all(flow.impairment.is_transparent for flow in flows) else NO_INTERFACE, "", ()
             )
         try:
             if not flows:
                 self._queues.clear()
                 return InjectionResult(order.number, "", "", ())
             if order.number != self._applied:
-                self._queues.apply(flows, never=self._never, condition=order.condition)
-                found = self._queues.verify(flows, never=self._never, count=FRAMES)
-                if found.reasons:
-                    return InjectionResult(order.number, "; ".join(found.reasons), "", ())
-            else:  # while it is driven: without starting programs, which would hold it up
-                measured = self._queues.measure(flows, never=self._never, count=FRAMES)
-                found = Verification(self._queues.doubts() + judge(flows, self._never, measured), measured)
+                self._queues.apply(flows, exempt=self._exempt, condition=order.condition)
+                verification = self._queues.verify(flows, exempt=self._exempt, count=FRAMES)
+                if verification.reasons:
+                    return InjectionResult(order.number, "; ".join(verification.reasons), "", ())
+            else:  # during a drive: no program is started, because that would delay the drive
+                measured = self._queues.measure(flows, exempt=self._exempt, count=FRAMES)
+                verification = Verification(self._queues.problems() + judge(flows, self._exempt, measured), measured)
             self._applied = order.number
         except LavtError as error:
             return InjectionResult(order.number, str(error), "", ())
-        measured_ms = tuple((flow.name, found.measured[flow.name].median_ms) for flow in flows)
-        return InjectionResult(order.number, "", "; ".join(found.reasons), measured_ms)
+        measured_ms = tuple((flow.name, verification.measured[flow.name].median_ms) for flow in flows)
+        return InjectionResult(order.number, "", "; ".join(verification.reasons), measured_ms)

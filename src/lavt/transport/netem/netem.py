@@ -1,7 +1,7 @@
-"""netem on an interface: applied, changed while packets are under way, verified, and taken away again.
+"""netem on an interface: applied, changed while packets are queued, verified and cleared.
 
-Nothing here knows signals or globals: a long-running program may do it from any thread. Two programs, or two threads,
-do one after the other what they do.
+This module uses no signals and no globals, so a long-running program can call it from any thread. A lock serialises
+the changes of several threads or programs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,16 @@ from lavt.errors import LavtError, UserError, WorkError
 from lavt.transport.emulation.impairment import ExemptPort, ImpairedFlow, Impairment, check_flows
 from lavt.transport.netem.correlated_jitter import CorrelatedJitter
 from lavt.transport.netem.probe import ProbeResult, judge, measure, probes
-from lavt.transport.netem.state import DIRECTORY, NOBODY, AppliedState, Owner, StateFiles, boot, namespace, this_process
+from lavt.transport.netem.state import (
+    DIRECTORY,
+    NO_OWNER,
+    AppliedState,
+    Owner,
+    StateFiles,
+    boot_id,
+    current_process,
+    network_namespace,
+)
 from lavt.transport.netem.tc import (
     PLACES,
     ROOT,
@@ -40,107 +49,110 @@ from lavt.transport.netem.tc import (
     expected_filter,
     filters,
     parse_filters,
+    parse_impairment,
     parse_qdiscs,
-    read_law,
-    set_law,
+    set_impairment,
     show_filters,
     show_qdiscs,
     uniform_table,
 )
 from lavt.value import value
 
-TC_LIMIT_S: Final = 10.0
+TC_TIMEOUT_S: Final = 10.0
 POLL_NS: Final = 10 * NS_PER_MS
-AFTER_LONGEST_NS: Final = NS_PER_S
-"""How much longer than the longest delay a queue is waited for."""
+DRAIN_MARGIN_NS: Final = NS_PER_S
+"""How much longer than its longest delay a queue gets to drain."""
 
 RunCommand = Callable[[Command], str]
-"""Runs a command and gives its standard output; raises `UserError` or `WorkError`."""
+"""Runs a command and returns its standard output; raises `UserError` or `WorkError`."""
 
-NO_ROOT = "only root may change queues: run it with sudo, or use the relay, which needs no root"
+NO_ROOT = "only root may change queueing disciplines: use sudo, or use the relay, which needs no root"
 NO_NETEM = (
-    "this kernel has no netem, prio or u32: load them (`modprobe -a sch_netem sch_prio cls_u32`), use a kernel that "
-    "has them, or use the relay, which needs none"
+    "this kernel lacks netem, prio or u32: load them (`modprobe -a sch_netem sch_prio cls_u32`), use a kernel that has "
+    "them, or use the relay, which needs none"
 )
-TELLING: Final = (
-    ("Cannot find device", "there is no interface {interface}: `ip link` names those there are"),
+TC_ERRORS: Final = (
+    ("Cannot find device", "there is no interface {interface}: list the interfaces with `ip link`"),
     ("Operation not permitted", NO_ROOT),
     ("qdisc kind is unknown", NO_NETEM),
     ("TC classifier not found", NO_NETEM),
-    ("No distribution data", "tc has no table of this distribution: install iproute2 whole, or name another"),
+    (
+        "No distribution data",
+        "tc lacks the table of this distribution: install all of iproute2, or use another distribution",
+    ),
     ("No such file or directory", NO_NETEM),
     ("Cannot send dump request", NO_NETEM),
 )
-"""What tc says when it is refused, and what we say."""
+"""Error texts of tc, and the messages to show for them."""
 
 
 def tc_environment() -> dict[str, str]:
-    """Give the environment in which tc is found, and speaks English."""
+    """Return an environment in which tc is found and prints English."""
     return {**os.environ, "PATH": os.environ.get("PATH", "") + ":/usr/sbin:/sbin", "LC_ALL": "C"}
 
 
 def run_tc(command: Command) -> str:
-    """Run a command of tc; raises `UserError` for what a user can put right, `WorkError` for everything else."""
+    """Run a tc command. Raise `UserError` for what a user can correct, `WorkError` for anything else."""
     environment = tc_environment()
     if shutil.which("tc", path=environment["PATH"]) is None:
-        raise UserError("there is no tc on this machine: install iproute2, or use the relay, which needs none")
+        raise UserError("tc is not installed: install iproute2, or use the relay, which does not need it")
     try:
-        ended = subprocess.run(  # noqa: S603 (our own words; the interface's name is checked)
+        completed = subprocess.run(  # noqa: S603 (the arguments are ours; the interface's name is checked)
             command,
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=TC_LIMIT_S,
+            timeout=TC_TIMEOUT_S,
             check=False,
             stdin=subprocess.DEVNULL,
             env=environment,
         )
     except subprocess.TimeoutExpired as error:
-        raise WorkError(f"`{as_typed(command)}` did not end within {TC_LIMIT_S:.0f} s") from error
-    if ended.returncode:
+        raise WorkError(f"`{as_typed(command)}` did not end within {TC_TIMEOUT_S:.0f} s") from error
+    if completed.returncode:
         interface = command[command.index("dev") + 1]
-        for part, sentence in TELLING:
-            if part in ended.stderr:
+        for part, sentence in TC_ERRORS:
+            if part in completed.stderr:
                 raise UserError(sentence.format(interface=interface))
-        raise WorkError(f"`{as_typed(command)}` failed: {' '.join(ended.stderr.split())}")
-    return ended.stdout
+        raise WorkError(f"`{as_typed(command)}` failed: {' '.join(completed.stderr.split())}")
+    return completed.stdout
 
 
 @value
 class Verification:
-    """What a verification found: `reasons` says in sentences what is not as asked, and is empty where all is."""
+    """The result of a verification: `reasons` lists every difference from the request, and is empty without one."""
 
     reasons: list[str]
     measured: dict[str, ProbeResult]
 
 
 class NetemInterface:
-    """The delay of one interface. As a context it puts the interface back at its end, however it ends.
+    """netem on one interface. As a context manager it restores the interface at the end of the block.
 
-    `stays`: what is applied outlives this process, as no program owns it. `directory` holds what is written down for a
-    restart. `seed` is that of correlated jitter. Raises `UserError` for a name that no interface can have.
+    With `persistent`, the impairments outlive this process and have no owner. `directory` stores the state for a
+    restart. `seed` is the seed of correlated jitter. Raises `UserError` for an invalid interface name.
     """
 
     def __init__(
         self,
         interface: str,
         *,
-        stays: bool = False,
+        persistent: bool = False,
         directory: Path = DIRECTORY,
         run: RunCommand = run_tc,
         clock: Clock | None = None,
         seed: int = 1,
     ) -> None:
         if not re.fullmatch(r"(?!-)[^\s/]{1,15}", interface) or interface in {".", ".."}:
-            raise UserError(f"{interface!r} is no name of an interface: `ip link` names those there are")
+            raise UserError(f"{interface!r} is not an interface name: list the interfaces with `ip link`")
         self.interface = interface
         self._files = StateFiles(directory)
         self._tables = str(directory)
-        self._owner = NOBODY if stays else this_process()
+        self._owner = NO_OWNER if persistent else current_process()
         self._run = run
         self._clock = clock or MachineClock()
         self._seed = seed
-        self._wander: CorrelatedJitter | None = None
+        self._jitter: CorrelatedJitter | None = None
 
     def __enter__(self) -> NetemInterface:
         return self
@@ -151,146 +163,150 @@ class NetemInterface:
         self.clear()
 
     def check(self) -> list[str]:
-        """Raise `UserError` where nothing could be applied; give what `restore` says."""
-        said = self.restore()
-        with self._files.alone():
+        """Raise `UserError` if nothing can be applied. Return the messages of `restore`."""
+        messages = self.restore()
+        with self._files.locked():
             self._check_owner()
-        return said
+        return messages
 
     def restore(self) -> list[str]:
-        """Put back every interface that a process left held when it died, and say of each what was done.
+        """Restore every interface whose owner died, and return a message for each.
 
-        What cannot be put back is tried again the next time, but for an interface that is gone.
+        A failed restoration is tried again the next time, unless the interface no longer exists.
         """
-        with self._files.alone():
+        with self._files.locked():
             return [
-                f"{each.interface} was still held ({each.words}, which has died): {self._restored(each.interface)}"
+                f"found {each.description}, which has died: {self._restore(each.interface)}"
                 for each in self._files.all()
                 if each.is_abandoned
             ]
 
     def apply(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), condition: str = ""
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), condition: str = ""
     ) -> list[Command]:
-        """Hold `flows` as their laws say, from now on; give the commands that did it.
+        """Apply the impairments of `flows` and return the commands that did it.
 
-        What is there already is changed without losing a packet, and what is no longer asked for is held no more.
-        `never` names ports that no flow may cover. Raises `UserError` for flows that cannot be had, and for an
-        interface that carries somebody else's queue, or a delay that another program of ours owns.
+        Existing impairments are changed without losing a packet, and those of other flows are removed. No flow may
+        cover a port of `exempt`. Raise `UserError` for impossible flows, and for an interface with a foreign root qdisc
+        or an impairment that another LAVT program owns.
         """
-        check_flows(flows, never)
-        wanders = any(flow.law.jitter_correlation for flow in flows)
-        if wanders and self._owner == NOBODY:
+        check_flows(flows, exempt)
+        is_correlated = any(flow.impairment.jitter_correlation for flow in flows)
+        if is_correlated and self._owner == NO_OWNER:
             raise UserError(
-                "correlated jitter needs a program that stays: `lavt netem apply --hold`, or network.injection: netem"
+                "correlated jitter needs a running program: `lavt netem apply --hold`, or network.injection: netem"
             )
         self.restore()
-        with self._files.alone():
+        with self._files.locked():
             self._check_owner()
-            qdiscs = self._ours_or_free(self.interface)
-            if any(flow.law.jitter_distribution == "uniform" for flow in flows):
+            qdiscs = self._our_qdiscs(self.interface)
+            if any(flow.impairment.jitter_distribution == "uniform" for flow in flows):
                 self._files.write_text("uniform.dist", uniform_table())
-            self._files.write(AppliedState(self.interface, namespace(), boot(), self._owner, condition, tuple(flows)))
-            self._stand_still()
-            ran = self._change(flows, qdiscs) if qdiscs else self._begin(flows)
-            if wanders:
-                self._wander = CorrelatedJitter(
+            self._files.write(
+                AppliedState(self.interface, network_namespace(), boot_id(), self._owner, condition, tuple(flows))
+            )
+            self._stop_jitter()
+            ran = self._change(flows, qdiscs) if qdiscs else self._create(flows)
+            if is_correlated:
+                self._jitter = CorrelatedJitter(
                     self.interface, flows, tc_environment(), seed=self._seed, clock=self._clock
                 )
             return ran
 
-    def clear(self, *, at_once: bool = False, of_anybody: bool = False) -> list[Command]:
-        """Put the interface back as it was; give the commands that did it, none where nothing of this owner was there.
+    def clear(self, *, at_once: bool = False, any_owner: bool = False) -> list[Command]:
+        """Restore the interface and return the commands that did it; none if nothing here belongs to this owner.
 
-        What is under way is waited for, in order; lost is only what a rate has piled up beyond the longest delay and
-        two seconds, and with `at_once` all of it. `of_anybody` also clears
-        what another program of ours owns, or was left in place; raises `UserError` for a queue that is not ours.
+        Queued packets leave first, in order. Packets are lost only if a rate limit has queued more than passes within
+        the longest delay and two seconds, or with `at_once`, which loses all of them. `any_owner` also clears
+        impairments of other LAVT programs and persistent ones. Raise `UserError` for a foreign root qdisc.
         """
-        with self._files.alone():
-            self._stand_still()
-            if not of_anybody and self._owner_of_what_is_there() != self._owner:
+        with self._files.locked():
+            self._stop_jitter()
+            if not any_owner and self._current_owner() != self._owner:
                 return []
             ran = self._clear(self.interface, at_once=at_once)
-            self._files.forget(self.interface)
+            self._files.remove(self.interface)
             return ran
 
     def applied(self) -> AppliedState | None:
-        """Tell what was applied, by whom; None where nothing was written down."""
+        """Return what was applied and by whom, or None if no state is stored."""
         return self._files.read(self.interface)
 
-    def shown(self) -> dict[str, Any]:
-        """Tell what is there, as it is read back: whether it is ours, and the law of each flow that has one."""
+    def status(self) -> dict[str, Any]:
+        """Return what tc reports: whether the root qdisc is LAVT's, and the impairment of each flow."""
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
-        laws = {name: _netem_at(place.handle, qdiscs) for name, place in PLACES.items()}
+        netems = {name: _netem_at(place.handle, qdiscs) for name, place in PLACES.items()}
         return {
             "interface": self.interface,
             "ours": _is_ours(qdiscs),
             "queues": [f"{each.kind} {each.handle} {each.parent}" for each in qdiscs],
-            "laws": {name: read_law(found.options) for name, found in laws.items() if found is not None},
+            "impairments": {
+                name: parse_impairment(found.options) for name, found in netems.items() if found is not None
+            },
             "applied": self.applied(),
         }
 
     def read_back(self, flows: Sequence[ImpairedFlow]) -> list[str]:
-        """Compare what tc tells with what was asked, in sentences; an empty list is as asked."""
+        """Compare tc's report with the request, and return a message for each difference."""
         qdiscs = parse_qdiscs(self._run(show_qdiscs(self.interface)))
         if not _is_ours(qdiscs):
-            return [f"{self.interface} has no queue of ours"]
+            return [f"{self.interface} has no qdisc of LAVT"]
         found = self._filters()
         wanted = {expected_filter(each) for flow in flows for each in filters(flow)}
         reasons = [reason for flow in flows for reason in difference(flow, qdiscs, found)]
         return reasons + [
-            f"there is a filter that nobody asked for: {each[:3]}" for each in found if each not in wanted
+            f"there is a filter that was not requested: {each[:3]}" for each in found if each not in wanted
         ]
 
     def measure(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> dict[str, ProbeResult]:
-        """Measure what happens to packets of each flow, and of what must not be held, on their way out."""
-        return measure(self.interface, probes(flows, never), count=count, clock=self._clock)
+        """Measure packets of each flow, and packets that must not be delayed, on their way through the queue."""
+        return measure(self.interface, probes(flows, exempt), count=count, clock=self._clock)
 
     def verify(
-        self, flows: Sequence[ImpairedFlow], *, never: Sequence[ExemptPort] = (), count: int = 50
+        self, flows: Sequence[ImpairedFlow], *, exempt: Sequence[ExemptPort] = (), count: int = 50
     ) -> Verification:
-        """Verify by reading back and by measuring, and tell what has stopped."""
+        """Verify the request by reading back and by measuring, and report correlated jitter that has stopped."""
         reasons = self.read_back(flows)
-        measured = self.measure(flows, never=never, count=count)
-        return Verification(reasons + self.doubts() + judge(flows, never, measured), measured)
+        measured = self.measure(flows, exempt=exempt, count=count)
+        return Verification(reasons + self.problems() + judge(flows, exempt, measured), measured)
 
-    def doubts(self) -> list[str]:
-        """Say in sentences what of ours has stopped by itself since it was applied; no program is started for it."""
-        return [] if self._wander is None else self._wander.doubts()
+    def problems(self) -> list[str]:
+        """Return a message for each flow whose correlated jitter has stopped; this starts no program."""
+        return [] if self._jitter is None else self._jitter.problems()
 
-    def _restored(self, interface: str) -> str:
-        """Put back what the dead left, and say what came of it."""
-        became = "it is put back"
+    def _restore(self, interface: str) -> str:
+        """Restore an interface whose owner died, and return the outcome."""
+        outcome = "the interface is restored"
         try:
             self._clear(interface, at_once=True)
         except LavtError as error:
             if _exists(interface):
-                return f"it is not put back: {error}"
-            became = "the interface is gone"
-        self._files.forget(interface)
-        return became
+                return f"the interface could not be restored: {error}"
+            outcome = "the interface no longer exists"
+        self._files.remove(interface)
+        return outcome
 
     def _check_owner(self) -> None:
-        """Raise `UserError` where the delay that is there belongs to another program of ours."""
-        if not self._ours_or_free(self.interface):
+        """Raise `UserError` if the impairment on the interface belongs to another LAVT program."""
+        if not self._our_qdiscs(self.interface):
             return
-        if self._owner_of_what_is_there() != self._owner:
-            there = self._files.read(self.interface)
-            words = f"a delay on {self.interface}, left in place" if there is None else there.words
+        if self._current_owner() != self._owner:
+            state = self._files.read(self.interface)
+            description = f"a delay on {self.interface}, left in place" if state is None else state.description
             raise UserError(
-                f"there is {words}: clear it with `lavt netem clear --interface {self.interface}`, or let it end"
+                f"found {description}: clear it with `lavt netem clear --interface {self.interface}`, or let it end"
             )
 
-    def _owner_of_what_is_there(self) -> Owner:
-        there = self._files.read(self.interface)
-        return NOBODY if there is None else there.owner  # without a file it was made by hand, with the scripts
+    def _current_owner(self) -> Owner:
+        state = self._files.read(self.interface)
+        return NO_OWNER if state is None else state.owner  # no state is stored if the scripts in netem/ applied it
 
-    def _ours_or_free(self, interface: str) -> list[Qdisc]:
-        """Give the queues where the root is ours, and none where it is the kernel's own.
+    def _our_qdiscs(self, interface: str) -> list[Qdisc]:
+        """Return the qdiscs if the root is LAVT's, or an empty list if it is the kernel's own.
 
-        Raises `UserError` for a root that somebody made: one with a handle that is not ours.
+        Raise `UserError` for a foreign root: one with another handle than LAVT's.
         """
         qdiscs = parse_qdiscs(self._run(show_qdiscs(interface)))
         if _is_ours(qdiscs):
@@ -298,29 +314,29 @@ class NetemInterface:
         for each in qdiscs:
             if each.parent == "root" and each.handle != "0:":
                 raise UserError(
-                    f"{interface} has a queue that is not ours ({each.kind} {each.handle}): take it away yourself "
+                    f"{interface} has a root qdisc that is not LAVT's ({each.kind} {each.handle}): delete it yourself "
                     f"(`tc qdisc del dev {interface} root`), or name another interface"
                 )
         return []
 
-    def _begin(self, flows: Sequence[ImpairedFlow]) -> list[Command]:
-        """Hold flows on an interface that is free; where that fails it is left as it was."""
+    def _create(self, flows: Sequence[ImpairedFlow]) -> list[Command]:
+        """Apply flows to an interface without a qdisc of LAVT; restore the interface if that fails."""
         try:
-            return self._do([add_root(self.interface)]) + self._change(flows, [])
+            return self._run_all([add_root(self.interface)]) + self._change(flows, [])
         except LavtError:
             with suppress(LavtError):
-                self._do([delete_root(self.interface)])
-            self._files.forget(self.interface)
+                self._run_all([delete_root(self.interface)])
+            self._files.remove(self.interface)
             raise
 
-    def _stand_still(self) -> None:
-        """Let no delay wander any more."""
-        if self._wander is not None:
-            self._wander.end()
-            self._wander = None
+    def _stop_jitter(self) -> None:
+        """Stop the thread for correlated jitter."""
+        if self._jitter is not None:
+            self._jitter.stop()
+            self._jitter = None
 
     def _change(self, flows: Sequence[ImpairedFlow], qdiscs: Sequence[Qdisc]) -> list[Command]:
-        """Bring our queues from what they are to what is asked."""
+        """Change LAVT's qdiscs and filters to what is requested."""
         requested = {flow.name: flow for flow in flows}
         found = set(self._filters()) if qdiscs else set()
         wanted = {expected_filter(each): each for flow in flows for each in filters(flow)}
@@ -328,29 +344,31 @@ class NetemInterface:
         for name, place in PLACES.items():
             exists = _netem_at(place.handle, qdiscs) is not None
             if exists or name in requested:
-                law = requested[name].law if name in requested else Impairment()
+                impairment = requested[name].impairment if name in requested else Impairment()
                 verb = "change" if exists else "add"
-                commands.append(set_law(self.interface, name, law, verb=verb, tables=self._tables))  # type: ignore[arg-type]
+                commands.append(set_impairment(self.interface, name, impairment, verb=verb, tables=self._tables))  # type: ignore[arg-type]
         commands += [delete_filter(self.interface, *each[:2]) for each in sorted(found - set(wanted), key=str)]
         commands += [add_filter(self.interface, each) for key, each in wanted.items() if key not in found]
-        return self._do(commands)
+        return self._run_all(commands)
 
     def _clear(self, interface: str, *, at_once: bool) -> list[Command]:
-        qdiscs = self._ours_or_free(interface)
+        qdiscs = self._our_qdiscs(interface)
         if not qdiscs:
             return []
-        held = {name: found for name, place in PLACES.items() if (found := _netem_at(place.handle, qdiscs)) is not None}
-        if at_once or not held:
-            return self._do([delete_root(interface)])
-        longest_ms = max(read_law(found.options).longest_ms for found in held.values())
-        ran = self._do([set_law(interface, name, Impairment(), verb="change") for name in held])
+        netems = {
+            name: found for name, place in PLACES.items() if (found := _netem_at(place.handle, qdiscs)) is not None
+        }
+        if at_once or not netems:
+            return self._run_all([delete_root(interface)])
+        longest_ms = max(parse_impairment(found.options).longest_ms for found in netems.values())
+        ran = self._run_all([set_impairment(interface, name, Impairment(), verb="change") for name in netems])
         self._wait_until_empty(interface, round(longest_ms * NS_PER_MS))
-        ran += self._do([delete_filters(interface)])
+        ran += self._run_all([delete_filters(interface)])
         self._wait_until_empty(interface, 0)
-        return ran + self._do([delete_root(interface)])
+        return ran + self._run_all([delete_root(interface)])
 
-    def _wait_until_empty(self, interface: str, longest_ns: int) -> None:
-        limit_ns = self._clock.now().mono_ns + longest_ns + AFTER_LONGEST_NS
+    def _wait_until_empty(self, interface: str, longest_delay_ns: int) -> None:
+        limit_ns = self._clock.now().mono_ns + longest_delay_ns + DRAIN_MARGIN_NS
         handles = {place.handle for place in PLACES.values()}
         while self._clock.now().mono_ns < limit_ns:
             qdiscs = parse_qdiscs(self._run(show_qdiscs(interface)))
@@ -361,7 +379,7 @@ class NetemInterface:
     def _filters(self) -> list[FoundFilter]:
         return parse_filters(self._run(show_filters(self.interface)))
 
-    def _do(self, commands: Sequence[Command]) -> list[Command]:
+    def _run_all(self, commands: Sequence[Command]) -> list[Command]:
         for command in commands:
             self._run(command)
         return list(commands)

@@ -1,7 +1,7 @@
-"""What is written down of an interface that is held, so that it is put back after a crash.
+"""State files of interfaces with impairments, so that an interface is restored after a crash.
 
-One file for each interface and network namespace, written before tc is told anything. It says who owns the delay: a
-process, which takes it away when it ends, or nobody, where `lavt netem apply` left it in place.
+There is one file for each interface and network namespace, written before tc is called. It names the owner: a process,
+which clears the interface when it ends, or none, if `lavt netem apply` left the impairments in place.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from lavt.transport.emulation.impairment import ImpairedFlow, Impairment
 from lavt.value import value
 
 DIRECTORY: Final = Path("/run/lavt")
-NOBODY: Final = (0, 0)
-"""Instead of an owner: left in place."""
+NO_OWNER: Final = (0, 0)
+"""The owner of persistent impairments."""
 _START_TICKS: Final = 19
-"""Index of a process's start among what follows its name in /proc/PID/stat (proc(5): field 22)."""
+"""Index of a process's start time among the fields after its name in /proc/PID/stat (proc(5): field 22)."""
 
 Owner = tuple[int, int]
-"""Number of a process and when it was started: numbers come again."""
+"""A process's number and start time, because numbers are reused."""
 
 
 @value
 class AppliedState:
-    """What was applied to an interface, and by whom."""
+    """What was applied to an interface, and the owner."""
 
     interface: str
     namespace: int
@@ -42,58 +42,58 @@ class AppliedState:
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether it belongs to a process that is no more, or to an earlier boot of the machine."""
-        if self.boot != boot():
+        """Whether the owner no longer runs, or the state is from an earlier boot."""
+        if self.boot != boot_id():
             return True
-        return self.owner != NOBODY and self.owner[1] != started(self.owner[0])
+        return self.owner != NO_OWNER and self.owner[1] != start_ticks(self.owner[0])
 
     @property
-    def words(self) -> str:
-        """What and whose it is."""
-        whose = "left in place" if self.owner == NOBODY else f"of process {self.owner[0]}"
-        return f"{self.condition or 'a delay'} on {self.interface}, {whose}"
+    def description(self) -> str:
+        """Condition, interface and owner, for messages."""
+        owner = "left in place" if self.owner == NO_OWNER else f"owned by process {self.owner[0]}"
+        return f"{self.condition or 'a delay'} on {self.interface}, {owner}"
 
 
-def this_process() -> Owner:
-    """Give this process as an owner."""
-    return os.getpid(), started(os.getpid())
+def current_process() -> Owner:
+    """Return this process as an owner."""
+    return os.getpid(), start_ticks(os.getpid())
 
 
-def started(pid: int) -> int:
-    """Tell when a process was started, in the kernel's ticks; 0 where there is none."""
+def start_ticks(pid: int) -> int:
+    """Return when a process started, in kernel ticks; 0 if it does not run."""
     try:
-        words = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
-        return 0 if words[0] in "ZX" else int(words[_START_TICKS])
+        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return 0 if fields[0] in "ZX" else int(fields[_START_TICKS])
     except (OSError, ValueError, IndexError):
         return 0
 
 
-def boot() -> str:
-    """Tell which boot of the machine this is."""
+def boot_id() -> str:
+    """Return the identifier of the machine's current boot."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
-def namespace() -> int:
-    """Tell the network namespace of the calling thread."""
-    return os.stat("/proc/thread-self/ns/net").st_ino  # noqa: PTH116 (it is a link that leads to no path)
+def network_namespace() -> int:
+    """Return the identifier of the calling thread's network namespace."""
+    return os.stat("/proc/thread-self/ns/net").st_ino  # noqa: PTH116 (the link's target is not a path)
 
 
 class StateFiles:
-    """The files in a directory. Raises `UserError` where it cannot be written."""
+    """The state files in a directory. Raises `UserError` if the directory is not writable."""
 
     def __init__(self, directory: Path = DIRECTORY) -> None:
         self.directory = directory
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keep all others that use this directory, processes and threads, from changing an interface meanwhile."""
+    def locked(self) -> Iterator[None]:
+        """Lock the directory, so that no other process or thread changes an interface meanwhile."""
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             lock = os.open(self.directory / "netem.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise UserError(
-                f"{self.directory} cannot be written ({error.strerror}): netem needs root; run it with sudo, or use "
-                "the relay, which needs none"
+                f"cannot write {self.directory} ({error.strerror}): netem needs root; use sudo, or the relay, which "
+                "does not need it"
             ) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -102,41 +102,41 @@ class StateFiles:
             os.close(lock)
 
     def write(self, applied: AppliedState) -> None:
-        """Write down what is going to be applied."""
+        """Store the state that is going to be applied."""
         self.write_text(self._path(applied.interface).name, json.dumps(asdict(applied)))
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file; there is never half of one."""
+        """Write a file atomically."""
         part = self.directory / f"{name}.part"
-        with self._writing():
+        with self._reporting_errors():
             part.write_text(text)
             part.replace(self.directory / name)
 
     def read(self, interface: str) -> AppliedState | None:
-        """Give what was applied to an interface of this namespace; None for nothing, or what cannot be read."""
+        """Return what was applied to an interface of this namespace, or None if there is no readable state."""
         return self._read(self._path(interface))
 
     def all(self) -> list[AppliedState]:
-        """Give everything that was applied in this namespace."""
-        found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{namespace()}-*.json"))]
+        """Return everything that was applied in this namespace."""
+        found = [self._read(path) for path in sorted(self.directory.glob(f"netem-{network_namespace()}-*.json"))]
         return [each for each in found if each is not None]
 
-    def forget(self, interface: str) -> None:
-        """Take away what was written down of an interface."""
-        with self._writing():
+    def remove(self, interface: str) -> None:
+        """Delete the state of an interface."""
+        with self._reporting_errors():
             self._path(interface).unlink(missing_ok=True)
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _reporting_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
             raise UserError(
-                f"{self.directory} cannot be written ({error.strerror}): make room there, and let root write to it"
+                f"cannot write {self.directory} ({error.strerror}): free space there, and let root write to it"
             ) from error
 
     def _path(self, interface: str) -> Path:
-        return self.directory / f"netem-{namespace()}-{interface}.json"
+        return self.directory / f"netem-{network_namespace()}-{interface}.json"
 
     @staticmethod
     def _read(path: Path) -> AppliedState | None:
@@ -144,13 +144,17 @@ class StateFiles:
             data = json.loads(path.read_text())
             pid, start = data["owner"]
             return AppliedState(
-                str(data["interface"]), int(data["namespace"]), str(data["boot"]), (int(pid), int(start)),
-                str(data["condition"]), flows_from(data["flows"]),
-            )  # fmt: skip
+                str(data["interface"]),
+                int(data["namespace"]),
+                str(data["boot"]),
+                (int(pid), int(start)),
+                str(data["condition"]),
+                flows_from(data["flows"]),
+            )
         except (OSError, ValueError, TypeError, KeyError, AttributeError):
             return None
 
 
 def flows_from(data: Sequence[Any]) -> tuple[ImpairedFlow, ...]:
-    """Make flows of what `dataclasses.asdict` made of them; raises `TypeError` or `KeyError` for anything else."""
-    return tuple(ImpairedFlow(**{**each, "law": Impairment(**each["law"])}) for each in data)
+    """Return flows from the output of `dataclasses.asdict`; raise `TypeError` or `KeyError` for anything else."""
+    return tuple(ImpairedFlow(**{**each, "impairment": Impairment(**each["impairment"])}) for each in data)

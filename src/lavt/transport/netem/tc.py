@@ -1,17 +1,16 @@
-"""What tc is told and what it says: commands for laws and flows, and their reading back. Nothing is run here.
+"""Commands and output formats of tc: makes the commands for flows and parses what tc reports. Nothing is run here.
 
-The queue of an interface becomes a `prio` with six bands. Everything goes through the first three, as it did before by
-the kernel's own rule; a flow that is to be held is sent by a filter to a band of its own, with a netem of its own:
+The root of an interface becomes a `prio` qdisc with six bands. All traffic uses the first three, as with the kernel's
+default; filters send each impaired flow to a band of its own, with a netem of its own:
 
     root 4c56: prio ── 4c56:1 .. 4c56:3   everything else, untouched
                     ├─ 4c56:4 netem 4c01: video     RTP and sender reports, not the challenges of its path
                     ├─ 4c56:5 netem 4c02: control
                     └─ 4c56:6 netem 4c03: state
 
-Handles are our own, so that ours is known from somebody else's. netem keeps order only where it has a rate (measured;
-tc-netem(8) does not say so): a flow without one gets 10 Gbit/s, which costs a packet a microsecond. So nothing
-overtakes where that is not asked for, neither by jitter nor when a delay becomes shorter, as in
-`transport/emulation/delay_line.py`.
+The handles identify LAVT's qdiscs. netem keeps order only with a rate (measured; tc-netem(8) does not mention it): a
+flow without a rate gets 10 Gbit/s, which costs 1 us per packet. So packets overtake only where that is requested, and
+neither by jitter nor when a delay becomes shorter, as in `transport/emulation/delay_line.py`.
 """
 
 from __future__ import annotations
@@ -24,33 +23,33 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal
 
 from lavt.errors import WorkError
-from lavt.transport.emulation.impairment import ORDER_RATE_BPS, ImpairedFlow, Impairment, bursts, gilbert
+from lavt.transport.emulation.impairment import ORDER_RATE_BPS, ImpairedFlow, Impairment, gilbert, has_loss_bursts
 from lavt.value import value
 
 Command = list[str]
 """A command and its arguments."""
 
 ROOT: Final = "4c56:"
-"""Handle of our root, "LV" in ASCII: what has it is ours."""
+"""Handle of LAVT's root qdisc, "LV" in ASCII."""
 BANDS: Final = 6
 LEAST_LIMIT_PACKETS: Final = 10_000
 PACKETS_PER_S: Final = 2_000
-"""Room for so many packets in each second of delay; the video has about 400 in a second, the control 50."""
+"""Queue limit for each second of delay; the video sends about 400 packets per second, the control 50."""
 TC_STEP_MS: Final = 0.002
-"""tc counts delays in microseconds, and loses up to one in each conversion."""
+"""tc counts delays in microseconds and loses up to one in each conversion."""
 
 
 @value
 class FlowPlacement:
-    """Where a flow's packets are held: the band, the handle of its netem, and the first of its filters' numbers."""
+    """Where a flow is delayed: its band, the handle of its netem, and the number of its first filter."""
 
     band: int
     handle: str
-    number: int
+    filter_number: int
 
     @property
     def parent(self) -> str:
-        """The band as tc names it."""
+        """The band in tc's notation."""
         return f"{ROOT}{self.band}"
 
 
@@ -63,145 +62,144 @@ PLACES: Final[Mapping[str, FlowPlacement]] = {
 
 @value
 class U32Match:
-    """One condition of a u32 filter: as tc is told it, and as it is read back, 32 bits at an offset."""
+    """One condition of a u32 filter: tc's input, and the 32 bits at an offset that tc reports."""
 
-    words: str
+    text: str
     offset: int
     bits: int
     mask: int
 
     @property
     def read_back(self) -> tuple[int, int, int]:
-        """Offset, bits and mask."""
+        """Offset, bits and mask, as tc reports them."""
         return self.offset, self.bits, self.mask
 
 
 @value
 class TcFilter:
-    """Sends the packets of one IP version that match to a flow's band."""
+    """A u32 filter that sends matching packets of one IP version to a flow's band."""
 
-    number: int
+    filter_number: int
     version: Literal["ip", "ipv6"]
     matches: tuple[U32Match, ...]
     parent: str
 
 
 def filters(flow: ImpairedFlow) -> list[TcFilter]:
-    """Give the filters of a flow, for IPv4 and for IPv6.
+    """Return the filters of a flow, for IPv4 and for IPv6.
 
-    Whole packets only (no fragments but the first, no IPv4 options, no IPv6 extension headers): the bytes looked at are
-    then what they are taken for. Of the video's port only what begins like RTP and RTCP, whose version is 2.
+    They match whole packets only (first fragments, no IPv4 options, no IPv6 extension headers), so that the offsets are
+    right. On the video's port they match only payloads that begin like RTP and RTCP (version 2).
     """
-    place = PLACES[flow.name]
-    number = {"udp": 17, "tcp": 6}[flow.protocol]
+    placement = PLACES[flow.name]
+    protocol_number = {"udp": 17, "tcp": 6}[flow.protocol]
     direction, shift = {"source": ("sport", 16), "destination": ("dport", 0)}[flow.end]
     port_bits, port_mask = flow.port << shift, 0xFFFF << shift
     matches4: tuple[U32Match, ...] = (
         U32Match("u8 0x45 0xff at 0", 0, 0x45000000, 0xFF000000),
         U32Match("u16 0x0000 0x1fff at 6", 4, 0, 0x1FFF),
-        U32Match(f"ip protocol {number} 0xff", 8, number << 16, 0xFF0000),
+        U32Match(f"ip protocol {protocol_number} 0xff", 8, protocol_number << 16, 0xFF0000),
         U32Match(f"ip {direction} {flow.port} 0xffff", 20, port_bits, port_mask),
     )
     matches6: tuple[U32Match, ...] = (
-        U32Match(f"ip6 protocol {number} 0xff", 4, number << 8, 0xFF00),
+        U32Match(f"ip6 protocol {protocol_number} 0xff", 4, protocol_number << 8, 0xFF00),
         U32Match(f"ip6 {direction} {flow.port} 0xffff", 40, port_bits, port_mask),
     )
     if flow.name == "video":
         matches4 += (U32Match("u8 0x80 0xc0 at 28", 28, 0x80000000, 0xC0000000),)
         matches6 += (U32Match("u8 0x80 0xc0 at 48", 48, 0x80000000, 0xC0000000),)
     return [
-        TcFilter(place.number, "ip", matches4, place.parent),
-        TcFilter(place.number + 1, "ipv6", matches6, place.parent),
+        TcFilter(placement.filter_number, "ip", matches4, placement.parent),
+        TcFilter(placement.filter_number + 1, "ipv6", matches6, placement.parent),
     ]
 
 
 def add_root(interface: str) -> Command:
-    """Give the command that makes room for flows of their own."""
+    """Return the command that creates a root qdisc with bands for flows."""
     return ["tc", "qdisc", "add", "dev", interface, "root", "handle", ROOT, "prio", "bands", str(BANDS)]
 
 
-def set_law(interface: str, name: str, law: Impairment, *, verb: Literal["add", "change"], tables: str = "") -> Command:
-    """Give the command that gives a flow its law, with all arguments: `change` keeps some that are not named.
+def set_impairment(
+    interface: str, name: str, impairment: Impairment, *, verb: Literal["add", "change"], tables: str = ""
+) -> Command:
+    """Return the command that sets a flow's impairment, with all arguments: `change` keeps some that are left out.
 
-    `tables` is the directory of our own table of the uniform distribution, which tc has not: without any table a
-    change would keep that of the law before.
+    `tables` is the directory of LAVT's table of the uniform distribution, which tc lacks: without a table a change
+    would keep the previous one.
     """
-    place = PLACES[name]
-    uniform = ["env", f"TC_LIB_DIR={tables}"] if law.jitter_ms and law.jitter_distribution == "uniform" else []
-    return [
-        *uniform, "tc", "qdisc", verb, "dev", interface, "parent", place.parent, "handle", place.handle,
-        *netem_arguments(law),
-    ]  # fmt: skip
+    placement = PLACES[name]
+    uniform = (
+        ["env", f"TC_LIB_DIR={tables}"] if impairment.jitter_ms and impairment.jitter_distribution == "uniform" else []
+    )
+    target = ["dev", interface, "parent", placement.parent, "handle", placement.handle]
+    return [*uniform, "tc", "qdisc", verb, *target, *netem_arguments(impairment)]
 
 
-def netem_arguments(law: Impairment) -> list[str]:
-    """Give netem's own arguments for a law; what wanders (correlated jitter) is not netem's."""
-    limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * law.longest_ms / 1000))
-    words = ["netem", "limit", str(limit), "delay", f"{_plain(law.delay_ms)}ms"]
-    if law.jitter_ms and not law.jitter_correlation:
-        words += [f"{_plain(law.jitter_ms)}ms", "distribution", law.jitter_distribution]
-    if law.loss and law.loss_burst_packets > 1:
-        words += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in gilbert(law))]
-    elif law.loss:
-        words += ["loss", "random", f"{_plain(100 * law.loss)}%"]
-    if law.reorder:
-        words += ["reorder", f"{_plain(100 * law.reorder)}%"]
-    return [*words, "rate", f"{law.rate_bps}bit" if law.rate_bps else "10gbit"]
+def netem_arguments(impairment: Impairment) -> list[str]:
+    """Return netem's arguments for an impairment; correlated jitter is not left to netem."""
+    limit = max(LEAST_LIMIT_PACKETS, math.ceil(PACKETS_PER_S * impairment.longest_ms / 1000))
+    arguments = ["netem", "limit", str(limit), "delay", f"{_plain(impairment.delay_ms)}ms"]
+    if impairment.jitter_ms and not impairment.jitter_correlation:
+        arguments += [f"{_plain(impairment.jitter_ms)}ms", "distribution", impairment.jitter_distribution]
+    if impairment.loss and impairment.loss_burst_packets > 1:
+        arguments += ["loss", "gemodel", *(f"{_plain(100 * share)}%" for share in gilbert(impairment))]
+    elif impairment.loss:
+        arguments += ["loss", "random", f"{_plain(100 * impairment.loss)}%"]
+    if impairment.reorder:
+        arguments += ["reorder", f"{_plain(100 * impairment.reorder)}%"]
+    return [*arguments, "rate", f"{impairment.rate_bps}bit" if impairment.rate_bps else "10gbit"]
 
 
 def add_filter(interface: str, each: TcFilter) -> Command:
-    """Give the command that sends what matches to its band."""
-    words = " ".join(f"match {match.words}" for match in each.matches)
-    return [
-        "tc", "filter", "add", "dev", interface, "parent", ROOT, "protocol", each.version, "prio", str(each.number),
-        "u32", *words.split(), "classid", each.parent,
-    ]  # fmt: skip
+    """Return the command that adds a filter."""
+    arguments = " ".join(f"match {match.text}" for match in each.matches)
+    target = ["dev", interface, "parent", ROOT, "protocol", each.version, "prio", str(each.filter_number)]
+    return ["tc", "filter", "add", *target, "u32", *arguments.split(), "classid", each.parent]
 
 
-def delete_filter(interface: str, number: int, version: str) -> Command:
-    """Give the command that takes one filter away."""
-    return [
-        "tc", "filter", "del", "dev", interface, "parent", ROOT, "protocol", version, "prio", str(number), "u32",
-    ]  # fmt: skip
+def delete_filter(interface: str, filter_number: int, version: str) -> Command:
+    """Return the command that deletes one filter."""
+    target = ["dev", interface, "parent", ROOT, "protocol", version, "prio", str(filter_number)]
+    return ["tc", "filter", "del", *target, "u32"]
 
 
 def delete_filters(interface: str) -> Command:
-    """Give the command that takes all filters away."""
+    """Return the command that deletes all filters."""
     return ["tc", "filter", "del", "dev", interface, "parent", ROOT]
 
 
 def delete_root(interface: str) -> Command:
-    """Give the command after which the interface has its own queue again."""
+    """Return the command that deletes the root qdisc, so that the interface gets its default back."""
     return ["tc", "qdisc", "del", "dev", interface, "root"]
 
 
 def show_qdiscs(interface: str) -> Command:
-    """Give the command that tells the queues."""
+    """Return the command that lists the qdiscs."""
     return ["tc", "-j", "-s", "qdisc", "show", "dev", interface]
 
 
 def show_filters(interface: str) -> Command:
-    """Give the command that tells our filters; as text, as the JSON of u32 has one key several times."""
+    """Return the command that lists LAVT's filters, as text: u32's JSON repeats a key."""
     return ["tc", "filter", "show", "dev", interface, "parent", ROOT]
 
 
 def first_commands(interface: str, flows: Sequence[ImpairedFlow], *, tables: str = "") -> list[Command]:
-    """Give all commands for an interface that has nothing of ours."""
+    """Return all commands for an interface without qdiscs of LAVT."""
     commands = [add_root(interface)]
     for flow in flows:
-        commands.append(set_law(interface, flow.name, flow.law, verb="add", tables=tables))
+        commands.append(set_impairment(interface, flow.name, flow.impairment, verb="add", tables=tables))
         commands += [add_filter(interface, each) for each in filters(flow)]
     return commands
 
 
 def as_typed(command: Sequence[str]) -> str:
-    """Give a command as one would type it."""
+    """Return a command as it would be typed."""
     return shlex.join(command)
 
 
 @value
 class Qdisc:
-    """A queue as tc tells it; `parent` is "root" for the root."""
+    """A queueing discipline as tc reports it; `parent` is "root" for the root."""
 
     kind: str
     handle: str
@@ -211,7 +209,7 @@ class Qdisc:
 
 
 def parse_qdiscs(text: str) -> list[Qdisc]:
-    """Read what `tc -j -s qdisc show` prints; raises `WorkError` for anything else."""
+    """Parse the output of `tc -j -s qdisc show`. Raise `WorkError` for anything else."""
     try:
         return [
             Qdisc(
@@ -224,18 +222,18 @@ def parse_qdiscs(text: str) -> list[Qdisc]:
             for entry in json.loads(text or "[]")
         ]
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise WorkError(f"tc told its queues in words that are not understood: {text[:200]!r}") from error
+        raise WorkError(f"could not parse tc's list of qdiscs: {text[:200]!r}") from error
 
 
 _FILTER: Final = re.compile(r"protocol (\S+) pref (\d+) u32 .*flowid (\S+)")
 _MATCH: Final = re.compile(r"^\s*match ([0-9a-f]{8})/([0-9a-f]{8}) at (\d+)$")
 
 FoundFilter = tuple[int, str, str, frozenset[tuple[int, int, int]]]
-"""Number, IP version, band, and what it matches: (offset, bits, mask) each."""
+"""Number, IP version, band, and matches: (offset, bits, mask) each."""
 
 
 def parse_filters(text: str) -> list[FoundFilter]:
-    """Read the u32 filters out of what `tc filter show` prints; other lines are passed over."""
+    """Parse the u32 filters in the output of `tc filter show`; other lines are skipped."""
     found: list[tuple[int, str, str, set[tuple[int, int, int]]]] = []
     for line in text.splitlines():
         if (head := _FILTER.search(line)) is not None:
@@ -246,21 +244,21 @@ def parse_filters(text: str) -> list[FoundFilter]:
 
 
 def expected_filter(each: TcFilter) -> FoundFilter:
-    """Give a filter as it is read back."""
-    return each.number, each.version, each.parent, frozenset(match.read_back for match in each.matches)
+    """Return a filter as tc reports it."""
+    return each.filter_number, each.version, each.parent, frozenset(match.read_back for match in each.matches)
 
 
-def read_law(options: Mapping[str, Any]) -> Impairment:
-    """Give the law that a netem's options tell; the distribution is not told, and counts as normal.
+def parse_impairment(options: Mapping[str, Any]) -> Impairment:
+    """Return the impairment of a netem's options. tc does not report the distribution, so it is normal.
 
-    Raises `WorkError` for options that are not netem's.
+    Raise `WorkError` for options that are not netem's.
     """
     try:
         delay = options.get("delay", {})
         loss, burst = float(options.get("loss-random", {}).get("loss", 0.0)), 0.0
         if (model := options.get("loss-gemodel")) is not None:
-            into, out_of = float(model["p"]), float(model["r"])
-            loss, burst = into / (into + out_of), 1 / out_of
+            p_begin, p_end = float(model["p"]), float(model["r"])
+            loss, burst = p_begin / (p_begin + p_end), 1 / p_end
         rate_bps = 8 * int(options.get("rate", {}).get("rate", 0))
         return Impairment(
             delay_ms=1000 * float(delay.get("delay", 0.0)),
@@ -271,47 +269,50 @@ def read_law(options: Mapping[str, Any]) -> Impairment:
             reorder=float(options["reorder"]["reorder"]) if options.get("gap") else 0.0,
         )
     except (ValueError, TypeError, KeyError, AttributeError, ZeroDivisionError) as error:
-        raise WorkError(f"tc told a netem in words that are not understood: {str(options)[:200]!r}") from error
+        raise WorkError(f"could not parse tc's options of a netem: {str(options)[:200]!r}") from error
 
 
 def difference(flow: ImpairedFlow, qdiscs: Iterable[Qdisc], found: Iterable[FoundFilter]) -> list[str]:
-    """Compare a flow with what was read back, in sentences; an empty list is as asked."""
-    place, requested = PLACES[flow.name], flow.law
-    netem = next((each for each in qdiscs if each.handle == place.handle), None)
-    if netem is None or netem.kind != "netem" or netem.parent != place.parent:
-        return [f"{flow.words} has no netem"]
-    is_ = read_law(netem.options)
-    wanders = bool(requested.jitter_correlation)  # then the delay is where it has got to, and no jitter of netem's
+    """Compare a flow with tc's report, and return a message for each difference."""
+    placement, requested = PLACES[flow.name], flow.impairment
+    netem = next((each for each in qdiscs if each.handle == placement.handle), None)
+    if netem is None or netem.kind != "netem" or netem.parent != placement.parent:
+        return [f"{flow.description} has no netem"]
+    actual_impairment = parse_impairment(netem.options)
+    is_correlated = bool(requested.jitter_correlation)  # then the delay varies, and netem has no jitter
+    burst_packets = requested.loss_burst_packets * has_loss_bursts(requested)
+    delay_step_ms = TC_STEP_MS + 8 * requested.jitter_ms * is_correlated
+    jitter_ms = 0.0 if is_correlated else requested.jitter_ms
     reasons = [
-        f"{flow.words}: {name} is {there:g} where {wanted:g} was asked"
-        for name, there, wanted, step in (
-            ("delay_ms", is_.delay_ms, requested.delay_ms, TC_STEP_MS + 8 * requested.jitter_ms * wanders),
-            ("jitter_ms", is_.jitter_ms, 0.0 if wanders else requested.jitter_ms, TC_STEP_MS),
-            ("loss", is_.loss, requested.loss, 1e-5),
-            ("loss_burst_packets", is_.loss_burst_packets, requested.loss_burst_packets * bursts(requested), 1e-3),
-            ("rate_bps", is_.rate_bps, requested.rate_bps, 8),
-            ("reorder", is_.reorder, requested.reorder, 1e-5),
+        f"{flow.description}: {name} is {actual:g} instead of {expected:g}"
+        for name, actual, expected, step in (
+            ("delay_ms", actual_impairment.delay_ms, requested.delay_ms, delay_step_ms),
+            ("jitter_ms", actual_impairment.jitter_ms, jitter_ms, TC_STEP_MS),
+            ("loss", actual_impairment.loss, requested.loss, 1e-5),
+            ("loss_burst_packets", actual_impairment.loss_burst_packets, burst_packets, 1e-3),
+            ("rate_bps", actual_impairment.rate_bps, requested.rate_bps, 8),
+            ("reorder", actual_impairment.reorder, requested.reorder, 1e-5),
         )
-        if abs(there - wanted) > step + 1e-5 * wanted
-    ]  # fmt: skip
+        if abs(actual - expected) > step + 1e-5 * expected
+    ]
     if int(netem.options.get("limit", 0)) < LEAST_LIMIT_PACKETS:
-        reasons.append(f"{flow.words}: room for {netem.options.get('limit')} packets only")
+        reasons.append(f"{flow.description}: its queue limit is only {netem.options.get('limit')} packets")
     if not netem.options.get("rate"):
-        reasons.append(f"{flow.words}: has no rate, so packets overtake each other")
-    there_filters = set(found)
+        reasons.append(f"{flow.description}: it has no rate, so packets overtake each other")
+    actual_filters = set(found)
     reasons += [
-        f"{flow.words} has no filter for {each.version}"
+        f"{flow.description} has no filter for {each.version}"
         for each in filters(flow)
-        if expected_filter(each) not in there_filters
+        if expected_filter(each) not in actual_filters
     ]
     return reasons
 
 
 def uniform_table() -> str:
-    """Give tc's table of the uniform distribution: the half width is 8192."""
+    """Return tc's table of the uniform distribution; its half width is 8192."""
     return "# uniform, for tc netem\n" + "".join(f"{number}\n" for number in range(-8192, 8193, 16))
 
 
 def _plain(number: float) -> str:
-    """Write a number without an exponent, to the precision that tc has."""
+    """Format a number without an exponent, to tc's precision."""
     return f"{number:.6f}".rstrip("0").rstrip(".") or "0"

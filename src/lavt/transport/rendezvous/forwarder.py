@@ -1,25 +1,29 @@
-"""A UDP flow to a vehicle behind a NAT that forwards nothing, through a machine that both ends reach.
+"""Forward a UDP flow to a vehicle behind NAT, through a machine that both ends can reach.
 
-The vehicle's socket registers with the rendezvous every second, which also keeps its NAT open. Clients send to the
-rendezvous what they would send to the vehicle. Between these two each datagram is wrapped with the client's address:
+The vehicle's socket registers with the rendezvous every second, which also keeps its NAT mapping alive. Clients send
+to the rendezvous what they would send to the vehicle. Between rendezvous and vehicle each datagram is wrapped with the
+client's address:
 
     vehicle -> rendezvous   registration  b"LAVR", version, 1, wall time, vehicle, flow, signature or nothing
     rendezvous <-> vehicle  wrapped       b"LAVR", version, 2, client's IPv4 address, client's port, datagram
 
-The proof of the video's path and its encryption stay between the ends: the rendezvous has no token and no key, and the
-address in the wrapping is what the vehicle seals in its challenge. What it could do, any router on the way could do.
+Validation of the video path and its encryption are end to end: the rendezvous has no token and no key, and the wrapped
+client address is the one in the vehicle's address-validation cookie. A rendezvous can do no more than any router on the
+path. Threats:
 
-* Stand in for the vehicle: a registration counts only with the vehicle's signature, and newer than the last taken. A
-  rendezvous that was started again, or has not heard the vehicle for 10 s, may take an old one, until the vehicle's
-  next (at most 1 s; longer only where the vehicle's clock was set back). Without a key any of its name counts.
-* Have it send to a third party: it sends to the registered vehicle, and from there to clients that were heard in the
-  last 30 s, one datagram for one, longer by the wrapping or shorter. A registration gets no reply.
-* Flood the vehicle: it gets only what looks like the flow's own, so many a second; those that it has answered have a
-  share of their own, so that strangers cannot keep them out.
-* Not covered: who reads on the way to the rendezvous can send a registration on first, from elsewhere, and so swallow
-  the flow for a second, as it can swallow the datagrams themselves.
+* Impersonating the vehicle: a registration is accepted only with the vehicle's signature and a later time than the
+  last one. A rendezvous that has just started, or has had no registration for 10 s, may accept an old one until the
+  vehicle's next (at most 1 s; longer only if the vehicle's clock was set back). Without a key, every registration with
+  the vehicle's name is accepted.
+* Reflection to a third party: the rendezvous sends to the registered vehicle, and from the vehicle to clients that sent
+  something in the last 30 s. Each datagram causes at most one, which differs in length by the wrapping. A registration
+  gets no reply.
+* Flooding the vehicle: only datagrams that look like the flow's pass, at a limited rate. Clients that the vehicle has
+  answered have a rate limit of their own, so that others cannot crowd them out.
+* Not covered: an attacker on the path to the rendezvous can forward a registration from another address before the
+  original arrives, and so divert the flow for a second. It could as well drop the datagrams themselves.
 
-No input, output or clock here: `rendezvous_link.py` has the sockets. One flow is one `Forwarder`, of one vehicle.
+No input, output or clock here: `link.py` has the sockets. A `Forwarder` serves one flow of one vehicle.
 """
 
 from __future__ import annotations
@@ -42,18 +46,19 @@ FlowName = Literal["video", "probe"]
 Address = tuple[str, int]
 
 REGISTER_EVERY_NS: Final = NS_PER_S
-"""Linux as a NAT forgets a UDP flow after 30 s; and so long at most a vehicle with a new address is not found."""
-VEHICLE_SILENCE_NS: Final = 10 * NS_PER_S
-"""A vehicle that has not registered for so long is not there."""
-CLIENT_SILENCE_NS: Final = 30 * NS_PER_S
-"""A client that sent nothing for so long gets nothing."""
-MOST_CLIENTS: Final = 64
-"""That the vehicle has answered, and as many that it has not."""
+"""A Linux NAT drops a UDP mapping after 30 s. The period is also the longest outage after a change of address."""
+VEHICLE_TIMEOUT_NS: Final = 10 * NS_PER_S
+"""A registration expires after this time."""
+CLIENT_TIMEOUT_NS: Final = 30 * NS_PER_S
+"""A client gets nothing if it has sent nothing for this time."""
+MAX_CLIENTS: Final = 64
+"""Limits the clients that the vehicle has answered, and separately those that it has not."""
 REGISTRATIONS_PER_S: Final = 50
-"""So many signatures are looked at of those from the vehicle's address, and as many from elsewhere."""
+"""Limits the signatures verified from the vehicle's address, and separately those from other addresses."""
 UPSTREAM_PER_S: Final = 200
-"""Of those the vehicle has answered, and as many of all others. A client reports 2.5 times a second, as measured."""
-LONGEST_UPSTREAM_BYTES: Final = 1400
+"""Limits the datagrams of clients that the vehicle has answered, and separately those of others. A client sends 2.5
+reports a second, as measured."""
+MAX_UPSTREAM_BYTES: Final = 1400
 
 _MAGIC: Final = b"LAVR"
 _VERSION: Final = 1
@@ -64,27 +69,27 @@ _ADDRESS: Final = struct.Struct(">4sH")
 WRAPPING_BYTES: Final = len(_WRAPPED) + _ADDRESS.size
 
 
-def write_registration(vehicle: str, flow: FlowName, wall_ns: int, key: PrivateKey | None) -> bytes:
-    """Say where the flow of a vehicle is, by sending this from there: 54 bytes, 118 where it is signed."""
-    said = _LAYOUT.pack(_REGISTRATION, wall_ns, vehicle.encode(), flow.encode())
-    return said if key is None else said + key.sign(_context(vehicle) + said)
+def encode_registration(vehicle: str, flow: FlowName, wall_ns: int, key: PrivateKey | None) -> bytes:
+    """Return a registration, which the vehicle's socket sends: 54 bytes, or 118 with a signature."""
+    registration = _LAYOUT.pack(_REGISTRATION, wall_ns, vehicle.encode(), flow.encode())
+    return registration if key is None else registration + key.sign(_signing_context(vehicle) + registration)
 
 
 def wrap(client: Address, datagram: bytes) -> bytes:
-    """Wrap a datagram from or to a client, whose address is an IPv4 one in numbers."""
+    """Wrap a datagram from or to a client, whose host is a numeric IPv4 address."""
     return _WRAPPED + _ADDRESS.pack(socket.inet_aton(client[0]), client[1]) + datagram
 
 
 def unwrap(data: bytes) -> tuple[Address, bytes] | None:
-    """Give the client's address and the datagram; None for what is not wrapped."""
+    """Return the client's address and the datagram; None if `data` is not wrapped."""
     if not data.startswith(_WRAPPED) or len(data) < WRAPPING_BYTES:
         return None
     host, port = _ADDRESS.unpack_from(data, len(_WRAPPED))
     return (socket.inet_ntoa(host), port), data[WRAPPING_BYTES:]
 
 
-def _context(vehicle: str) -> bytes:
-    """Begin what is signed, as in `sealing.py`: no signature serves for anything else."""
+def _signing_context(vehicle: str) -> bytes:
+    """Return the prefix of signed data, as in `envelope.py`: the signature is valid for registrations only."""
     return f"LAVT 1 registration {vehicle}\0".encode()
 
 
@@ -100,15 +105,15 @@ def _is_probe(datagram: bytes) -> bool:
     return True
 
 
-LOOKS_RIGHT: Final[Mapping[FlowName, Callable[[bytes], bool]]] = {"video": _may_be_video, "probe": _is_probe}
-"""What a client may send in each flow."""
+UPSTREAM_CHECKS: Final[Mapping[FlowName, Callable[[bytes], bool]]] = {"video": _may_be_video, "probe": _is_probe}
+"""Checks whether a client may send a datagram, by flow."""
 
 
 class Forwarder:
-    """One flow of one vehicle: where the vehicle is, which clients there are, and where each datagram goes.
+    """A forwarder that knows the addresses of one vehicle and its clients, and routes the datagrams of one flow.
 
-    `key` is the vehicle's; None: whoever knows its name can stand in for it. All times are of one monotonic clock.
-    `counts` has what became of the datagrams.
+    `key` is the vehicle's public key; without it, anyone who knows the vehicle's name can register. All times are of
+    one monotonic clock. `counts` has the numbers of datagrams by result.
     """
 
     def __init__(self, vehicle: str, flow: FlowName, key: PublicKey | None) -> None:
@@ -116,21 +121,21 @@ class Forwarder:
         self._vehicle = vehicle
         self._flow: FlowName = flow
         self._key = key
-        self._at: Address | None = None
+        self._vehicle_address: Address | None = None
         self._registered_ns = 0
-        self._told_ns = 0
+        self._registration_wall_ns = 0
         self._clients = _Clients()
-        self._signatures = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
-        """Apart, by whether they come from where the vehicle is."""
-        self._upstream = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
-        """Apart, by whether the vehicle has answered the client."""
+        self._signature_limiters = {True: RateLimiter(REGISTRATIONS_PER_S), False: RateLimiter(REGISTRATIONS_PER_S)}
+        """By whether the registration comes from the vehicle's address."""
+        self._upstream_limiters = {True: RateLimiter(UPSTREAM_PER_S), False: RateLimiter(UPSTREAM_PER_S)}
+        """By whether the vehicle has answered the client."""
 
-    def vehicle_at(self, now_ns: int) -> Address | None:
-        """Tell from where the vehicle has registered; None: it is not there."""
-        return self._at if now_ns - self._registered_ns <= VEHICLE_SILENCE_NS else None
+    def vehicle_address(self, now_ns: int) -> Address | None:
+        """Return the address from which the vehicle registered; None if there is none or the registration expired."""
+        return self._vehicle_address if now_ns - self._registered_ns <= VEHICLE_TIMEOUT_NS else None
 
     def receive(self, datagram: bytes, sender: Address, now_ns: int) -> tuple[bytes, Address] | None:
-        """Take a datagram, and give what is to be sent and where to; None: nothing."""
+        """Process a datagram; return a datagram to send and its destination, or None."""
         if datagram.startswith(_REGISTRATION):
             self.counts[self._register(datagram, sender, now_ns)] += 1
             return None
@@ -139,31 +144,31 @@ class Forwarder:
         return self._from_client(datagram, sender, now_ns)
 
     def _register(self, datagram: bytes, sender: Address, now_ns: int) -> str:
-        """Take a registration if it is the vehicle's and new; say what became of it."""
-        said, signature = datagram[: _LAYOUT.size], datagram[_LAYOUT.size :]
-        if len(said) != _LAYOUT.size or len(signature) not in {0, SIGNATURE_BYTES}:
+        """Accept a registration if it is the vehicle's and new; return the name of the counter of the result."""
+        registration, signature = datagram[: _LAYOUT.size], datagram[_LAYOUT.size :]
+        if len(registration) != _LAYOUT.size or len(signature) not in {0, SIGNATURE_BYTES}:
             return "registrations_malformed"
-        told_ns = _LAYOUT.unpack(said)[1]
-        if said != write_registration(self._vehicle, self._flow, told_ns, None):
+        wall_ns = _LAYOUT.unpack(registration)[1]
+        if registration != encode_registration(self._vehicle, self._flow, wall_ns, None):
             return "registrations_of_others"
-        at = self.vehicle_at(now_ns)
-        if at is not None and told_ns <= self._told_ns:
+        address = self.vehicle_address(now_ns)
+        if address is not None and wall_ns <= self._registration_wall_ns:
             return "registrations_stale"
         if self._key is not None:
-            if not self._signatures[sender == at].take(now_ns):
+            if not self._signature_limiters[sender == address].take(now_ns):
                 return "registrations_too_many"
-            if not self._key.verifies(signature, _context(self._vehicle) + said):
+            if not self._key.verify(signature, _signing_context(self._vehicle) + registration):
                 return "registrations_forged"
-        self._at, self._registered_ns, self._told_ns = sender, now_ns, told_ns
+        self._vehicle_address, self._registered_ns, self._registration_wall_ns = sender, now_ns, wall_ns
         return "registrations"
 
     def _from_vehicle(self, datagram: bytes, sender: Address, now_ns: int) -> tuple[bytes, Address] | None:
         unwrapped = unwrap(datagram)
         if unwrapped is None:
             self.counts["malformed"] += 1
-        elif sender != self.vehicle_at(now_ns):
+        elif sender != self.vehicle_address(now_ns):
             self.counts["not_from_vehicle"] += 1
-        elif not self._clients.answered(unwrapped[0], now_ns):
+        elif not self._clients.note_answer(unwrapped[0], now_ns):
             self.counts["to_nobody"] += 1
         else:
             self.counts["to_clients"] += 1
@@ -171,49 +176,52 @@ class Forwarder:
         return None
 
     def _from_client(self, datagram: bytes, sender: Address, now_ns: int) -> tuple[bytes, Address] | None:
-        at = self.vehicle_at(now_ns)
-        if sender == at or len(datagram) > LONGEST_UPSTREAM_BYTES or not LOOKS_RIGHT[self._flow](datagram):
+        address = self.vehicle_address(now_ns)
+        if sender == address or len(datagram) > MAX_UPSTREAM_BYTES or not UPSTREAM_CHECKS[self._flow](datagram):
             self.counts["malformed"] += 1
-        elif at is None:
+        elif address is None:
             self.counts["without_vehicle"] += 1
-        elif not self._upstream[self._clients.heard(sender, now_ns)].take(now_ns):
+        elif not self._upstream_limiters[self._clients.note_datagram(sender, now_ns)].take(now_ns):
             self.counts["too_many"] += 1
         else:
             self.counts["to_vehicle"] += 1
-            return wrap(sender, datagram), at
+            return wrap(sender, datagram), address
         return None
 
 
 class _Clients:
-    """Those heard lately, the longest silent first; a crowd of strangers drives nobody out whom the vehicle answers."""
+    """The clients and when they last sent something, oldest first.
+
+    Clients that the vehicle has answered are in a table of their own, so that others cannot displace them.
+    """
 
     def __init__(self) -> None:
         self._answered: dict[Address, int] = {}
         self._unanswered: dict[Address, int] = {}
 
-    def heard(self, client: Address, now_ns: int) -> bool:
-        """Note that a client sent something; tell whether the vehicle has answered it before."""
-        known = client in self._answered
-        _put(self._answered if known else self._unanswered, client, now_ns)
-        return known
+    def note_datagram(self, client: Address, now_ns: int) -> bool:
+        """Note that a client sent something; return whether the vehicle has answered it before."""
+        is_answered = client in self._answered
+        _put(self._answered if is_answered else self._unanswered, client, now_ns)
+        return is_answered
 
-    def answered(self, client: Address, now_ns: int) -> bool:
-        """Tell whether a client was heard lately, to whom the vehicle sends something."""
-        heard_ns = self._answered.get(client)
-        if heard_ns is None:
-            heard_ns = self._unanswered.pop(client, None)
-            if heard_ns is None:
+    def note_answer(self, client: Address, now_ns: int) -> bool:
+        """Note that the vehicle sends to a client; return whether the client has sent something recently."""
+        received_ns = self._answered.get(client)
+        if received_ns is None:
+            received_ns = self._unanswered.pop(client, None)
+            if received_ns is None:
                 return False
-            _put(self._answered, client, heard_ns)
-        if now_ns - heard_ns <= CLIENT_SILENCE_NS:
+            _put(self._answered, client, received_ns)
+        if now_ns - received_ns <= CLIENT_TIMEOUT_NS:
             return True
         del self._answered[client]
         return False
 
 
-def _put(table: dict[Address, int], client: Address, heard_ns: int) -> None:
-    """Put a client at the end; where there are too many, the first goes."""
+def _put(table: dict[Address, int], client: Address, received_ns: int) -> None:
+    """Put a client at the end of a table; drop the first if there are too many."""
     table.pop(client, None)
-    table[client] = heard_ns
-    if len(table) > MOST_CLIENTS:
+    table[client] = received_ns
+    if len(table) > MAX_CLIENTS:
         del table[next(iter(table))]

@@ -1,4 +1,4 @@
-"""The sockets of a rendezvous, and the vehicle's socket that also talks through one (`rendezvous.py`)."""
+"""The sockets of a rendezvous, and the vehicle's socket that also communicates through one."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from lavt.transport.rendezvous.forwarder import REGISTER_EVERY_NS, Address, Forw
 from lavt.transport.udp_link import Deliver, UdpLink
 
 _VIA: Final = "rendezvous:"
-"""Before the host of a client that is heard through the rendezvous: an answer goes the same way back."""
+"""Prefix of the host of a client behind the rendezvous, by which replies take the same way back."""
 
 
 class RendezvousLink:
-    """A `UdpLink` of the vehicle that hears clients directly and, at the same time, through the rendezvous.
+    """A `UdpLink` of the vehicle that receives from clients both directly and through the rendezvous.
 
-    The peer of what came through is the client's address with a mark, so that all who take it for an address can.
-    `registration` writes one for a time of the wall clock; it is sent from the start on, every second.
+    The peer of a datagram that came through the rendezvous is the client's address with a prefix before the host, which
+    can be used like any other address. `registration` returns a registration for a time of the wall clock; from `start`
+    on one is sent every second.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class RendezvousLink:
         registration: Callable[[int], bytes],
         name: str = "video",
     ) -> None:
-        self._link = UdpLink(clock, channel, self._come, bind=bind, name=name)
+        self._link = UdpLink(clock, channel, self._on_datagram, bind=bind, name=name)
         self._clock = clock
         self._deliver = deliver
         self._rendezvous = rendezvous
@@ -46,22 +47,22 @@ class RendezvousLink:
 
     @property
     def port(self) -> int:
-        """The port that was opened."""
+        """The UDP port of the socket."""
         return self._link.port
 
     @property
     def counts(self) -> Counter[str]:
-        """What was counted."""
+        """The numbers of lost and rejected datagrams, by reason."""
         return self._link.counts
 
     def start(self) -> None:
-        """Begin to receive, and register."""
+        """Start to receive and to register."""
         self._link.start()
         self._thread.start()
 
     def send(self, *sends: Send) -> None:
-        """Send datagrams, to each peer the way it came."""
-        self._link.send(*map(self._addressed, sends))
+        """Send datagrams, to each peer directly or through the rendezvous."""
+        self._link.send(*map(self._route, sends))
 
     def close(self) -> None:
         """Stop and close the socket."""
@@ -70,7 +71,7 @@ class RendezvousLink:
             self._thread.join()
         self._link.close()
 
-    def _come(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
+    def _on_datagram(self, channel: str, payload: Any, arrived: Now, peer: Any) -> None:
         if peer != self._rendezvous:
             self._deliver(channel, payload, arrived, peer)
             return
@@ -81,7 +82,7 @@ class RendezvousLink:
         (host, port), datagram = unwrapped
         self._deliver(channel, datagram, arrived, (_VIA + host, port))
 
-    def _addressed(self, send: Send) -> Send:
+    def _route(self, send: Send) -> Send:
         host, port = send.peer
         if not host.startswith(_VIA):
             return send
@@ -89,7 +90,7 @@ class RendezvousLink:
 
     def _keep_registered(self) -> None:
         while True:
-            # later than any before, also where the wall clock is set back
+            # later than any before, even if the wall clock is set back
             self._registered_ns = max(self._registered_ns + 1, self._clock.now().wall_ns)
             self._link.send(Send("registration", self._registration(self._registered_ns), self._rendezvous))
             if self._closing.wait(REGISTER_EVERY_NS / NS_PER_S):
@@ -97,7 +98,7 @@ class RendezvousLink:
 
 
 class RendezvousPort:
-    """One flow's port on the machine that both ends reach: what comes is passed on by the thread that receives it.
+    """The UDP port of one flow at the rendezvous; the thread that receives a datagram also forwards it.
 
     Raises `UserError` for a port that cannot be opened.
     """
@@ -105,31 +106,31 @@ class RendezvousPort:
     def __init__(self, clock: Clock, forwarder: Forwarder, *, bind: Address, name: str) -> None:
         self._clock = clock
         self._forwarder = forwarder
-        self._link = UdpLink(clock, name, self._pass_on, bind=bind, name=name)
+        self._link = UdpLink(clock, name, self._forward, bind=bind, name=name)
 
     @property
     def port(self) -> int:
-        """The port that was opened."""
+        """The UDP port of the socket."""
         return self._link.port
 
     @property
     def counts(self) -> dict[str, int]:
-        """What became of what came."""
+        """The numbers of datagrams by result."""
         return {**self._forwarder.counts, **self._link.counts}
 
-    def vehicle_at(self) -> Address | None:
-        """Tell from where the vehicle has registered; None: it is not there."""
-        return self._forwarder.vehicle_at(self._clock.now().mono_ns)
+    def vehicle_address(self) -> Address | None:
+        """Return the address from which the vehicle registered; None if there is none or the registration expired."""
+        return self._forwarder.vehicle_address(self._clock.now().mono_ns)
 
     def start(self) -> None:
-        """Begin."""
+        """Start to forward."""
         self._link.start()
 
     def close(self) -> None:
-        """End, and close the socket."""
+        """Stop forwarding and close the socket."""
         self._link.close()
 
-    def _pass_on(self, channel: str, datagram: bytes, arrived: Now, sender: Any) -> None:
-        passed = self._forwarder.receive(datagram, sender, arrived.mono_ns)
-        if passed is not None:
-            self._link.send(Send(channel, *passed))
+    def _forward(self, channel: str, datagram: bytes, arrived: Now, sender: Any) -> None:
+        forwarded = self._forwarder.receive(datagram, sender, arrived.mono_ns)
+        if forwarded is not None:
+            self._link.send(Send(channel, *forwarded))

@@ -1,8 +1,8 @@
-"""Erasure code: two parity symbols, P and Q, from which any one or two missing symbols of a block come back.
+"""Erasure code: two parity symbols, P and Q, from which any one or two missing symbols of a block are recovered.
 
-As in RAID 6, byte by byte over the field of 256 elements with the polynomial 0x11d (x^8 + x^4 + x^3 + x^2 + 1): P is
-the sum of all symbols, Q that of 2^i times symbol i, counted from 0; a sum is an exclusive or. Source: H. P. Anvin,
-"The mathematics of RAID-6" (2004).
+It is the code of RAID 6, byte by byte over the field of 256 elements with the polynomial 0x11d (x^8 + x^4 + x^3 + x^2 +
+1): P is the sum of all symbols, Q the sum of 2^i times symbol i, counted from 0; a sum is an exclusive or. Source:
+H. P. Anvin, "The mathematics of RAID-6" (2004).
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from lavt.errors import BadPacket
 P: Final = 0
 Q: Final = 1
 MAX_SYMBOLS: Final = 255
-"""2^255 is 1 again: one symbol more would go into Q as the first one does."""
+"""2^255 is 1 again: a further symbol would have the same factor in Q as the first one."""
 
 _DOUBLED: Final = bytes(byte << 1 ^ (byte >> 7) * 0x11D for byte in range(256))
 _TIMES: Final = list(accumulate(repeat(_DOUBLED, MAX_SYMBOLS - 1), bytes.translate, initial=bytes(range(256))))
-"""At i what 2^i makes of each byte, for `bytes.translate`; at -i, as lists count from their end, what undoes that."""
+"""At index i the table for `bytes.translate` that multiplies each byte by 2^i; at -i the table of the inverse."""
 _EXPONENT: Final = {times[1]: exponent for exponent, times in enumerate(_TIMES)}
-"""Of each byte but 0, as a power of 2."""
+"""The exponent of each byte but 0, as a power of 2."""
 
 
-def parity(symbols: Sequence[bytes], count: int) -> list[bytes]:
-    """Make the first `count` of P and Q: bytes as many as the longest symbol has; shorter ones are filled with zeros.
+def compute_parity(symbols: Sequence[bytes], count: int) -> list[bytes]:
+    """Return the first `count` of P and Q, as long as the longest symbol; shorter symbols are padded with zeros.
 
-    Raises `ValueError` for other than 1 to 255 symbols and 0 to 2 of parity.
+    Raises `ValueError` for other than 1 to 255 symbols and 0 to 2 parity symbols.
     """
-    if not 1 <= len(symbols) <= MAX_SYMBOLS or not 0 <= count <= len(_PARTS):
+    if not 1 <= len(symbols) <= MAX_SYMBOLS or not 0 <= count <= len(_TERMS):
         raise ValueError(f"{count} parity symbols of {len(symbols)}: choose 0 to 2 of 1 to {MAX_SYMBOLS}")
-    filled = _filled(symbols, max(map(len, symbols)))
-    return [_sum(parts(filled)) for parts in _PARTS[:count]]
+    padded = _pad(symbols, max(map(len, symbols)))
+    return [_sum(terms(padded)) for terms in _TERMS[:count]]
 
 
-def missing(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]) -> list[bytes]:
-    """Make the symbols that are None, in order and with the zeros they were filled with.
+def recover(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]) -> list[bytes]:
+    """Return the symbols that are None, in order and with their padding of zeros.
 
-    `parity_symbols` is what is there of `P` and `Q`: as many as are missing or more. Raises `BadPacket` for fewer, for
-    more than 255 symbols, and for symbols longer than those of parity.
+    `parity_symbols` are the received ones of `P` and `Q`, at least as many as symbols are missing. Raises `BadPacket`
+    for fewer, for more than 255 symbols, and for symbols longer than the parity symbols.
     """
-    places = [place for place, symbol in enumerate(symbols) if symbol is None]
-    used = [which for which in (P, Q) if which in parity_symbols][: len(places)]
-    if len(used) < len(places) or len(symbols) > MAX_SYMBOLS:
+    lost = [index for index, symbol in enumerate(symbols) if symbol is None]
+    used = [which for which in (P, Q) if which in parity_symbols][: len(lost)]
+    if len(used) < len(lost) or len(symbols) > MAX_SYMBOLS:
         raise BadPacket("too few parity symbols, or too many others")
     if not used:
         return []
@@ -55,11 +55,11 @@ def missing(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]
     size = len(parity_symbols[used[0]])
     if len(parity_symbols[used[-1]]) != size or max(map(len, known)) > size:
         raise BadPacket("parity symbols shorter than another symbol")
-    # What is missing is zeros here, so what these sums leave of parity is its parts alone.
-    filled = _filled(known, size)
-    left = {which: _sum([*_PARTS[which](filled), parity_symbols[which]]) for which in used}
-    first, last = places[0], places[-1]
-    if len(places) == 1:
+    # Missing symbols are zeros here, so adding the known terms leaves only the missing terms of the parity.
+    padded = _pad(known, size)
+    left = {which: _sum([*_TERMS[which](padded), parity_symbols[which]]) for which in used}
+    first, last = lost[0], lost[-1]
+    if len(lost) == 1:
         return [left[P] if P in left else left[Q].translate(_TIMES[-first])]
     # P leaves a + b, and Q 2^first a + 2^last b: so 2^-first Q + P is (2^(last - first) + 1) b.
     mixed = _sum([left[Q].translate(_TIMES[-first]), left[P]])
@@ -68,22 +68,22 @@ def missing(symbols: Sequence[bytes | None], parity_symbols: Mapping[int, bytes]
     return [_sum([left[P], second]), second]
 
 
-def _filled(symbols: Sequence[bytes], size: int) -> list[bytes]:
-    """Give symbols of one length."""
+def _pad(symbols: Sequence[bytes], size: int) -> list[bytes]:
+    """Return the symbols padded with zeros to one length."""
     return [symbol.ljust(size, b"\x00") for symbol in symbols]
 
 
 def _sum(symbols: list[bytes]) -> bytes:
-    """Add symbols of one length."""
+    """Return the sum of symbols of one length."""
     table = np.frombuffer(b"".join(symbols), np.uint8).reshape(len(symbols), len(symbols[0]))
     total: NDArray[np.uint8] = np.bitwise_xor.reduce(table)
     return total.tobytes()
 
 
-def _parts_of_q(symbols: list[bytes]) -> list[bytes]:
-    """Multiply each symbol by the power of 2 of its place."""
+def _terms_of_q(symbols: list[bytes]) -> list[bytes]:
+    """Return each symbol multiplied by 2 to the power of its index."""
     return list(map(bytes.translate, symbols, _TIMES))
 
 
-_PARTS: Final[tuple[Callable[[list[bytes]], list[bytes]], ...]] = (list, _parts_of_q)
-"""What P and what Q are the sum of."""
+_TERMS: Final[tuple[Callable[[list[bytes]], list[bytes]], ...]] = (list, _terms_of_q)
+"""The terms of the sums P and Q."""

@@ -1,56 +1,56 @@
-"""How a video stream arrives: the statistics of RFC 3550 for the sender, and those of each second for the record.
+"""Reception statistics of a video stream: those of RFC 3550 for the sender, and samples for the record.
 
-Loss is counted twice. Before repair a packet is lost that did not arrive, whether or not it was made again (RFC 5725,
-section 3); after repair one that the decoder had to do without.
+Loss is counted twice. Before repair, a packet is lost if it did not arrive, whether or not it was recovered (RFC 5725,
+section 3); after repair, a packet is lost if the decoder did not get it.
 """
 
 from __future__ import annotations
 
 from lavt.transport.rtp.jitter_buffer import JitterBuffer
-from lavt.transport.rtp.ntp_time import short_time
+from lavt.transport.rtp.ntp_time import ntp_to_short
 from lavt.transport.rtp.rtcp import Announcement, ReceptionReport, SenderReport
-from lavt.transport.rtp.rtcp_xr import answered_round_trip_ns
+from lavt.transport.rtp.rtcp_xr import round_trip_of_answer_ns
 from lavt.transport.rtp.rtp import RtpPacket
 from lavt.value import value
 
 
 @value
 class ReceptionSample:
-    """How the stream arrived between two samples; what is no time is in packets and adds up over the samples."""
+    """Reception between two samples. Counts are in packets since the previous sample, so their sums are totals."""
 
     duration_ns: int
-    """Since the sample before, or since the beginning; 0 where no packet has come yet."""
+    """Time since the previous sample, or since the stream began; 0 before the first packet."""
     packets: int
-    """That arrived, duplicates and late ones included, strays and repair packets not."""
+    """Packets that arrived, including duplicates and late ones, without strays and repair packets."""
     lost_before_repair: int
-    """Expected less arrived (RFC 3550, A.3): late ones and duplicates count against it and can make it negative."""
+    """Expected less arrived packets (RFC 3550, A.3); late packets and duplicates can make it negative."""
     recovered: int
-    """Made again from repair packets while they were waited for."""
+    """Packets recovered from repair packets within their hold."""
     lost_after_repair: int
-    """Given up, also where they came later."""
+    """Packets given up, including those that arrived later."""
     reordered: int
-    """Overtaken by others, but in time."""
+    """Packets that arrived after later ones, but within their hold."""
     late: int
-    """Came after they had been given up."""
+    """Packets that arrived after they had been given up."""
     duplicate: int
-    """Came twice, or after they had been made again."""
+    """Packets that arrived twice, or after they had been recovered."""
     jitter_us: int
-    """At the end (RFC 3550, section 6.4.1). A frame's packets share a timestamp, so the spacing of these is in it."""
+    """Jitter at the end (RFC 3550, section 6.4.1). A frame's packets share a timestamp: it includes their spacing."""
     round_trip_us: int | None
-    """The last one known at the end: of a report to the sender, and of the sender's report that answers it."""
+    """Last known round-trip time at the end, of a report to the sender and the sender's report that answers it."""
 
 
 class Reception:
-    """Keeps the statistics of a stream whose packets go through `reorder`, in whose counters the losses are.
+    """Reception statistics of a stream; the losses come from the counters of its `jitter_buffer`.
 
-    Public: `round_trip_ns`, None before the sender has answered a report.
+    Public: `round_trip_ns`, the round-trip time; None before the sender has answered a report.
     """
 
-    def __init__(self, reorder: JitterBuffer) -> None:
+    def __init__(self, jitter_buffer: JitterBuffer) -> None:
         self.round_trip_ns: int | None = None
-        self._reorder = reorder
+        self._jitter_buffer = jitter_buffer
         self._packets = 0
-        self._strays = reorder.stray
+        self._strays = jitter_buffer.stray
         self._ssrc: int | None = None
         self._transit: int | None = None
         self._jitter = 0.0
@@ -62,31 +62,32 @@ class Reception:
         self._sampled = self._totals()
 
     def received(self, packet: RtpPacket, arrived_ns: int) -> None:
-        """Count a packet of the stream that came from the network, after the reorder buffer has taken it.
+        """Count a packet that arrived from the network, after it was pushed to the jitter buffer.
 
-        Packets that were made again are not given here.
+        Do not call it for recovered packets.
         """
         self._packets += 1
         if packet.ssrc != self._ssrc:
-            self._begin(packet.ssrc, arrived_ns)
-        strays, self._strays = self._strays, self._reorder.stray
+            self._begin_stream(packet.ssrc, arrived_ns)
+        strays, self._strays = self._strays, self._jitter_buffer.stray
         if self._strays <= strays:
             self._note_transit(packet.timestamp, arrived_ns)
 
     def note_announcement(self, announcement: Announcement, receiver_ssrc: int | None, arrived_ns: int) -> None:
-        """Take what a sender says, on the clock of our reports: the round trip, where it answers one of ours.
+        """Note a sender's datagram that arrived at `arrived_ns`, by the clock of our reports.
 
-        Its report is for the round trip that the sender will know from our next one.
+        An answer to one of our reports gives the round-trip time. Our next report returns the time of its sender
+        report, from which the sender computes its own.
         """
         for report in announcement.reports:
             self._sender_report = report, arrived_ns
         for answer in announcement.answers:
             if answer.receiver_ssrc == receiver_ssrc:
-                round_trip_ns = answered_round_trip_ns(answer, arrived_ns)
+                round_trip_ns = round_trip_of_answer_ns(answer, arrived_ns)
                 self.round_trip_ns = self.round_trip_ns if round_trip_ns is None else round_trip_ns
 
     def report(self, now_ns: int) -> ReceptionReport | None:
-        """Give the reception report since the one before (RFC 3550, A.3); None before the first packet."""
+        """Return the reception report since the previous one (RFC 3550, A.3); None before the first packet."""
         if self._ssrc is None:
             return None
         packets, lost = self._arrived(), self._lost_before_repair()
@@ -95,11 +96,11 @@ class Reception:
         self._packets_reported, self._lost_reported = packets, lost
         last, age_ns = 0, 0
         if self._sender_report is not None and self._sender_report[0].ssrc == self._ssrc:
-            sent, arrived_ns = self._sender_report
-            last, age_ns = short_time(sent.ntp_time), now_ns - arrived_ns
+            sender_report, arrived_ns = self._sender_report
+            last, age_ns = ntp_to_short(sender_report.ntp_time), now_ns - arrived_ns
         return ReceptionReport(
             self._ssrc,
-            self._reorder.highest_sequence,
+            self._jitter_buffer.highest_sequence,
             lost_since / expected_since if lost_since > 0 else 0.0,
             lost - self._lost_before_stream,
             int(self._jitter),
@@ -108,7 +109,7 @@ class Reception:
         )
 
     def sample(self, now_ns: int) -> ReceptionSample:
-        """Give what has happened since the sample before."""
+        """Return the sample since the previous one."""
         totals = self._totals()
         since = {name: total - self._sampled[name] for name, total in totals.items()}
         self._sampled = totals
@@ -120,8 +121,8 @@ class Reception:
             duration_ns=duration_ns, jitter_us=round(self._jitter * 100 / 9), round_trip_us=round_trip_us, **since
         )
 
-    def _begin(self, ssrc: int, arrived_ns: int) -> None:
-        """Begin a stream: a report is about one only."""
+    def _begin_stream(self, ssrc: int, arrived_ns: int) -> None:
+        """Begin a stream, since a report covers one stream only."""
         self._ssrc = ssrc
         self._transit, self._jitter = None, 0.0
         self._packets_reported = self._arrived() - 1
@@ -130,15 +131,15 @@ class Reception:
             self._sampled_ns = arrived_ns
 
     def _arrived(self) -> int:
-        return self._packets - self._reorder.stray
+        return self._packets - self._jitter_buffer.stray
 
     def _lost_before_repair(self) -> int:
-        """Give expected less arrived, from the counters: it goes on when the sender moves its sequence numbers."""
-        counters = self._reorder
+        """Return expected less arrived packets, computed so that it continues if the sequence numbers jump."""
+        counters = self._jitter_buffer
         return counters.lost - counters.late + counters.recovered - counters.duplicate
 
     def _totals(self) -> dict[str, int]:
-        counters = self._reorder
+        counters = self._jitter_buffer
         return {
             "packets": self._arrived(),
             "lost_before_repair": self._lost_before_repair(),
@@ -150,7 +151,7 @@ class Reception:
         }
 
     def _note_transit(self, timestamp: int, arrived_ns: int) -> None:
-        """Keep the jitter over all packets as they arrive, in ticks of the RTP clock (RFC 3550, A.8)."""
+        """Update the jitter by a packet, in ticks of the RTP clock (RFC 3550, A.8)."""
         transit = (arrived_ns * 9 // 100_000 - timestamp) % 2**32
         if self._transit is not None:
             difference = (transit - self._transit + 2**31) % 2**32 - 2**31

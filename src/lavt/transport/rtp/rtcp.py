@@ -1,12 +1,12 @@
-"""RTCP: what the sender and the receiver of a video tell each other beside it.
+"""RTCP: the control messages between the sender and the receiver of a video.
 
 Sender to receiver: sender reports (RFC 3550, section 6.4.1) and, in extended reports (RFC 3611), the answer to the
 receiver's reference time (section 4.5). Receiver to sender: receiver reports (RFC 3550, section 6.4.2), the reference
-time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the highest bit rate that the
-receiver wants (RFC 5104, section 4.2.1). So both can know the round trip without a clock in common.
+time (RFC 3611, section 4.4), picture-loss indications (RFC 4585, section 6.3.1) and the receiver's limit of the bit
+rate (RFC 5104, section 4.2.1). Both can compute the round-trip time without a common clock.
 
 Every datagram written here begins with a report and a source description (RFC 3550, section 6.1). RTCP shares the port
-with RTP; which of the two a datagram is shows in its second byte (RFC 5761).
+with RTP; the second byte of a datagram tells them apart (RFC 5761).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from lavt.errors import BadPacket
-from lavt.transport.rtp.ntp_time import delay_ns_of, ntp_of_wall, short_delay
+from lavt.transport.rtp.ntp_time import delay_to_short, short_to_delay_ns, wall_to_ntp
 from lavt.transport.rtp.rtcp_xr import (
     ReferenceAnswer,
     ReferenceTime,
@@ -29,7 +29,7 @@ from lavt.value import value
 
 RECEIVER_CNAME: Final = "receiver@lavt"
 OVERHEAD_BYTES: Final = 40
-"""Of each packet before its payload: IPv4 20, UDP 8, RTP 12."""
+"""Headers of each packet: IPv4 20, UDP 8, RTP 12."""
 
 _HEADER = struct.Struct("!BBH")
 _SSRC = struct.Struct("!I")
@@ -64,61 +64,61 @@ _RTCP_HEADER_BYTES: Final = 8
 
 @value
 class SenderReport:
-    """When a sender wrote its report, and what it had sent until then (RFC 3550, section 6.4.1)."""
+    """The time of a sender's report, and the packets sent until then (RFC 3550, section 6.4.1)."""
 
     ssrc: int
     ntp_time: int
     """64 bits, by the sender's wall clock."""
     rtp_timestamp: int
-    """Of the same moment."""
+    """The RTP timestamp of the same time."""
     packets: int
     octets: int
-    """Of payload."""
+    """Payload only."""
 
 
 @value
 class ReceptionReport:
-    """How a stream arrives at one receiver (RFC 3550, section 6.4.1)."""
+    """Reception quality of a stream at one receiver (RFC 3550, section 6.4.1)."""
 
     media_ssrc: int
     highest_sequence: int
     """Extended by the number of wraps, modulo 2^32."""
     lost_fraction: float
-    """Share of packets lost since the report before, in [0, 1), in steps of 1/256."""
+    """Share of packets lost since the previous report, in [0, 1), in steps of 1/256."""
     cumulative_lost: int
-    """Packets lost since the beginning; duplicates can make it negative."""
+    """Packets lost since the stream began; duplicates can make it negative."""
     jitter: int
     """Mean deviation of the arrival spacing, in ticks of the RTP clock (90 kHz)."""
     last_report: int = 0
-    """Middle 32 bits of the NTP time in the last sender report that came; 0: none came."""
+    """NTP time of the last sender report received, in short format; 0: none."""
     last_report_age_ns: int = 0
-    """How long before this report that one had come, in steps of 1/65536 s."""
+    """Time from the arrival of that sender report to this report, in steps of 1/65536 s."""
 
 
 @value
 class BitRateLimit:
-    """The highest bit rate that a receiver wants of one stream (RFC 5104, section 4.2.1.1)."""
+    """A receiver's limit of the bit rate of one stream (RFC 5104, section 4.2.1.1)."""
 
     media_ssrc: int
     bit_rate_bps: int
-    """With `overhead_bytes` of headers before each packet's payload."""
+    """Includes `overhead_bytes` of headers for each packet."""
     overhead_bytes: int
 
 
 @value
 class Feedback:
-    """What one RTCP datagram says that a sender hears."""
+    """The contents of an RTCP datagram that concern a sender."""
 
     reports: tuple[ReceptionReport, ...] = ()
     picture_loss: bool = False
-    """The receiver asks for a keyframe."""
+    """The receiver requests a keyframe."""
     limits: tuple[BitRateLimit, ...] = ()
     reference_times: tuple[ReferenceTime, ...] = ()
 
 
 @value
 class Announcement:
-    """What one RTCP datagram says that a receiver hears."""
+    """The contents of an RTCP datagram that concern a receiver."""
 
     reports: tuple[SenderReport, ...] = ()
     answers: tuple[ReferenceAnswer, ...] = ()
@@ -134,13 +134,11 @@ def sender_report(
     cname: str,
     answered: Sequence[ReferenceAnswer] = (),
 ) -> bytes:
-    """Write a sender report, with the reference times of receivers that it answers.
+    """Write a sender report with answers to the reference times of receivers.
 
-    `rtp_timestamp` is that of the moment `wall_ns` (ns since 1970). Counts wrap at 2^32.
+    `rtp_timestamp` belongs to the time `wall_ns` (ns since 1970). Counts wrap at 2^32.
     """
-    information = _SENDER_INFORMATION.pack(
-        ssrc, ntp_of_wall(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32
-    )  # fmt: skip
+    information = _SENDER_INFORMATION.pack(ssrc, wall_to_ntp(wall_ns), rtp_timestamp, packets % 2**32, octets % 2**32)
     datagram = _packet(_SENDER_REPORT, 0, information) + _description(ssrc, cname)
     if answered:
         datagram += _packet(_EXTENDED_REPORT, 0, write_answers(ssrc, answered))
@@ -148,16 +146,20 @@ def sender_report(
 
 
 def receiver_report(ssrc: int, report: ReceptionReport, *, clock_ns: int, cname: str = RECEIVER_CNAME) -> bytes:
-    """Write the receiver report of receiver `ssrc` with its reference time; values beyond their field are cut.
+    """Write the receiver report of receiver `ssrc` with its reference time; values are clamped to their fields.
 
-    `clock_ns` is any clock of the receiver that is never set: `answered_round_trip_ns` is asked with the same.
+    `clock_ns` is any clock of the receiver that is never set; `round_trip_of_answer_ns` needs the same clock.
     """
     fraction = min(max(int(report.lost_fraction * 256), 0), 255)
     lost = min(max(report.cumulative_lost, -_MAX_LOST - 1), _MAX_LOST) % 2**24
     block = _REPORT.pack(
-        report.media_ssrc, fraction << 24 | lost, report.highest_sequence % 2**32, min(report.jitter, _MAX_WORD),
-        report.last_report, short_delay(report.last_report_age_ns),
-    )  # fmt: skip
+        report.media_ssrc,
+        fraction << 24 | lost,
+        report.highest_sequence % 2**32,
+        min(report.jitter, _MAX_WORD),
+        report.last_report,
+        delay_to_short(report.last_report_age_ns),
+    )
     return (
         _packet(_RECEIVER_REPORT, 1, _SSRC.pack(ssrc) + block)
         + _description(ssrc, cname)
@@ -166,7 +168,10 @@ def receiver_report(ssrc: int, report: ReceptionReport, *, clock_ns: int, cname:
 
 
 def picture_loss(ssrc: int, media_ssrc: int, *, cname: str = RECEIVER_CNAME) -> bytes:
-    """Write the request of receiver `ssrc` for a keyframe of the stream `media_ssrc` (RFC 4585, section 6.3.1)."""
+    """Write the picture-loss indication of receiver `ssrc` for the stream `media_ssrc` (RFC 4585, section 6.3.1).
+
+    It requests a keyframe.
+    """
     return _empty_report(ssrc, cname) + _packet(_PAYLOAD_FEEDBACK, _PICTURE_LOSS, _FEEDBACK.pack(ssrc, media_ssrc))
 
 
@@ -178,23 +183,23 @@ def max_bit_rate(
     overhead_bytes: int = OVERHEAD_BYTES,
     cname: str = RECEIVER_CNAME,
 ) -> bytes:
-    """Write the request of receiver `ssrc` that `media_ssrc` be sent with at most `bit_rate_bps` (RFC 5104, 4.2.1).
+    """Write the request of receiver `ssrc` to send `media_ssrc` with at most `bit_rate_bps` (RFC 5104, section 4.2.1).
 
-    The bit rate counts `overhead_bytes` (at most 511) for each packet. It travels with 17 significant bits, rounded
-    down; values beyond their field are cut.
+    The bit rate includes `overhead_bytes` (at most 511) for each packet. It is sent with 17 significant bits, rounded
+    down; values are clamped to their fields.
     """
     rate = min(max(bit_rate_bps, 0), _MAX_BIT_RATE_BPS)
     exponent = max(rate.bit_length() - 17, 0)
     word = exponent << 26 | rate >> exponent << 9 | min(overhead_bytes, 511)
-    # The stream is named with its limit, and not in the header (RFC 5104, section 4.2.1.2).
+    # The SSRC of the stream is in the entry with its limit, not in the header (RFC 5104, section 4.2.1.2).
     body = _FEEDBACK.pack(ssrc, 0) + _BIT_RATE.pack(media_ssrc, word)
     return _empty_report(ssrc, cname) + _packet(_TRANSPORT_FEEDBACK, _MAX_BIT_RATE, body)
 
 
 def parse_feedback(datagram: bytes) -> Feedback:
-    """Read an RTCP datagram as a sender does; what says nothing of interest to it is passed over.
+    """Parse an RTCP datagram as a sender; contents that do not concern it are skipped.
 
-    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
+    Raises `BadPacket` for a datagram that fails the checks of RFC 3550, A.2, or has a part of an impossible length.
     """
     reports: list[ReceptionReport] = []
     limits: list[BitRateLimit] = []
@@ -214,15 +219,15 @@ def parse_feedback(datagram: bytes) -> Feedback:
 
 
 def parse_announcement(datagram: bytes) -> Announcement:
-    """Read an RTCP datagram as a receiver does; what says nothing of interest to it is passed over.
+    """Parse an RTCP datagram as a receiver; contents that do not concern it are skipped.
 
-    Raises `BadPacket` for what fails the checks of RFC 3550, A.2, or holds a part of a length it cannot have.
+    Raises `BadPacket` for a datagram that fails the checks of RFC 3550, A.2, or has a part of an impossible length.
     """
     reports: list[SenderReport] = []
     answers: list[ReferenceAnswer] = []
     for count, kind, body in _packets(datagram):
         if kind in _BEFORE_BLOCKS:
-            _report_blocks(kind, count, body)  # for their lengths
+            _report_blocks(kind, count, body)  # checks their lengths
         if kind == _SENDER_REPORT:
             reports.append(SenderReport(*_SENDER_INFORMATION.unpack_from(body)))
         elif kind == _EXTENDED_REPORT:
@@ -231,22 +236,22 @@ def parse_announcement(datagram: bytes) -> Announcement:
 
 
 def is_rtcp(datagram: bytes) -> bool:
-    """Tell whether a datagram on a port of RTP and RTCP is RTCP (RFC 5761, section 4)."""
+    """Return whether a datagram on a port of RTP and RTCP is RTCP (RFC 5761, section 4)."""
     return len(datagram) >= _RTCP_HEADER_BYTES and datagram[0] >> 6 == 2 and 192 <= datagram[1] <= 223
 
 
 def is_rtp(datagram: bytes) -> bool:
-    """Tell whether a datagram on a port of RTP and RTCP is RTP: payload types 64 to 95 cannot be (RFC 5761)."""
+    """Return whether a datagram on a port of RTP and RTCP is RTP, whose payload type is never 64 to 95 (RFC 5761)."""
     return len(datagram) >= _RTP_HEADER_BYTES and datagram[0] >> 6 == 2 and not 64 <= datagram[1] & 0x7F <= 95
 
 
 def _packet(kind: int, count: int, body: bytes) -> bytes:
-    """Put a header before the body of an RTCP packet; its length is in words of four bytes, less one."""
+    """Return an RTCP packet with its header; the header's length is in words of four bytes, less one."""
     return _HEADER.pack(_VERSION_2 | count, kind, len(body) // 4) + body
 
 
 def _empty_report(ssrc: int, cname: str) -> bytes:
-    """Write what stands before a request, since every RTCP datagram begins so (RFC 4585, section 3.1)."""
+    """Write the empty report and description with which a request must begin (RFC 4585, section 3.1)."""
     return _packet(_RECEIVER_REPORT, 0, _SSRC.pack(ssrc)) + _description(ssrc, cname)
 
 
@@ -257,15 +262,15 @@ def _description(ssrc: int, cname: str) -> bytes:
     return _packet(_SOURCE_DESCRIPTION, 1, _SSRC.pack(ssrc) + item + bytes(4 - len(item) % 4))
 
 
-def _check(right: bool, wrong: str) -> None:
-    if not right:
-        raise BadPacket(wrong)
+def _check(valid: bool, reason: str) -> None:
+    if not valid:
+        raise BadPacket(reason)
 
 
 def _packets(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Give count, type and body without padding of each RTCP packet in a datagram (RFC 3550, A.2)."""
+    """Yield count, type and body without padding of each RTCP packet in a datagram (RFC 3550, A.2)."""
     begins_with_report = len(datagram) >= _RTCP_HEADER_BYTES and datagram[1] in {_SENDER_REPORT, _RECEIVER_REPORT}
-    _check(begins_with_report, "an RTCP datagram begins with a report")
+    _check(begins_with_report, "an RTCP datagram must begin with a report")
     begin = 0
     while begin < len(datagram):
         _check(begin + _HEADER.size <= len(datagram), "RTCP header cut off")
@@ -283,7 +288,7 @@ def _packets(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _report_blocks(kind: int, count: int, body: bytes) -> list[ReceptionReport]:
-    """Read the `count` report blocks of a report; extensions may follow them."""
+    """Parse the `count` report blocks of a report; extensions may follow them."""
     begin = _BEFORE_BLOCKS[kind]
     end = begin + count * _REPORT.size
     _check(end <= len(body), "fewer report blocks than announced")
@@ -291,14 +296,13 @@ def _report_blocks(kind: int, count: int, body: bytes) -> list[ReceptionReport]:
     for media_ssrc, loss, highest, jitter, last, age in _REPORT.iter_unpack(body[begin:end]):
         lost = loss & 0xFF_FFFF
         signed = lost - 2**24 if lost > _MAX_LOST else lost
-        reports.append(
-            ReceptionReport(media_ssrc, highest, (loss >> 24) / 256, signed, jitter, last, delay_ns_of(age))
-        )  # fmt: skip
+        fraction = (loss >> 24) / 256
+        reports.append(ReceptionReport(media_ssrc, highest, fraction, signed, jitter, last, short_to_delay_ns(age)))
     return reports
 
 
 def _limits(body: bytes) -> list[BitRateLimit]:
-    """Read the entries of a request for a bit rate: exponent 6 bits, mantissa 17, overhead 9."""
+    """Parse the entries of a bit rate request: exponent 6 bits, mantissa 17, overhead 9."""
     entries = body[_FEEDBACK.size :]
     _check(bool(entries) and len(entries) % _BIT_RATE.size == 0, "bit rate limits of a wrong length")
     return [

@@ -1,7 +1,7 @@
-"""Extended reports (RFC 3611) by which a receiver, too, knows the round trip: reference times and their answers.
+"""Extended reports (RFC 3611) that give the receiver the round-trip time, too: reference times and their answers.
 
-The receiver sends what its clock says (section 4.4), the sender sends that back with how long it kept it (section 4.5).
-`rtcp.py` puts these bodies into RTCP packets of type 207. Blocks have the header of RTCP packets (section 3).
+The receiver sends the time of its clock (section 4.4); the sender returns it with the delay since it arrived (section
+4.5). `rtcp.py` puts these bodies into RTCP packets of type 207. Blocks have the header of RTCP packets (section 3).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from lavt.errors import BadPacket
-from lavt.transport.rtp.ntp_time import delay_ns_of, ntp_of_elapsed, round_trip_ns, short_delay, short_time
+from lavt.transport.rtp.ntp_time import delay_to_short, elapsed_to_ntp, ntp_to_short, round_trip_ns, short_to_delay_ns
 from lavt.value import value
 
 _HEADER = struct.Struct("!BBH")
@@ -24,40 +24,40 @@ _ANSWERS_BLOCK: Final = 5
 
 @value
 class ReferenceTime:
-    """What a receiver's clock said when it wrote its report (RFC 3611, section 4.4)."""
+    """The time of a receiver's clock when it wrote its report (RFC 3611, section 4.4)."""
 
     receiver_ssrc: int
     time: int
-    """Middle 32 bits."""
+    """In NTP short format."""
 
 
 @value
 class ReferenceAnswer:
-    """A reference time on its way back to its receiver (RFC 3611, section 4.5)."""
+    """A reference time that a sender returns to its receiver (RFC 3611, section 4.5)."""
 
     receiver_ssrc: int
     time: int
-    """Middle 32 bits, as they came."""
+    """In NTP short format, as received."""
     age_ns: int
-    """How long before this answer it had come; on the wire in steps of 1/65536 s."""
+    """Time from its arrival to this answer; on the wire in steps of 1/65536 s."""
 
 
-def answered_round_trip_ns(answer: ReferenceAnswer, arrived_clock_ns: int) -> int | None:
-    """Give the receiver the round trip from an answer that came at `arrived_clock_ns`; None: it says none.
+def round_trip_of_answer_ns(answer: ReferenceAnswer, arrived_clock_ns: int) -> int | None:
+    """Return the round-trip time from an answer that arrived at `arrived_clock_ns`; None: it gives none.
 
-    The clock is the one of the reference time. Whether the answer is ours, its `receiver_ssrc` says.
+    The clock is that of the reference time. The caller checks by `receiver_ssrc` that the answer is for it.
     """
-    return round_trip_ns(short_time(ntp_of_elapsed(arrived_clock_ns)), answer.time, answer.age_ns)
+    return round_trip_ns(ntp_to_short(elapsed_to_ntp(arrived_clock_ns)), answer.time, answer.age_ns)
 
 
 def write_reference_time(ssrc: int, clock_ns: int) -> bytes:
-    """Write the body with what the clock of receiver `ssrc` says; any clock will do that is never set."""
-    return _body(ssrc, _REFERENCE_TIME_BLOCK, _REFERENCE_TIME.pack(ntp_of_elapsed(clock_ns)))
+    """Write the body with the clock of receiver `ssrc`, which may be any clock that is never set."""
+    return _body(ssrc, _REFERENCE_TIME_BLOCK, _REFERENCE_TIME.pack(elapsed_to_ntp(clock_ns)))
 
 
 def write_answers(ssrc: int, answers: Sequence[ReferenceAnswer]) -> bytes:
     """Write the body with the answers of sender `ssrc`."""
-    entries = [_ANSWER.pack(each.receiver_ssrc, each.time, short_delay(each.age_ns)) for each in answers]
+    entries = [_ANSWER.pack(each.receiver_ssrc, each.time, delay_to_short(each.age_ns)) for each in answers]
     return _body(ssrc, _ANSWERS_BLOCK, b"".join(entries))
 
 
@@ -69,7 +69,7 @@ def read_reference_times(body: bytes) -> list[ReferenceTime]:
             if len(block) != _REFERENCE_TIME.size:
                 raise BadPacket("reference time of a wrong length")
             (receiver_ssrc,), (ntp_time,) = _SSRC.unpack_from(body), _REFERENCE_TIME.unpack(block)
-            times.append(ReferenceTime(receiver_ssrc, short_time(ntp_time)))
+            times.append(ReferenceTime(receiver_ssrc, ntp_to_short(ntp_time)))
     return times
 
 
@@ -80,7 +80,9 @@ def read_answers(body: bytes) -> list[ReferenceAnswer]:
         if kind == _ANSWERS_BLOCK:
             if len(block) % _ANSWER.size:
                 raise BadPacket("answers to reference times of a wrong length")
-            answers += [ReferenceAnswer(ssrc, time, delay_ns_of(age)) for ssrc, time, age in _ANSWER.iter_unpack(block)]
+            answers += [
+                ReferenceAnswer(ssrc, time, short_to_delay_ns(age)) for ssrc, time, age in _ANSWER.iter_unpack(block)
+            ]
     return answers
 
 
@@ -89,7 +91,7 @@ def _body(ssrc: int, kind: int, block: bytes) -> bytes:
 
 
 def _blocks(body: bytes) -> Iterator[tuple[int, bytes]]:
-    """Give type and content of each block; a body is whole words of four bytes."""
+    """Yield type and content of each block; a body consists of whole words of four bytes."""
     if len(body) < _SSRC.size:
         raise BadPacket("extended report cut off")
     begin = _SSRC.size

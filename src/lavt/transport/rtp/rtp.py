@@ -1,8 +1,9 @@
 """RTP packets (RFC 3550) that carry H.264 (RFC 6184, packetization mode 1): access units to packets and back.
 
-An access unit is what one picture became: NAL units behind start codes (H.264, annex B). Sending uses single NAL unit
-packets, STAP-A for small neighbours such as the parameter sets, and FU-A in equal pieces; receiving takes any mix of
-these. An access unit leaves the depacketizer with its marker packet, so no frame waits for the next.
+An access unit is one encoded picture: NAL units behind start codes (H.264, annex B). The packetizer uses single NAL
+unit packets, STAP-A for small consecutive units such as the parameter sets, and FU-A fragments of equal size; the
+depacketizer accepts any mix of these. It completes an access unit with its marker packet, so that no frame waits for
+the next.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from lavt.value import value
 VIDEO_PAYLOAD_TYPE: Final = 96
 MAX_PACKET_BYTES: Final = 1200
 MAX_ACCESS_UNIT_BYTES: Final = 2 * 1024 * 1024
-"""More than any picture needs: a peer that never ends its access unit fills no memory beyond this."""
+"""More than any picture needs. It limits the memory for a peer that never ends its access unit."""
 
 _HEADER = struct.Struct("!BBHII")
 RTP_HEADER_BYTES: Final = _HEADER.size
@@ -27,7 +28,7 @@ _SHORT_START_CODE: Final = b"\x00\x00\x01"
 _MIN_PACKET_BYTES: Final = 64
 
 _NAL_TYPE: Final = 0x1F
-_NAL_IMPORTANCE: Final = 0x60
+_NAL_REF_IDC: Final = 0x60
 _FORBIDDEN: Final = 0x80
 _NONE: Final = 0
 """No NAL unit has this type."""
@@ -59,9 +60,9 @@ class RtpPacket:
 
 
 def parse_packet(datagram: bytes) -> RtpPacket:
-    """Read a datagram as an RTP packet, leaving out contributing sources, header extension and padding.
+    """Parse a datagram as an RTP packet, without contributing sources, header extension and padding.
 
-    Raises `BadPacket` for anything that is not RTP version 2 or ends before its own header says.
+    Raises `BadPacket` for a datagram that is not RTP version 2 or is shorter than its header says.
     """
     if len(datagram) < _HEADER.size:
         raise BadPacket("shorter than an RTP header")
@@ -85,13 +86,13 @@ def parse_packet(datagram: bytes) -> RtpPacket:
 
 
 def split_nal_units(access_unit: bytes) -> list[bytes]:
-    """Take the NAL units out of an annex B byte stream; what comes before the first start code is left out."""
+    """Return the NAL units of an annex B byte stream; bytes before the first start code are ignored."""
     units = []
     begin = access_unit.find(_SHORT_START_CODE)
     while begin >= 0:
         begin += len(_SHORT_START_CODE)
         end = access_unit.find(_SHORT_START_CODE, begin)
-        # A NAL unit never ends with a zero byte: what is there belongs to the next start code or is filling.
+        # A NAL unit never ends with a zero byte: trailing zeros belong to the next start code or are stuffing.
         unit = access_unit[begin : end if end >= 0 else None].rstrip(b"\x00")
         if unit:
             units.append(unit)
@@ -100,9 +101,9 @@ def split_nal_units(access_unit: bytes) -> list[bytes]:
 
 
 class Packetizer:
-    """Makes RTP packets of access units: one stream, consecutive sequence numbers.
+    """A packetizer of access units into RTP packets of one stream with consecutive sequence numbers.
 
-    `max_packet_bytes` counts the RTP header in and UDP and IP out. Raises `UserError` for a size no stream can use.
+    `max_packet_bytes` includes the RTP header but not UDP and IP. Raises `UserError` for a size no stream can use.
     """
 
     def __init__(
@@ -113,15 +114,15 @@ class Packetizer:
         max_packet_bytes: int = MAX_PACKET_BYTES,
     ) -> None:
         if not _MIN_PACKET_BYTES <= max_packet_bytes <= 65_507:
-            raise UserError(f"RTP packets of {max_packet_bytes} bytes: choose {_MIN_PACKET_BYTES} to 65507")
+            raise UserError(f"RTP packets cannot have {max_packet_bytes} bytes: choose {_MIN_PACKET_BYTES} to 65507")
         self.ssrc = ssrc
         self.next_sequence = first_sequence % 2**16
         self._payload_type = payload_type
         self._max_payload_bytes = max_packet_bytes - _HEADER.size
 
     def packetize(self, access_unit: bytes, timestamp: int) -> list[bytes]:
-        """Make the datagrams of one access unit (annex B) with one 90 kHz `timestamp`; the last carries the marker."""
-        payloads = self._payloads(split_nal_units(access_unit))
+        """Return the datagrams of one access unit (annex B) with one 90 kHz `timestamp`; the last has the marker."""
+        payloads = self._to_payloads(split_nal_units(access_unit))
         last = len(payloads) - 1
         datagrams = []
         for index, payload in enumerate(payloads):
@@ -130,7 +131,7 @@ class Packetizer:
             self.next_sequence = (self.next_sequence + 1) % 2**16
         return datagrams
 
-    def _payloads(self, units: list[bytes]) -> list[bytes]:
+    def _to_payloads(self, units: list[bytes]) -> list[bytes]:
         """Pack NAL units in order: neighbours together while they fit one packet, large ones in pieces."""
         payloads: list[bytes] = []
         together: list[bytes] = []
@@ -150,15 +151,15 @@ class Packetizer:
 
 
 def _aggregate(units: list[bytes]) -> bytes:
-    """Put NAL units into one STAP-A (RFC 6184, section 5.7.1); one alone needs none."""
+    """Return a STAP-A of several NAL units (RFC 6184, section 5.7.1); return a single unit unchanged."""
     if len(units) == 1:
         return units[0]
-    importance = max(unit[0] & _NAL_IMPORTANCE for unit in units)
-    return bytes([importance | _STAP_A]) + b"".join(len(unit).to_bytes(2, "big") + unit for unit in units)
+    ref_idc = max(unit[0] & _NAL_REF_IDC for unit in units)
+    return bytes([ref_idc | _STAP_A]) + b"".join(len(unit).to_bytes(2, "big") + unit for unit in units)
 
 
 def _fragment(unit: bytes, max_payload_bytes: int) -> list[bytes]:
-    """Cut one NAL unit into FU-A of nearly equal size (RFC 6184, section 5.8)."""
+    """Split one NAL unit into FU-A of nearly equal size (RFC 6184, section 5.8)."""
     body_bytes = len(unit) - 1
     count = -(-body_bytes // (max_payload_bytes - 2))
     indicator = unit[0] & ~_NAL_TYPE | _FU_A
@@ -171,22 +172,23 @@ def _fragment(unit: bytes, max_payload_bytes: int) -> list[bytes]:
 
 @value
 class AccessUnit:
-    """What is there of one picture's H.264."""
+    """The received H.264 data of one picture."""
 
     data: bytes
-    """Annex B; b"" when nothing of it can be decoded."""
+    """Annex B; b"" if nothing of it can be decoded."""
     timestamp: int
     complete: bool
-    """Nothing of it is missing, nor, since the stream began, anything before it that it refers to. A picture that is
-    not complete stays in what is predicted from it, so pictures are in doubt from there to the next whole keyframe."""
+    """True if nothing is missing in it, nor directly before it unless it is a keyframe with parameter sets. Errors of
+    an incomplete picture persist in the pictures predicted from it, so pictures are in doubt from there to the next
+    complete keyframe."""
     keyframe: bool
-    """It holds slices of an IDR picture: decoding can begin here."""
+    """True if it has slices of an IDR picture: decoding can begin here."""
 
 
 class Depacketizer:
-    """Puts access units together from RTP packets in the order of their sequence numbers.
+    """A depacketizer that assembles access units from RTP packets in the order of their sequence numbers.
 
-    It never raises: payloads that are not H.264 are counted in `malformed` and leave their access unit incomplete.
+    It never raises: payloads that are not H.264 are counted in `malformed` and make their access unit incomplete.
     """
 
     def __init__(self) -> None:
@@ -194,27 +196,27 @@ class Depacketizer:
         self._begun = False
 
     def push(self, packet: RtpPacket, lost_before: bool) -> list[AccessUnit]:
-        """Take the next packet; return the access units that are over, oldest first: at most two.
+        """Add the next packet; return the access units that are finished, oldest first: at most two.
 
-        `lost_before` says that packets between this one and the one before are missing. An access unit whose marker
-        packet is missing leaves when the next one begins.
+        `lost_before`: packets between this one and the previous one are missing. An access unit whose marker packet is
+        missing is finished when the next one begins.
         """
-        over = []
+        finished = []
         if self._begun and packet.timestamp != self._timestamp:
             if lost_before:
                 self._damaged = True
-            over.append(self._finish())
+            finished.append(self._finish())
         if not self._begun:
             self._begin(packet.timestamp, after_loss=lost_before)
         elif lost_before:
             self._damaged = True
             self._open_fragment = _NONE
-        if not self._take(packet.payload):
+        if not self._add_payload(packet.payload):
             self.malformed += 1
             self._damaged = True
         if packet.marker:
-            over.append(self._finish())
-        return over
+            finished.append(self._finish())
+        return finished
 
     def _begin(self, timestamp: int, *, after_loss: bool) -> None:
         """Start an empty access unit."""
@@ -228,43 +230,46 @@ class Depacketizer:
         self._open_fragment = _NONE
 
     def _finish(self) -> AccessUnit:
-        """End the access unit and leave none begun."""
+        """Finish the current access unit and return it."""
         damaged = self._damaged or self._open_fragment != _NONE
-        # After a loss the first packets of this unit may be among the lost, and so may a picture it refers to. A
-        # keyframe that begins with its parameter sets shows that neither matters.
+        # After a loss the first packets of this unit, or a picture it refers to, may have been lost. A keyframe that
+        # begins with its parameter sets or a delimiter is complete all the same.
         fresh = self._keyframe and self._first_kind in (_PARAMETER_SET, _DELIMITER)
         complete = not damaged and bool(self._data) and (fresh or not self._after_loss)
         unit = AccessUnit(bytes(self._data), self._timestamp, complete, self._keyframe)
         self._begun = False
         return unit
 
-    def _take(self, payload: bytes) -> bool:
-        """Add what a payload holds; False when it is not H.264 in packetization mode 1."""
+    def _add_payload(self, payload: bytes) -> bool:
+        """Add the contents of a payload; return False if it is not H.264 in packetization mode 1."""
         if not payload or payload[0] & _FORBIDDEN or len(self._data) + len(payload) > MAX_ACCESS_UNIT_BYTES:
             return False
         kind = payload[0] & _NAL_TYPE
         if kind == _FU_A:
-            return self._take_fragment(payload)
+            return self._add_fragment(payload)
         if self._open_fragment != _NONE:
             self._damaged = True
             self._open_fragment = _NONE
         if kind == _STAP_A:
-            return self._take_aggregate(payload)
-        return self._begin_unit(payload[0]) and self._add(payload[1:])
+            return self._add_aggregate(payload)
+        return self._begin_nal_unit(payload[0]) and self._append(payload[1:])
 
-    def _take_aggregate(self, payload: bytes) -> bool:
-        """Add the NAL units of a STAP-A, as far as they are well formed."""
+    def _add_aggregate(self, payload: bytes) -> bool:
+        """Add the NAL units of a STAP-A up to the first malformed one; return whether all are well formed."""
         at = 1
         while at < len(payload):
             begin = at + 2
             at = begin + int.from_bytes(payload[at:begin], "big")
-            if at > len(payload) or at == begin or not self._begin_unit(payload[begin]):
+            if at > len(payload) or at == begin or not self._begin_nal_unit(payload[begin]):
                 return False
-            self._add(payload[begin + 1 : at])
+            self._append(payload[begin + 1 : at])
         return len(payload) > 1
 
-    def _take_fragment(self, payload: bytes) -> bool:
-        """Add an FU-A. Pieces after a hole are left out: a decoder gets on better with a NAL unit that ends early."""
+    def _add_fragment(self, payload: bytes) -> bool:
+        """Add an FU-A; return False if it is malformed.
+
+        Fragments after a gap are dropped: a decoder copes better with a NAL unit that ends early.
+        """
         if len(payload) < 2:
             return False
         kind = payload[1] & _NAL_TYPE
@@ -273,17 +278,17 @@ class Depacketizer:
             return False
         if starts:
             self._damaged = self._damaged or self._open_fragment != _NONE
-            if not self._begin_unit(payload[0] & ~_NAL_TYPE | kind):
+            if not self._begin_nal_unit(payload[0] & ~_NAL_TYPE | kind):
                 return False
         elif self._open_fragment != kind:
             self._damaged = True
             self._open_fragment = _NONE
             return True
         self._open_fragment = _NONE if ends else kind
-        return self._add(payload[2:])
+        return self._append(payload[2:])
 
-    def _begin_unit(self, header: int) -> bool:
-        """Start a NAL unit with its header byte; False when it is of no kind that may stand alone."""
+    def _begin_nal_unit(self, header: int) -> bool:
+        """Start a NAL unit with its header byte; return False if its type is not that of a single NAL unit."""
         kind = header & _NAL_TYPE
         if not 1 <= kind <= _LAST_SINGLE_NAL or header & _FORBIDDEN:
             return False
@@ -294,7 +299,7 @@ class Depacketizer:
         self._data.append(header)
         return True
 
-    def _add(self, part: bytes) -> bool:
-        """Append bytes to the NAL unit begun last."""
+    def _append(self, part: bytes) -> bool:
+        """Append bytes to the current NAL unit; return True."""
         self._data += part
         return True

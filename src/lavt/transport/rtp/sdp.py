@@ -1,4 +1,4 @@
-"""What a plain receiver has to know of our RTP stream, as the file that players open (SDP, RFC 8866)."""
+"""Session description (SDP, RFC 8866) of our RTP stream: the file by which plain receivers open it."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ _SEQUENCE_PARAMETERS: Final = 7
 """NAL unit type of a sequence parameter set (H.264, table 7-1)."""
 _NAL_TYPE: Final = 0x1F
 _MULTICAST_HOPS: Final = "/1"
-"""What the kernel gives a multicast datagram where nobody says otherwise."""
+"""The time to live of multicast datagrams: the kernel's default."""
 
 
 def session_description(receiver: tuple[str, int], *, rate_hz: float, profile_level_id: str) -> str:
-    """Describe the stream that goes to `receiver`, an IPv4 address and a port: a whole SDP file.
+    """Return the SDP file of the stream to `receiver`, an IPv4 address and a port.
 
     `profile_level_id` is that of the stream's own parameter sets, in hexadecimal. RTCP is on the port of RTP. Raises
-    `UserError` for a port that nobody can listen on. RFC 8866; RFC 6184, section 8.2.1, for the format; RFC 5761 for
-    RTCP.
+    `UserError` for a port that cannot be listened on. Sources: RFC 8866; RFC 6184, section 8.2.1, for the format;
+    RFC 5761 for RTCP.
     """
     address, port = IPv4Address(receiver[0]), receiver[1]
     if not 1 <= port <= 65535:
-        raise UserError(f"nobody can receive at port {port} of {address}: give the receiver a port of 1 to 65535")
+        raise UserError(f"a receiver cannot listen on port {port} of {address}: choose a port of 1 to 65535")
     lines = (
         "v=0",
-        "o=- 0 0 IN IP4 127.0.0.1",  # who sends, and its address, is for the server to know
+        "o=- 0 0 IN IP4 127.0.0.1",  # does not reveal the server's user and address
         "s=LAVT",
         f"c=IN IP4 {address}{_MULTICAST_HOPS if address.is_multicast else ''}",
         "t=0 0",
@@ -42,7 +42,7 @@ def session_description(receiver: tuple[str, int], *, rate_hz: float, profile_le
 
 
 def profile_level_id(access_unit: bytes) -> str:
-    """Give profile, constraints and level as the sequence parameters of a keyframe (annex B) say them: six digits.
+    """Return profile, constraints and level from the sequence parameters of a keyframe (annex B): six digits.
 
     Raises `BadPacket` for an access unit without sequence parameters.
     """

@@ -1,1 +1,1 @@
-"""Signed envelopes, keys and certificates, and the gateway that verifies what comes from Zenoh."""
+"""Signed envelopes, keys and certificates, and the gateways that verify messages from Zenoh."""

@@ -1,8 +1,8 @@
-"""A test authority, the certificates it signs for routers (X.509, EC P-256), and keys for signatures (Ed25519).
+"""A test certificate authority, router certificates (X.509, EC P-256) and signing keys (Ed25519).
 
-All is PEM: certificates, private keys as PKCS 8 without a password, public keys as SubjectPublicKeyInfo. Access lists
-of Zenoh see the common name (CN) of a certificate. Only those that are dialled get the addresses at which they are, and
-may stand as servers: an operator's stolen key cannot play the vehicle's router.
+Everything is PEM: certificates, private keys as PKCS 8 without a password, public keys as SubjectPublicKeyInfo.
+Zenoh's access lists match the common name (CN) of a certificate. Only certificates of routers that accept connections
+contain host addresses and the server usage, so a stolen operator key cannot impersonate the vehicle's router.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from lavt.errors import UserError
 from lavt.value import value
 
 NS_PER_DAY: Final = 86_400 * NS_PER_S
-CLOCKS_DIFFER_NS: Final = NS_PER_DAY
-"""Certificates hold from so long ago: the clock of a vehicle that just started may be behind."""
+CLOCK_SKEW_NS: Final = NS_PER_DAY
+"""Certificates are valid from this long before now: the clock of a vehicle that has just started may be behind."""
 AUTHORITY: Final = "lavt test authority"
 LOOPBACK: Final = ("127.0.0.1", "localhost")
 _LABEL: Final = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
@@ -36,26 +36,26 @@ Kind = TypeVar("Kind", bound=x509.ExtensionType)
 
 @value
 class KeyPair:
-    """A private key, and what may be shown of it: a certificate, or a public key. Both PEM."""
+    """A private key and its public part, which is a certificate or a public key. Both are PEM."""
 
     private: bytes
-    shown: bytes
+    public: bytes
 
 
 @value
 class CertificateSummary:
-    """What a certificate says."""
+    """The fields of a certificate that `lavt keys` prints."""
 
     name: str
     role: str
     hosts: tuple[str, ...]
-    """Where it may be dialled; empty where it never is."""
+    """Names and addresses at which the server accepts connections; empty for a client."""
     expires: str
-    """Day, as 2027-01-31 (UTC)."""
+    """The day in UTC, such as 2027-01-31."""
 
 
 def new_authority(now_wall_ns: int, days: int) -> KeyPair:
-    """Make an authority that signs itself and holds for `days`; it can sign certificates, but no other authority."""
+    """Create a self-signed authority, valid for `days`; it can sign certificates, but no other authority."""
     key = generate_private_key(SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, AUTHORITY)])
     builder = (
@@ -68,12 +68,13 @@ def new_authority(now_wall_ns: int, days: int) -> KeyPair:
 
 
 def new_certificate(
-    authority: KeyPair, name: str, role: str, *, dialled_at: Iterable[str] | None, now_wall_ns: int, days: int
+    authority: KeyPair, name: str, role: str, *, server_hosts: Iterable[str] | None, now_wall_ns: int, days: int
 ) -> KeyPair:
-    """Make a key and its certificate for `name`, which is the CN; the role is its organizational unit (OU).
+    """Create a key and a certificate whose CN is `name` and whose organizational unit (OU) is `role`.
 
-    `dialled_at` are the addresses and host names beside the loopback's; None: it is never dialled. It holds for
-    `days`, but not longer than the authority. Raises `UserError` for an authority that cannot be read or has expired.
+    `server_hosts` are the addresses and host names besides the loopback ones; None makes a client-only certificate.
+    The certificate is valid for `days`, but not longer than the authority's. Raise `UserError` for an authority that
+    cannot be read or has expired.
     """
     issuer, issuer_key = _authority(authority)
     begins, ends = calendar_time(now_wall_ns), issuer.not_valid_after_utc
@@ -83,8 +84,8 @@ def new_certificate(
     subject = x509.Name(
         [x509.NameAttribute(NameOID.COMMON_NAME, name), x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role)]
     )
-    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([] if dialled_at is None else [ExtendedKeyUsageOID.SERVER_AUTH])
-    hosts = [name] if dialled_at is None else [name, *LOOPBACK, *dialled_at]
+    usages = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([] if server_hosts is None else [ExtendedKeyUsageOID.SERVER_AUTH])
+    hosts = [name] if server_hosts is None else [name, *LOOPBACK, *server_hosts]
     builder = (
         _builder(subject, issuer.subject, key, now_wall_ns)
         .not_valid_after(min(calendar_time(now_wall_ns + days * NS_PER_DAY), ends))
@@ -100,18 +101,18 @@ def new_certificate(
 
 
 def new_signing_pair() -> KeyPair:
-    """Make a key to sign with and the public key that others check it by (Ed25519)."""
+    """Create an Ed25519 key pair for signatures."""
     key = Ed25519PrivateKey.generate()
     public = key.public_key().public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
     return KeyPair(_private(key), public)
 
 
-def described(certificate: bytes, where: str) -> CertificateSummary:
-    """Read what a certificate says; raises `UserError`, which says `where` it is, for bytes that are none."""
+def summarize(certificate: bytes, where: str) -> CertificateSummary:
+    """Return the summary of a PEM certificate; raise `UserError` that names `where` if it is not one."""
     read = _read(certificate, where)
-    server = _extension(read, x509.ExtendedKeyUsage)
-    dialled = server is not None and ExtendedKeyUsageOID.SERVER_AUTH in server
-    names = _extension(read, x509.SubjectAlternativeName) if dialled else None
+    usages = _extension(read, x509.ExtendedKeyUsage)
+    is_server = usages is not None and ExtendedKeyUsageOID.SERVER_AUTH in usages
+    names = _extension(read, x509.SubjectAlternativeName) if is_server else None
     return CertificateSummary(
         name=_subject(read, NameOID.COMMON_NAME),
         role=_subject(read, NameOID.ORGANIZATIONAL_UNIT_NAME),
@@ -121,12 +122,12 @@ def described(certificate: bytes, where: str) -> CertificateSummary:
 
 
 def days_left(certificate: bytes, where: str, now_wall_ns: int) -> float:
-    """Tell for how many days a certificate holds from now on, negative where it has ended; errors as `described`."""
+    """Return the days until a certificate expires, negative if it has; raise `UserError` as `summarize` does."""
     return _read(certificate, where).not_valid_after_utc.timestamp() * NS_PER_S / NS_PER_DAY - now_wall_ns / NS_PER_DAY
 
 
 def is_host(text: str) -> bool:
-    """Whether it is an IP address or a host name, without a port."""
+    """Return whether `text` is an IP address or a host name without a port."""
     return _address(text) is not None or _HOST.match(text) is not None
 
 
@@ -139,7 +140,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(calendar_time(now_wall_ns - CLOCKS_DIFFER_NS))
+        .not_valid_before(calendar_time(now_wall_ns - CLOCK_SKEW_NS))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )
 
@@ -184,17 +185,17 @@ def _read(certificate: bytes, where: str) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(certificate)
     except ValueError as error:
-        raise UserError(f"{where} is no certificate in PEM: copy it back, or move it away") from error
+        raise UserError(f"{where} is not a PEM certificate: copy it back, or move it away") from error
 
 
 def _authority(authority: KeyPair) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
-    certificate = _read(authority.shown, "that of the authority")
+    certificate = _read(authority.public, "the authority's certificate")
     try:
         key = serialization.load_pem_private_key(authority.private, password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise UserError("the authority's key is no private key in PEM without a password") from error
+        raise UserError("the authority's key is not a PEM private key without a password") from error
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
-        raise UserError("the authority's key is not that of its certificate")
+        raise UserError("the authority's key does not match its certificate")
     return certificate, key
 
 

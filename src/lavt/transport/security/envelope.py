@@ -1,8 +1,9 @@
-"""Envelopes that say who sent a message, around what crosses Zenoh; replays are refused. Formats: `docs/wire.md`.
+"""Signed envelopes for the messages that cross Zenoh, with protection against replays. Formats: `docs/wire.md`.
 
-Access lists of routers see the neighbour and not the origin, and whoever reaches the operator's router could publish.
-So commands and queries are signed with the operator's key, which the vehicle knows, and states and replies with the
-vehicle's, which the operator knows (Ed25519). No input, output or clock here; whoever calls from several threads locks.
+A router's access list sees the neighbour and not the origin of a message, so any process that reaches the operator's
+router could publish. Commands and requests therefore carry the operator's signature, which the vehicle verifies; states
+and replies carry the vehicle's, which the operator verifies (Ed25519). Commands, requests and states also carry a MAC
+under the session's token, which is cheaper to verify. No input, output or clock here; callers do the locking.
 """
 
 from __future__ import annotations
@@ -28,106 +29,109 @@ from lavt.transport.security.keys import (
 )
 from lavt.value import value
 
-CODE_BYTES: Final = 16
-"""Of the authentication code of who holds the vehicle, which costs a fiftieth of a signature and so answers a flood."""
-TRAILER_BYTES: Final = CODE_BYTES + SIGNATURE_BYTES
-"""After what is signed."""
-PLACE_BYTES: Final = 16
-"""Instance of the server's process and a number that counts within it, 8 bytes each."""
+MAC_BYTES: Final = 16
+"""A MAC costs a fiftieth of a signature, so it separates the active operator's messages from a flood."""
+TRAILER_BYTES: Final = MAC_BYTES + SIGNATURE_BYTES
+"""MAC and signature, which follow the signed part."""
+REPLAY_COUNTER_BYTES: Final = 16
+"""A random number of the server's process and a counter within that process, 8 bytes each."""
 DIGEST_BYTES: Final = 16
-LONGEST_BYTES: Final = MAX_MESSAGE_BYTES + 256
-KEPT: Final = 8
-"""So many requests wait for their replies, and so many agreements are remembered."""
+MAX_ENVELOPE_BYTES: Final = MAX_MESSAGE_BYTES + 256
+MAX_PENDING_REQUESTS: Final = 8
+MAX_AGREEMENTS: Final = 8
 
 REQUESTS: Final[dict[str, type[SessionRequest | NetemRequest]]] = {"session": SessionRequest, "netem": NetemRequest}
-"""By the channel of the query."""
+"""Request classes by channel."""
 
-_NOBODY: Final = bytes(CODE_BYTES)
-_HERE, _AGAIN = b"\0", b"\1"
-"""A reply says: here is the answer; or: ask again with this place."""
-_WHO_BYTES: Final = 32
+_NO_MAC: Final = bytes(MAC_BYTES)
+_ANSWER, _RETRY = b"\0", b"\1"
+"""Kind of a reply: an answer, or a demand to send the request again with the replay counter in the reply."""
+_NAME_BYTES: Final = 32
 
 
-def _context(what: str, vehicle: str) -> bytes:
-    """Begin what is signed: no signature serves for another kind of message or another vehicle."""
-    return f"LAVT 1 {what} {vehicle}\0".encode()
+def _signing_context(purpose: str, vehicle: str) -> bytes:
+    """Return the prefix of signed data: a signature is valid for one kind of message and one vehicle only."""
+    return f"LAVT 1 {purpose} {vehicle}\0".encode()
 
 
 class _SessionMacs:
-    """The codes of one session, which its two ends can make and nobody else; before there is one, of nobody."""
+    """The MACs of one session, whose key only its two ends know; without a session, zeros that never verify."""
 
     def __init__(self, token: bytes = b"") -> None:
         self._key = hmac.digest(token, b"LAVT 1 codes", "sha256") if token else b""
 
-    def of(self, channel: str, signed: bytes) -> bytes:
-        """Make the code of what is signed."""
-        return hmac.digest(self._key, channel.encode() + signed, "sha256")[:CODE_BYTES] if self._key else _NOBODY
+    def compute(self, channel: str, signed: bytes) -> bytes:
+        """Return the MAC of the signed part of an envelope."""
+        return hmac.digest(self._key, channel.encode() + signed, "sha256")[:MAC_BYTES] if self._key else _NO_MAC
 
-    def fit(self, channel: str, data: bytes) -> bool:
-        """Tell whether the code of an envelope is right."""
-        if not self._key or len(data) > LONGEST_BYTES:
+    def verify(self, channel: str, data: bytes) -> bool:
+        """Return whether the MAC of an envelope is valid."""
+        if not self._key or len(data) > MAX_ENVELOPE_BYTES:
             return False
-        code = data[-TRAILER_BYTES:-SIGNATURE_BYTES]
-        return hmac.compare_digest(self.of(channel, data[:-TRAILER_BYTES]), code)
+        mac = data[-TRAILER_BYTES:-SIGNATURE_BYTES]
+        return hmac.compare_digest(self.compute(channel, data[:-TRAILER_BYTES]), mac)
 
 
-def _signed(data: bytes) -> bytes:
-    """Return what is signed in an envelope, unchecked; empty, which nobody signs, where it is too short or too long."""
-    return data[:-TRAILER_BYTES] if len(data) <= LONGEST_BYTES else b""
+def _signed_part(data: bytes) -> bytes:
+    """Return the part before MAC and signature, unverified; empty if the envelope is too short or too long.
+
+    Nobody signs an empty part.
+    """
+    return data[:-TRAILER_BYTES] if len(data) <= MAX_ENVELOPE_BYTES else b""
 
 
 @value
 class VerifiedRequest:
-    """A query that is authentic and new: from whom, and what its reply needs to know of it."""
+    """A request with a valid signature, and the data that its reply needs."""
 
     channel: str
-    who: str
+    operator: str
     body: bytes
-    """Empty: it only asks for the place of the next."""
+    """Empty: the request only asks for the next replay counter."""
     digest: bytes
     secret: bytes
     public: bytes
-    """The server's end of the agreement."""
+    """The server's public key of the agreement."""
     is_stale: bool
-    """It has not the place that is next, so it may be a replay: nobody looks at it, and who sent it may ask again."""
+    """The replay counter is not the next one, so this may be a replay: the body is ignored and the client may retry."""
 
 
-class NoVehicleAuthenticator:
-    """The vehicle's end where nothing is signed: everything is taken to be authentic."""
+class NullVehicleAuthenticator:
+    """The vehicle's authenticator where nothing is signed: it accepts every message and signs none."""
 
     counts: Mapping[str, int] = {}
 
-    def body(self, data: bytes) -> bytes:
-        """Give the command in an envelope, unchecked."""
+    def unverified_body(self, data: bytes) -> bytes:
+        """Return the command in an envelope without verifying it."""
         return data
 
     def is_from_active_operator(self, _data: bytes) -> bool:
-        """Tell whether a command comes from who holds the vehicle: nobody knows."""
+        """Return True: without MACs every command may be the active operator's."""
         return True
 
     def is_next_of_active_operator(self, _channel: str, _data: bytes) -> bool:
-        """Tell whether a query is the next of who holds the vehicle: nobody knows."""
+        """Return False: without MACs no request is known to be the active operator's."""
         return False
 
-    def open_command(self, data: bytes) -> bytes | None:
-        """Give the command in an envelope."""
+    def verify_command(self, data: bytes) -> bytes | None:
+        """Return the command."""
         return data
 
-    def open_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
-        """Give the query in an envelope."""
+    def verify_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
+        """Return the request."""
         return VerifiedRequest(channel, "", data, b"", b"", b"", is_stale=False)
 
     def sign_state(self, body: bytes) -> bytes:
-        """Give the state as it is."""
+        """Return the state unchanged."""
         return body
 
     def sign_reply(self, _request: VerifiedRequest, body: bytes) -> bytes:
-        """Give the reply as it is."""
+        """Return the reply unchanged."""
         return body
 
 
-class VehicleAuthenticator(NoVehicleAuthenticator):
-    """The vehicle's end: `operators` are the names and keys of who may drive."""
+class VehicleAuthenticator(NullVehicleAuthenticator):
+    """The vehicle's authenticator; `operators` maps the names of the permitted operators to their public keys."""
 
     def __init__(self, vehicle: str, key: PrivateKey, operators: Mapping[str, PublicKey]) -> None:
         self.counts = self._counts = Counter[str]()
@@ -136,243 +140,251 @@ class VehicleAuthenticator(NoVehicleAuthenticator):
         self._operators = dict(operators)
         self._instance = secrets.token_bytes(8)
         self._states = 0
-        self._requested: Counter[tuple[str, str]] = Counter()
-        """By channel and operator: how many requests were taken."""
+        self._accepted_requests: Counter[tuple[str, str]] = Counter()
+        """How many requests had the next replay counter, by channel and operator."""
         self._agreements: dict[bytes, tuple[bytes, bytes]] = {}
-        """By the client's public key: the secret, and the public key of this end."""
+        """Secret and public key of this end, by the client's public key."""
         self._active_operator = ""
-        self._codes = _SessionMacs()
+        self._macs = _SessionMacs()
 
-    # What comes in.
+    # Received messages.
 
-    def body(self, data: bytes) -> bytes:
-        """Give the command in an envelope, unchecked."""
-        return _signed(data)
+    def unverified_body(self, data: bytes) -> bytes:
+        """Return the command in an envelope without verifying it."""
+        return _signed_part(data)
 
     def is_from_active_operator(self, data: bytes) -> bool:
-        """Tell by its code, which is cheap, whether a command comes from who holds the vehicle."""
-        return self._codes.fit("control", data)
+        """Return whether the MAC of a command is valid, which is cheap to check."""
+        return self._macs.verify("control", data)
 
     def is_next_of_active_operator(self, channel: str, data: bytes) -> bool:
-        """Tell by place and code, which is cheap, whether a query is the next of who holds the vehicle."""
-        return data.startswith(self._place(channel, self._active_operator)) and self._codes.fit(channel, data)
+        """Return whether a request has the active operator's next replay counter and MAC, which is cheap to check."""
+        counter = self._replay_counter(channel, self._active_operator)
+        return data.startswith(counter) and self._macs.verify(channel, data)
 
-    def open_command(self, data: bytes) -> bytes | None:
-        """Give the command in an envelope that the holder has signed; of other operators only an emergency stop."""
-        body, signature = _signed(data), data[-SIGNATURE_BYTES:]
-        said = _context("control", self._vehicle) + body
+    def verify_command(self, data: bytes) -> bytes | None:
+        """Return the command if the active operator signed it, or if any operator signed an emergency stop."""
+        body, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
+        signed = _signing_context("control", self._vehicle) + body
         active_operator = self._operators.get(self._active_operator)
-        if active_operator is not None and active_operator.verifies(signature, said):
+        if active_operator is not None and active_operator.verify(signature, signed):
             return body
-        if self._asks_for_emergency_stop(body) and any(
-            key.verifies(signature, said) for name, key in self._operators.items() if name != self._active_operator
+        if self._has_emergency_stop(body) and any(
+            key.verify(signature, signed) for name, key in self._operators.items() if name != self._active_operator
         ):
             return body
         self._counts["commands_forged"] += 1
         return None
 
-    def _asks_for_emergency_stop(self, body: bytes) -> bool:
+    def _has_emergency_stop(self, body: bytes) -> bool:
         try:
             return decode(Command, body).emergency_stop != 0
         except BadMessage:
             return False
 
-    def open_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
-        """Give the query in an envelope that one of the operators has signed in his own name; None for any other."""
-        signed, signature = _signed(data), data[-SIGNATURE_BYTES:]
-        at = PLACE_BYTES + PUBLIC_KEY_BYTES + _WHO_BYTES
-        place, public = signed[:PLACE_BYTES], signed[PLACE_BYTES : at - _WHO_BYTES]
-        who, body = signed[at - _WHO_BYTES : at].rstrip(b"\0").decode("ascii", "replace"), signed[at:]
-        key = self._operators.get(who)
-        if key is None or not key.verifies(signature, _context(channel, self._vehicle) + signed):
+    def verify_request(self, channel: str, data: bytes) -> VerifiedRequest | None:
+        """Return the request if an operator signed it in its own name, otherwise None."""
+        signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
+        at = REPLAY_COUNTER_BYTES + PUBLIC_KEY_BYTES + _NAME_BYTES
+        counter, public = signed[:REPLAY_COUNTER_BYTES], signed[REPLAY_COUNTER_BYTES : at - _NAME_BYTES]
+        operator, body = signed[at - _NAME_BYTES : at].rstrip(b"\0").decode("ascii", "replace"), signed[at:]
+        key = self._operators.get(operator)
+        if key is None or not key.verify(signature, _signing_context(channel, self._vehicle) + signed):
             self._counts[f"{channel}_requests_forged"] += 1
             return None
-        agreed = self._agree(public)
-        if agreed is None or not self._is_own(channel, who, body):
+        agreed = self._agree_on_secret(public)
+        if agreed is None or not self._is_in_own_name(channel, operator, body):
             self._counts[f"{channel}_requests_forged"] += 1
             return None
-        next_in_place = place == self._place(channel, who)
-        self._requested[channel, who] += next_in_place
-        # An emergency stop has a number of its own, and no time to ask twice.
-        stale = body == b"" or not (next_in_place or _is_emergency_stop(channel, body))
+        is_next = counter == self._replay_counter(channel, operator)
+        self._accepted_requests[channel, operator] += is_next
+        # An emergency stop has a number of its own and cannot wait for a second request.
+        stale = body == b"" or not (is_next or _is_emergency_stop(channel, body))
         self._counts[f"{channel}_requests_of_another_time"] += stale and body != b""
-        return VerifiedRequest(channel, who, body, _digest(data), *agreed, stale)
+        return VerifiedRequest(channel, operator, body, _digest(data), *agreed, stale)
 
-    def _is_own(self, channel: str, who: str, body: bytes) -> bool:
-        """Whether a request is in the name of who has signed it; an empty one only asks for the place."""
+    def _is_in_own_name(self, channel: str, operator: str, body: bytes) -> bool:
+        """Return whether a request names the operator that signed it; an empty one passes."""
         kind: Any = REQUESTS[channel]
         try:
-            return body == b"" or bool(decode(kind, body).who == who)
+            return body == b"" or bool(decode(kind, body).who == operator)
         except BadMessage:
             return False
 
-    def _place(self, channel: str, who: str) -> bytes:
-        return self._instance + self._requested[channel, who].to_bytes(8, "big")
+    def _replay_counter(self, channel: str, operator: str) -> bytes:
+        """Return the replay counter that the operator's next request must have."""
+        return self._instance + self._accepted_requests[channel, operator].to_bytes(8, "big")
 
-    def _agree(self, public: bytes) -> tuple[bytes, bytes] | None:
-        """Agree on a secret with whoever has this public key: the secret and the public key of this end."""
+    def _agree_on_secret(self, public: bytes) -> tuple[bytes, bytes] | None:
+        """Return the secret shared with the owner of `public` and the public key of this end; None for a bad key."""
         if public not in self._agreements:
             agreement = KeyAgreement()
-            secret = agreement.secret(public, _context("secret", self._vehicle) + public + agreement.public)
+            context = _signing_context("secret", self._vehicle) + public + agreement.public
+            secret = agreement.derive_secret(public, context)
             if secret is None:
                 return None
             self._agreements[public] = secret, agreement.public
-            if len(self._agreements) > KEPT:
+            if len(self._agreements) > MAX_AGREEMENTS:
                 self._agreements.pop(next(iter(self._agreements)))
         return self._agreements[public]
 
-    # What goes out.
+    # Sent messages.
 
     def sign_state(self, body: bytes) -> bytes:
-        """Sign a state, and number it."""
+        """Add a number, a MAC and a signature to a state."""
         self._states += 1
         signed = self._instance + self._states.to_bytes(8, "big") + body
-        return signed + self._codes.of("state", signed) + self._key.sign(_context("state", self._vehicle) + signed)
+        signature = self._key.sign(_signing_context("state", self._vehicle) + signed)
+        return signed + self._macs.compute("state", signed) + signature
 
     def sign_reply(self, request: VerifiedRequest, body: bytes) -> bytes:
-        """Sign the reply to `request`, encrypted for who asked; of a stale one `body` is empty."""
+        """Encrypt and sign the reply to `request`; `body` is empty if the request is stale."""
         if not request.is_stale:
-            self._note_session(request, body)
-        place = self._place(request.channel, request.who)
+            self._update_session(request, body)
+        counter = self._replay_counter(request.channel, request.operator)
         encrypted = encrypt(request.secret, body, request.digest)
-        signed = request.digest + (_AGAIN if request.is_stale else _HERE) + place + request.public + encrypted
-        return signed + self._key.sign(_context(f"{request.channel} reply", self._vehicle) + signed)
+        signed = request.digest + (_RETRY if request.is_stale else _ANSWER) + counter + request.public + encrypted
+        return signed + self._key.sign(_signing_context(f"{request.channel} reply", self._vehicle) + signed)
 
-    def _note_session(self, request: VerifiedRequest, body: bytes) -> None:
-        """Follow who holds the vehicle: whose commands are admitted, and by which codes."""
+    def _update_session(self, request: VerifiedRequest, body: bytes) -> None:
+        """Update the active operator and the session's MACs from a reply that is about to be sent."""
         if request.channel != "session":
             return
         reply, operation = decode(SessionReply, body), decode(SessionRequest, request.body).operation
         if reply.granted and operation == "release":
-            self._active_operator, self._codes = "", _SessionMacs()
+            self._active_operator, self._macs = "", _SessionMacs()
         elif reply.granted and reply.token:
-            self._active_operator, self._codes = request.who, _SessionMacs(reply.token)
+            self._active_operator, self._macs = request.operator, _SessionMacs(reply.token)
 
 
 @value
 class VerifiedReply:
-    """What a reply says: a `body`, or that the request must be sent `again`, in these bytes; or neither."""
+    """The result of verifying a reply: its body, or the envelope to send as a retry, or neither."""
 
     body: bytes | None
-    again: bytes | None
+    retry: bytes | None
 
 
 @value
 class VerifiedState:
-    """A state, or None where it is not to be shown."""
+    """The result of verifying a state; `body` is None if the state must not be shown."""
 
     body: bytes | None
-    ask: bool
-    """It is the vehicle's, and may be old: of a server's process that has not answered a request yet. So ask it."""
+    needs_request: bool
+    """The signature is valid, but this process of the server has not answered a request yet, so it may be a replay."""
 
 
 class OperatorAuthenticator:
-    """The operator's end; `vehicle_key` is the vehicle's."""
+    """The operator's authenticator; `operator` is its name and `vehicle_key` the vehicle's public key."""
 
-    def __init__(self, vehicle: str, who: str, key: PrivateKey, vehicle_key: PublicKey) -> None:
+    def __init__(self, vehicle: str, operator: str, key: PrivateKey, vehicle_key: PublicKey) -> None:
         self.counts: Counter[str] = Counter()
         self._vehicle = vehicle
-        self._who = who.encode().ljust(_WHO_BYTES, b"\0")
+        self._operator = operator.encode().ljust(_NAME_BYTES, b"\0")
         self._key = key
         self._vehicle_key = vehicle_key
         self._agreement = KeyAgreement()
-        self._places: dict[str, bytes] = dict.fromkeys(REQUESTS, bytes(PLACE_BYTES))
-        self._requested: dict[bytes, tuple[str, bytes]] = {}
-        """By digest: the channel and the body of requests that wait for a reply."""
-        self._codes = _SessionMacs()
-        self._newest_state = bytes(PLACE_BYTES)
+        self._replay_counters: dict[str, bytes] = dict.fromkeys(REQUESTS, bytes(REPLAY_COUNTER_BYTES))
+        self._pending: dict[bytes, tuple[str, bytes]] = {}
+        """Channel and body of the requests without a reply, by digest, oldest first."""
+        self._macs = _SessionMacs()
+        self._newest_state = bytes(REPLAY_COUNTER_BYTES)
 
-    # What goes out.
+    # Sent messages.
 
     def sign_command(self, body: bytes) -> bytes:
-        """Sign a command."""
-        return body + self._codes.of("control", body) + self._key.sign(_context("control", self._vehicle) + body)
+        """Append MAC and signature to a command."""
+        signature = self._key.sign(_signing_context("control", self._vehicle) + body)
+        return body + self._macs.compute("control", body) + signature
 
     def sign_request(self, channel: str, body: bytes) -> bytes:
-        """Sign a query; an empty one only asks for the place of the next."""
-        signed = self._places[channel] + self._agreement.public + self._who + body
-        data = signed + self._codes.of(channel, signed) + self._key.sign(_context(channel, self._vehicle) + signed)
-        self._requested[_digest(data)] = channel, body
-        if len(self._requested) > KEPT:
-            self._requested.pop(next(iter(self._requested)))
+        """Sign a request; an empty one only asks for the next replay counter."""
+        signed = self._replay_counters[channel] + self._agreement.public + self._operator + body
+        signature = self._key.sign(_signing_context(channel, self._vehicle) + signed)
+        data = signed + self._macs.compute(channel, signed) + signature
+        self._pending[_digest(data)] = channel, body
+        if len(self._pending) > MAX_PENDING_REQUESTS:
+            self._pending.pop(next(iter(self._pending)))
         return data
 
-    # What comes in.
+    # Received messages.
 
-    def open_reply(self, channel: str, data: bytes) -> VerifiedReply:
-        """Give the answer of the vehicle to a request of ours; each is taken once."""
-        digest, reason = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
+    def verify_reply(self, channel: str, data: bytes) -> VerifiedReply:
+        """Return the vehicle's reply to a pending request; each reply is accepted once."""
+        digest, kind = data[:DIGEST_BYTES], data[DIGEST_BYTES : DIGEST_BYTES + 1]
         at = DIGEST_BYTES + 1
-        place, public = data[at : at + PLACE_BYTES], data[at + PLACE_BYTES : at + PLACE_BYTES + PUBLIC_KEY_BYTES]
+        end = at + REPLAY_COUNTER_BYTES
+        counter, public = data[at:end], data[end : end + PUBLIC_KEY_BYTES]
         signed, signature = data[:-SIGNATURE_BYTES], data[-SIGNATURE_BYTES:]
-        requested = self._requested.get(digest)
-        said = _context(f"{channel} reply", self._vehicle) + signed
+        pending = self._pending.get(digest)
         if (
-            requested is None
-            or requested[0] != channel
-            or len(data) > LONGEST_BYTES
-            or not self._vehicle_key.verifies(signature, said)
+            pending is None
+            or pending[0] != channel
+            or len(data) > MAX_ENVELOPE_BYTES
+            or not self._vehicle_key.verify(signature, _signing_context(f"{channel} reply", self._vehicle) + signed)
         ):
-            return self._forged(f"{channel}_replies_forged")
-        own = self._agreement.public
-        secret = self._agreement.secret(public, _context("secret", self._vehicle) + own + public)
-        encrypted = signed[at + PLACE_BYTES + PUBLIC_KEY_BYTES :]
-        body = None if secret is None else decrypt(secret, encrypted, digest)
+            return self._reject_forged_reply(channel)
+        context = _signing_context("secret", self._vehicle) + self._agreement.public + public
+        secret = self._agreement.derive_secret(public, context)
+        body = None if secret is None else decrypt(secret, signed[end + PUBLIC_KEY_BYTES :], digest)
         if body is None:
-            return self._forged(f"{channel}_replies_forged")
-        self._forget(channel, digest)
-        self._note_place(channel, place)
-        if reason == _AGAIN:
-            return VerifiedReply(None, self.sign_request(channel, requested[1]) if requested[1] else None)
+            return self._reject_forged_reply(channel)
+        self._drop_pending(channel, digest)
+        self._store_replay_counter(channel, counter)
+        if kind == _RETRY:
+            return VerifiedReply(None, self.sign_request(channel, pending[1]) if pending[1] else None)
         if channel == "session":
-            self._note_session(body)
+            self._update_session(body)
         return VerifiedReply(body, None)
 
-    def _forget(self, channel: str, answered: bytes) -> None:
-        """Take no reply any more to a request, nor to those of its kind from before it: what they say is older."""
-        for digest in list(self._requested):
-            if self._requested[digest][0] == channel:
-                del self._requested[digest]
+    def _drop_pending(self, channel: str, answered: bytes) -> None:
+        """Drop an answered request and the earlier ones on its channel, whose replies would be out of date."""
+        for digest in list(self._pending):
+            if self._pending[digest][0] == channel:
+                del self._pending[digest]
             if digest == answered:
                 return
 
-    def _forged(self, name: str) -> VerifiedReply:
-        self.counts[name] += 1
+    def _reject_forged_reply(self, channel: str) -> VerifiedReply:
+        self.counts[f"{channel}_replies_forged"] += 1
         return VerifiedReply(None, None)
 
-    def _note_place(self, channel: str, place: bytes) -> None:
-        self._places[channel] = place
-        if place[:8] != self._newest_state[:8]:  # another process of the server: its states are counted anew
-            self._newest_state = place[:8] + bytes(8)
+    def _store_replay_counter(self, channel: str, counter: bytes) -> None:
+        self._replay_counters[channel] = counter
+        if counter[:8] != self._newest_state[:8]:  # another process of the server: its states start from 0
+            self._newest_state = counter[:8] + bytes(8)
 
-    def _note_session(self, body: bytes) -> None:
+    def _update_session(self, body: bytes) -> None:
         try:
             reply = decode(SessionReply, body)
         except BadMessage:
             return
         if reply.granted and reply.token:
-            self._codes = _SessionMacs(reply.token)
+            self._macs = _SessionMacs(reply.token)
 
     def is_next_state(self, data: bytes) -> bool:
-        """Tell by number and code, which is cheap, whether a state is a newer one for who holds the vehicle."""
-        return data[:PLACE_BYTES] > self._newest_state and self._codes.fit("state", data)
+        """Return whether a state is newer than the last and has a valid MAC, which is cheap to check.
 
-    def open_state(self, data: bytes) -> VerifiedState:
-        """Give a state that the vehicle has signed, newer than any before."""
-        signed, signature = _signed(data), data[-SIGNATURE_BYTES:]
-        place = signed[:PLACE_BYTES]
-        known = place[:8] == self._newest_state[:8]
-        if known and place <= self._newest_state:
+        Only the active operator can verify the MAC.
+        """
+        return data[:REPLAY_COUNTER_BYTES] > self._newest_state and self._macs.verify("state", data)
+
+    def verify_state(self, data: bytes) -> VerifiedState:
+        """Return the state if the vehicle signed it and it is newer than any before."""
+        signed, signature = _signed_part(data), data[-SIGNATURE_BYTES:]
+        counter = signed[:REPLAY_COUNTER_BYTES]
+        is_known_instance = counter[:8] == self._newest_state[:8]
+        if is_known_instance and counter <= self._newest_state:
             self.counts["states_replayed"] += 1
-            return VerifiedState(None, ask=False)
-        if not self._vehicle_key.verifies(signature, _context("state", self._vehicle) + signed):
+            return VerifiedState(None, needs_request=False)
+        if not self._vehicle_key.verify(signature, _signing_context("state", self._vehicle) + signed):
             self.counts["states_forged"] += 1
-            return VerifiedState(None, ask=False)
-        if not known:
+            return VerifiedState(None, needs_request=False)
+        if not is_known_instance:
             self.counts["states_of_another_time"] += 1
-            return VerifiedState(None, ask=True)
-        self._newest_state = place
-        return VerifiedState(signed[PLACE_BYTES:], ask=False)
+            return VerifiedState(None, needs_request=True)
+        self._newest_state = counter
+        return VerifiedState(signed[REPLAY_COUNTER_BYTES:], needs_request=False)
 
 
 def _digest(data: bytes) -> bytes:

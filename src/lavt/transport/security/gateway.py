@@ -1,7 +1,7 @@
-"""Where messages of Zenoh come in and go out on one side: what is not authentic, or is too much, stays outside.
+"""Gateways that filter and authenticate messages between Zenoh and the runtime of a side.
 
-A door is what a link delivers to, in threads of its own, and what hands on to the side's runtime. Behind it a message
-is what its sender meant to say, so that no node asks who sent it. Times of arrival are those of the link.
+A link delivers to its gateway in threads of the link, and the gateway delivers to the runtime. The nodes behind it get
+authentic messages only and need not check who sent them. Times of arrival are the link's.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ from typing import Any, Final
 
 from lavt.domain import NS_PER_S, Now
 from lavt.node import Peer, Send
-from lavt.transport.security.envelope import REQUESTS, NoVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
+from lavt.transport.security.envelope import REQUESTS, NullVehicleAuthenticator, OperatorAuthenticator, VerifiedRequest
 from lavt.transport.security.flood_filter import QUERIES_PER_S, FloodFilter, RateLimiter
 
 Deliver = Callable[[str, Any, Now, Peer], None]
+"""Takes (channel, payload, arrived, peer)."""
 Carry = Callable[..., None]
-"""What is outside: takes `Send`s."""
+"""Takes `Send`s and passes them to the link."""
 
-ASK_PERIOD_NS: Final = NS_PER_S
-QUERIES_KEPT: Final = 64
+REQUEST_PERIOD_NS: Final = NS_PER_S
+MAX_PENDING_QUERIES: Final = 64
 STATES_PER_S: Final = 500
-"""Ten times what a vehicle tells; as many signatures take 7 % of a core."""
+"""Ten times the rate of a vehicle; as many signatures take 7 % of a core."""
 
 
 class OpenClientGateway:
-    """The operator's door where nothing is signed."""
+    """The operator's gateway where nothing is signed: it passes everything unchanged."""
 
     counts: Mapping[str, int] = {}
 
@@ -37,137 +38,136 @@ class OpenClientGateway:
 
 
 class ServerGateway:
-    """The vehicle's door. `in_force` gives the epoch in force and the sequence last obeyed."""
+    """The vehicle's gateway. `in_force` returns the epoch in force and the sequence of the last accepted command."""
 
     def __init__(
         self,
         deliver: Deliver,
         carry: Carry,
         in_force: Callable[[], tuple[int, int]],
-        authenticator: NoVehicleAuthenticator,
+        authenticator: NullVehicleAuthenticator,
     ) -> None:
         self._deliver = deliver
         self._carry = carry
         self._authenticator = authenticator
-        self._screen = FloodFilter(in_force, authenticator.is_from_active_operator)
-        self._budgets = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
+        self._flood_filter = FloodFilter(in_force, authenticator.is_from_active_operator)
+        self._query_limiters = {channel: RateLimiter(QUERIES_PER_S) for channel in REQUESTS}
         self._requests: dict[tuple[str, Peer], VerifiedRequest] = {}
-        self._again: Send | None = None
-        """What a stale request is answered, as soon as the turn is over."""
+        self._retry: Send | None = None
+        """The reply to a stale request, sent as soon as the lock is free."""
         self._counts: Counter[str] = Counter()
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     @property
     def counts(self) -> dict[str, int]:
-        """What was kept outside."""
-        return {**self._counts, **self._screen.counts, **self._authenticator.counts}
+        """The numbers of rejected messages, by reason."""
+        return {**self._counts, **self._flood_filter.counts, **self._authenticator.counts}
 
     def receive(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
-        """Take what the link delivers."""
-        with self._turn:
-            opened = self._command if channel == "control" else self._request
-            body = opened(channel, payload, arrived.mono_ns, peer)
-            again, self._again = self._again, None
-        if again is not None:  # out of turn: the link may wait for its router, and the vehicle for its turn
-            self._carry(again)
+        """Filter and verify a message from the link, and deliver it to the runtime if it is authentic."""
+        with self._lock:
+            verify = self._verify_command if channel == "control" else self._verify_request
+            body = verify(channel, payload, arrived.mono_ns, peer)
+            retry, self._retry = self._retry, None
+        if retry is not None:  # without the lock: the link may wait for its router, and the vehicle for the lock
+            self._carry(retry)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
 
-    def _command(self, _channel: str, payload: bytes, now_ns: int, _peer: Peer) -> bytes | None:
-        if not self._screen.passes(payload, self._authenticator.body(payload), now_ns):
+    def _verify_command(self, _channel: str, payload: bytes, now_ns: int, _peer: Peer) -> bytes | None:
+        if not self._flood_filter.passes(payload, self._authenticator.unverified_body(payload), now_ns):
             return None
-        body = self._authenticator.open_command(payload)
+        body = self._authenticator.verify_command(payload)
         if body is not None:
-            self._screen.note(body)
+            self._flood_filter.note_authentic(body)
         return body
 
-    def _request(self, channel: str, payload: bytes, now_ns: int, peer: Peer) -> bytes | None:
+    def _verify_request(self, channel: str, payload: bytes, now_ns: int, peer: Peer) -> bytes | None:
         if not (
-            self._authenticator.is_next_of_active_operator(channel, payload) or self._budgets[channel].take(now_ns)
+            self._authenticator.is_next_of_active_operator(channel, payload)
+            or self._query_limiters[channel].take(now_ns)
         ):
             self._counts[f"{channel}_requests_screened_out"] += 1
             return None
-        request = self._authenticator.open_request(channel, payload)
+        request = self._authenticator.verify_request(channel, payload)
         if request is None:
             return None
         if request.is_stale:
-            self._again = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
+            self._retry = Send(f"{channel}_reply", self._authenticator.sign_reply(request, b""), peer)
             return None
         self._requests[channel, peer] = request
-        if len(self._requests) > QUERIES_KEPT:
+        if len(self._requests) > MAX_PENDING_QUERIES:
             self._requests.pop(next(iter(self._requests)))
         return request.body
 
     def send(self, *sends: Send) -> None:
-        """Let messages of this side out."""
-        with self._turn:
-            signed = [each for send in sends if (each := self._signed(send)) is not None]
+        """Sign messages from the runtime and pass them to the link; a reply without a pending request is dropped."""
+        with self._lock:
+            signed = [each for send in sends if (each := self._sign(send)) is not None]
         self._carry(*signed)
 
-    def _signed(self, send: Send) -> Send | None:
+    def _sign(self, send: Send) -> Send | None:
         if send.channel == "state":
             return Send("state", self._authenticator.sign_state(send.payload))
         request = self._requests.pop((send.channel.removesuffix("_reply"), send.peer), None)
-        return (
-            None
-            if request is None
-            else Send(send.channel, self._authenticator.sign_reply(request, send.payload), send.peer)
-        )
+        if request is None:
+            return None
+        return Send(send.channel, self._authenticator.sign_reply(request, send.payload), send.peer)
 
 
 class ClientGateway:
-    """The operator's door."""
+    """The operator's gateway."""
 
     def __init__(self, deliver: Deliver, carry: Carry, authenticator: OperatorAuthenticator) -> None:
         self._deliver = deliver
         self._carry = carry
         self._authenticator = authenticator
-        self._states = RateLimiter(STATES_PER_S)
+        self._state_limiter = RateLimiter(STATES_PER_S)
         self._counts: Counter[str] = Counter()
         self._requested_ns: int | None = None
-        self._turn = threading.Lock()
+        self._lock = threading.Lock()
 
     @property
     def counts(self) -> dict[str, int]:
-        """What was kept outside."""
+        """The numbers of rejected messages, by reason."""
         return {**self._counts, **self._authenticator.counts}
 
     def receive(self, channel: str, payload: bytes, arrived: Now, peer: Peer) -> None:
-        """Take what the link delivers."""
-        with self._turn:
-            opened = self._state if channel == "state" else self._reply
-            body = opened(channel, payload, arrived.mono_ns)
+        """Filter and verify a message from the link, and deliver it to the runtime if it is authentic."""
+        with self._lock:
+            verify = self._verify_state if channel == "state" else self._verify_reply
+            body = verify(channel, payload, arrived.mono_ns)
         if body is not None:
             self._deliver(channel, body, arrived, peer)
 
-    def _state(self, _channel: str, payload: bytes, now_ns: int) -> bytes | None:
-        if not (self._authenticator.is_next_state(payload) or self._states.take(now_ns)):
+    def _verify_state(self, _channel: str, payload: bytes, now_ns: int) -> bytes | None:
+        if not (self._authenticator.is_next_state(payload) or self._state_limiter.take(now_ns)):
             self._counts["states_screened_out"] += 1
             return None
-        opened = self._authenticator.open_state(payload)
-        if opened.ask and (self._requested_ns is None or now_ns - self._requested_ns >= ASK_PERIOD_NS):
+        state = self._authenticator.verify_state(payload)
+        if state.needs_request and (self._requested_ns is None or now_ns - self._requested_ns >= REQUEST_PERIOD_NS):
             self._requested_ns = now_ns
-            self._send_soon(Send("session", self._authenticator.sign_request("session", b"")))
-        return opened.body
+            self._send_in_thread(Send("session", self._authenticator.sign_request("session", b"")))
+        return state.body
 
-    def _reply(self, channel: str, payload: bytes, _now_ns: int) -> bytes | None:
+    def _verify_reply(self, channel: str, payload: bytes, _now_ns: int) -> bytes | None:
         query = channel.removesuffix("_reply")
-        reply = self._authenticator.open_reply(query, payload)
-        if reply.again is not None:
-            self._send_soon(Send(query, reply.again))
+        reply = self._authenticator.verify_reply(query, payload)
+        if reply.retry is not None:
+            self._send_in_thread(Send(query, reply.retry))
         return reply.body
 
-    def _send_soon(self, send: Send) -> None:
-        """Send in a thread of its own: in the one that delivers, Zenoh does not allow it."""
+    def _send_in_thread(self, send: Send) -> None:
+        """Send from a new thread: Zenoh does not allow it in the thread that delivers."""
         threading.Thread(target=self._carry, args=(send,), name="gateway", daemon=True).start()
 
     def send(self, *sends: Send) -> None:
-        """Let messages of this side out."""
-        with self._turn:
-            signed = [Send(send.channel, self._signed(send), send.peer) for send in sends]
+        """Sign messages from the runtime and pass them to the link."""
+        with self._lock:
+            signed = [Send(send.channel, self._sign(send), send.peer) for send in sends]
         self._carry(*signed)
 
-    def _signed(self, send: Send) -> bytes:
+    def _sign(self, send: Send) -> bytes:
         if send.channel == "control":
             return self._authenticator.sign_command(send.payload)
         return self._authenticator.sign_request(send.channel, send.payload)

@@ -1,6 +1,6 @@
-"""Keys that say who somebody is (Ed25519), and secrets agreed on for one session (X25519, HKDF, AES-GCM).
+"""Signing keys (Ed25519), key agreement (X25519, HKDF) and encryption (AES-GCM).
 
-With `certificates.py` the only module that knows `cryptography`, which is an extra: who signs nothing does not need it.
+Only this module and `certificates.py` import `cryptography`. It is an extra, so it is imported where it is used.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ class PrivateKey:
         self._key = key
 
     def sign(self, data: bytes) -> bytes:
-        """Sign `data`; the signature has 64 bytes."""
+        """Return the signature of `data`, 64 bytes."""
         return self._key.sign(data)
 
     @property
     def public(self) -> PublicKey:
-        """What verifies its signatures."""
+        """The public key that verifies this key's signatures."""
         return PublicKey(self._key.public_key())
 
 
 class PublicKey:
-    """An Ed25519 key that verifies."""
+    """An Ed25519 key that verifies signatures."""
 
     def __init__(self, key: Ed25519PublicKey) -> None:
         self._key = key
 
-    def verifies(self, signature: bytes, data: bytes) -> bool:
-        """Tell whether `signature` is that of `data`; anything else than a signature is not."""
+    def verify(self, signature: bytes, data: bytes) -> bool:
+        """Return whether `signature` is a valid signature of `data`; malformed ones are not."""
         from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 (an extra)
 
         try:
@@ -56,10 +56,12 @@ class PublicKey:
 
 
 def load_private(path: Path) -> PrivateKey:
-    """Read an Ed25519 private key (PEM, PKCS8); raises `UserError`, also for one that others may read."""
+    """Read an Ed25519 private key (PEM, PKCS 8); raise `UserError` if it is invalid or if other users may read it."""
     data = _read(path)
     if path.stat().st_mode & 0o077:
-        raise UserError(f"others may read the private key {path}: chmod 600 it, and make new keys if they have")
+        raise UserError(
+            f"other users may read the private key {path}: chmod 600 it, and make new keys if somebody has read it"
+        )
     try:
         from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 (an extra)
         from cryptography.hazmat.primitives.asymmetric import ed25519  # noqa: PLC0415
@@ -76,7 +78,7 @@ def load_private(path: Path) -> PrivateKey:
 
 
 def load_public(path: Path) -> PublicKey:
-    """Read an Ed25519 public key (PEM); raises `UserError`."""
+    """Read an Ed25519 public key (PEM); raise `UserError` if it is invalid."""
     data = _read(path)
     try:
         from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 (an extra)
@@ -101,7 +103,7 @@ def _read(path: Path) -> bytes:
 
 
 class KeyAgreement:
-    """One end of an agreement on a secret that nobody in between learns (X25519, RFC 7748); used for one session."""
+    """One end of an X25519 key agreement (RFC 7748), used for one session."""
 
     def __init__(self) -> None:
         from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey  # noqa: PLC0415 (an extra)
@@ -109,10 +111,10 @@ class KeyAgreement:
         self._key = X25519PrivateKey.generate()
         self.public = self._key.public_key().public_bytes_raw()
 
-    def secret(self, other: bytes, context: bytes) -> bytes | None:
-        """Give the 32 bytes shared with whoever has the public key `other`; None where that is no key.
+    def derive_secret(self, other: bytes, context: bytes) -> bytes | None:
+        """Return the 32 bytes shared with the owner of the public key `other`; None if `other` is not a valid key.
 
-        `context` is what both ends know: another one gives another secret (HKDF-SHA256, RFC 5869).
+        Both ends must use the same `context`, the info of HKDF-SHA256 (RFC 5869).
         """
         from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PublicKey  # noqa: PLC0415 (an extra)
         from cryptography.hazmat.primitives.hashes import SHA256  # noqa: PLC0415
@@ -120,21 +122,24 @@ class KeyAgreement:
 
         try:
             shared = self._key.exchange(X25519PublicKey.from_public_bytes(other))
-        except ValueError:  # of another length, or a point that gives the same secret to everybody
+        except ValueError:  # a wrong length, or a low-order point, with which every secret is the same
             return None
         return HKDF(SHA256(), SECRET_BYTES, None, context).derive(shared)
 
 
-def encrypt(secret: bytes, text: bytes, context: bytes) -> bytes:
-    """Encrypt and authenticate `text` (AES-256-GCM): 12 bytes nonce, then as many as `text` has, and 16 more."""
+def encrypt(secret: bytes, plaintext: bytes, context: bytes) -> bytes:
+    """Encrypt `plaintext` with AES-256-GCM: a nonce of 12 bytes, the ciphertext and a tag of 16 bytes.
+
+    `context` is authenticated as well.
+    """
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM  # noqa: PLC0415 (an extra)
 
     nonce = secrets.token_bytes(NONCE_BYTES)
-    return nonce + AESGCM(secret).encrypt(nonce, text, context)
+    return nonce + AESGCM(secret).encrypt(nonce, plaintext, context)
 
 
 def decrypt(secret: bytes, data: bytes, context: bytes) -> bytes | None:
-    """Undo `encrypt`; None for what is not authentic."""
+    """Decrypt the output of `encrypt`; return None if it is not authentic."""
     from cryptography.exceptions import InvalidTag  # noqa: PLC0415 (an extra)
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM  # noqa: PLC0415
 

@@ -1,1 +1,1 @@
-"""Frames on their way: H.264, the stamp in the pixels, encryption and path validation."""
+"""The video path: H.264, the stamp in the pixels, encryption and path validation."""

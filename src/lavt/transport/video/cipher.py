@@ -1,7 +1,8 @@
-"""What happens to the video's packets on their way: nothing, or SRTP under keys of this path alone.
+"""Encryption of the video's packets: none, or SRTP with keys that are used for one path only.
 
-The keys are made of the session's token, which only the two ends know where messages are signed, and of the challenge
-that opened the path: so every opening has fresh ones, for each direction its own, and counts packets from 0.
+The keys are derived from the session token, which only the two ends know where messages are signed, and from the
+challenge that opened the path. So each time the path is opened, each direction gets a new key and a packet index that
+starts at 0.
 """
 
 from __future__ import annotations
@@ -18,37 +19,37 @@ _LABELS: Final = {"server": b"LAVT 1 SRTP server to client", "client": b"LAVT 1 
 
 
 class Cipher(Protocol):
-    """Both directions of an open path, as one end has them."""
+    """Both directions of an open path, seen from one end."""
 
-    def authenticator(self, packet: bytes) -> bytes:
-        """Make what is sent of an RTP packet."""
+    def protect(self, packet: bytes) -> bytes:
+        """Return the datagram to send for an RTP packet."""
         ...
 
-    def protect_control(self, packet: bytes) -> bytes:
-        """Make what is sent of an RTCP packet."""
+    def protect_rtcp(self, packet: bytes) -> bytes:
+        """Return the datagram to send for an RTCP packet."""
         ...
 
-    def open(self, packet: bytes) -> bytes | None:
-        """Give the RTP packet of what came; None where it is not the other end's."""
+    def unprotect(self, packet: bytes) -> bytes | None:
+        """Return the RTP packet of a received datagram, or None if it is not from the other end."""
         ...
 
-    def open_control(self, packet: bytes) -> bytes | None:
-        """Give the RTCP packet of what came; None where it is not the other end's."""
+    def unprotect_rtcp(self, packet: bytes) -> bytes | None:
+        """Return the RTCP packet of a received datagram, or None if it is not from the other end."""
         ...
 
 
 NewCipher = Callable[[bytes, bytes], Cipher]
-"""Of the token and the challenge."""
+"""Makes a cipher from the token and the challenge."""
 
 
 class NoCipher:
-    """Leaves every packet as it is."""
+    """A cipher that leaves every packet unchanged."""
 
-    def authenticator(self, packet: bytes) -> bytes:
-        """Give the packet."""
+    def protect(self, packet: bytes) -> bytes:
+        """Return the packet."""
         return packet
 
-    protect_control = open = open_control = authenticator
+    protect_rtcp = unprotect = unprotect_rtcp = protect
 
 
 class SrtpCipher:
@@ -56,16 +57,20 @@ class SrtpCipher:
 
     def __init__(self, end: End, token: bytes, challenge: bytes) -> None:
         other: End = "client" if end == "server" else "server"
-        protector, unprotector = Protector(_key(end, token, challenge)), Unprotector(_key(other, token, challenge))
-        self.authenticator, self.protect_control = protector.protect, protector.protect_control
-        self.open, self.open_control = unprotector.unprotect, unprotector.unprotect_control
+        protector = Protector(_derive_key(end, token, challenge))
+        unprotector = Unprotector(_derive_key(other, token, challenge))
+        self.protect, self.protect_rtcp = protector.protect, protector.protect_rtcp
+        self.unprotect, self.unprotect_rtcp = unprotector.unprotect, unprotector.unprotect_rtcp
 
 
 def plain_cipher(_token: bytes, _challenge: bytes) -> Cipher:
-    """Make the cipher of a path where nothing is encrypted."""
+    """Return the cipher of a path without encryption."""
     return NoCipher()
 
 
-def _key(sender: End, token: bytes, challenge: bytes) -> bytes:
-    """Derive the key of a direction: the token is as good as random, so one step of HMAC-SHA256 will do (RFC 5869)."""
+def _derive_key(sender: End, token: bytes, challenge: bytes) -> bytes:
+    """Derive the key of one direction.
+
+    The token is as good as random, so one step of HMAC-SHA256 is enough (RFC 5869).
+    """
     return hmac.digest(token, _LABELS[sender] + challenge, "sha256")[:KEY_BYTES]

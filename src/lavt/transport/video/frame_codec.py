@@ -1,7 +1,7 @@
-"""How a picture gets its stamp, becomes an access unit, and comes back: as H.264, or in virtual time by a shorter way.
+"""Codecs that stamp a picture, encode it as an access unit and decode it: H.264, and two shortcuts for virtual time.
 
-What stands for H.264 on the two shorter ways is one small access unit that needs no other: RTP packets, order, delay
-and loss act on it as on video. It is text, which holds neither a start code nor a zero byte.
+A shortcut replaces H.264 by one small access unit that depends on no other. RTP packets, order, delay and loss affect
+it as they affect video. Its content is text, so it contains neither a start code nor a zero byte.
 """
 
 from __future__ import annotations
@@ -14,74 +14,74 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lavt.domain import Lane, Picture, SeenLane, Sight
+from lavt.domain import FramePayload, Lane, Picture, SeenLane
 from lavt.errors import BadPacket
 from lavt.transport.video.h264 import DecodedPicture, Decoder, Encoder
 from lavt.transport.video.stamp import STAMP_PX, read_stamp, write_stamp, write_stamp_i420
 from lavt.value import value
 
-_STANDS_ALONE: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
+_IDR_PREFIX: Final = b"\x00\x00\x00\x01\x09\xf0\x00\x00\x00\x01\x65"
 """An access unit delimiter, and the header of a slice that refers to nothing (H.264, table 7-1)."""
 _LANE: Final = struct.Struct("!Qq7d")
 Planes = NDArray[np.uint8]
-"""A picture in I420: (height * 3 / 2, width), the luma first."""
-LEAST_BIT_RATE_BPS: Final = 50_000
-"""Whatever is asked for: below it is no picture that anybody could drive by."""
-CHECKED_ROWS: Final = 16
-KEPT_PICTURES: Final = 300
-"""Pictures that are on their way at most: 10 s of them at 30 Hz, and 280 MB."""
+"""A picture in I420: (height * 3 / 2, width), luma first."""
+MIN_BIT_RATE_BPS: Final = 50_000
+"""Lower limits are raised to this one: below it nobody could drive by the picture."""
+CHECKSUM_ROW_STEP: Final = 16
+MAX_STORED_PICTURES: Final = 300
+"""Most pictures in transit: 10 s at 30 Hz, and 280 MB."""
 
 
 class ReceivedPicture(Protocol):
-    """What came of an access unit."""
+    """A picture decoded from an access unit."""
 
     @property
-    def picture(self) -> Sight:
-        """What a detector looks at; it may be made only now."""
+    def picture(self) -> FramePayload:
+        """The picture for a detector; it may be converted only on access."""
         ...
 
     @property
     def corrupt(self) -> bool:
-        """Parts of it were made up."""
+        """True if the decoder had to conceal parts of the picture."""
         ...
 
 
 class PictureSender(Protocol):
-    """The camera's end."""
+    """The codec at the camera's end."""
 
-    def prepare(self, picture: Sight) -> tuple[Sight, int]:
-        """Give what the stamp goes into, and a number that tells the picture, without it, from the one before."""
+    def prepare(self, picture: FramePayload) -> tuple[FramePayload, int]:
+        """Return the picture to stamp, and a checksum by which unstamped pictures can be told apart."""
         ...
 
-    def write_stamp(self, prepared: Sight, stamp_ns: int) -> Sight:
-        """Put the stamp into the picture, in place where it is pixels, and return it."""
+    def write_stamp(self, prepared: FramePayload, stamp_ns: int) -> FramePayload:
+        """Write the stamp into the picture, in place if it consists of pixels, and return it."""
         ...
 
-    def encode(self, stamped: Sight, *, keyframe: bool) -> bytes:
-        """Make an access unit of a stamped picture; a keyframe where one is asked for."""
+    def encode(self, stamped: FramePayload, *, keyframe: bool) -> bytes:
+        """Encode a stamped picture as an access unit, on request as a keyframe."""
         ...
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """Keep to a bit rate from the next picture on, where what is sent has one; None: to its own."""
+        """Limit the bit rate from the next picture on, if the codec has one; None: use the configured one."""
         ...
 
 
 class PictureReceiver(Protocol):
-    """The driver's end."""
+    """The codec at the driver's end."""
 
     def decode(self, access_unit: bytes) -> ReceivedPicture | None:
-        """Give the picture of an access unit; None when there is none."""
+        """Return the picture of an access unit, or None if it gives none."""
         ...
 
     def read_stamp(self, received: Any) -> int:
-        """Read the stamp of what `decode` gave; raises `BadPacket` for a picture that cannot be looked at."""
+        """Read the stamp of a decoded picture; raises `BadPacket` for a picture that cannot have one."""
         ...
 
 
 class VideoSender:
-    """Converts pictures to I420 in a buffer that is used again, stamps them there, and encodes them as H.264.
+    """An H.264 sender that converts pictures to I420 in a reused buffer, stamps them there and encodes them.
 
-    Those of a camera that gives I420 itself are stamped and encoded where they are.
+    Pictures that a camera delivers in I420 are stamped and encoded in place.
     """
 
     def __init__(self, encoder: Encoder) -> None:
@@ -89,12 +89,12 @@ class VideoSender:
         self._bit_rate_bps = encoder.bit_rate_bps
 
     def prepare(self, picture: Picture) -> tuple[Planes, int]:
-        """Convert the picture where it is not in I420 already; the number is a CRC-32 of its luma below the stamp.
+        """Convert the picture to I420 unless it is; the checksum is a CRC-32 of its luma below the stamp.
 
-        That of every sixteenth row: a live camera's noise is in each of them, and a frozen one's pixels change in none.
+        It covers every sixteenth row: a live camera's noise changes each row, and a frozen camera's rows never change.
         """
         planes = picture if picture.ndim == 2 else self._encoder.to_planes(picture)
-        return planes, zlib.crc32(planes[STAMP_PX : planes.shape[0] * 2 // 3 : CHECKED_ROWS].tobytes())
+        return planes, zlib.crc32(planes[STAMP_PX : planes.shape[0] * 2 // 3 : CHECKSUM_ROW_STEP].tobytes())
 
     def write_stamp(self, prepared: Planes, stamp_ns: int) -> Planes:
         """Write the stamp into the planes."""
@@ -106,15 +106,15 @@ class VideoSender:
         return self._encoder.encode_planes(stamped, keyframe=keyframe)
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """Keep to the lower one of the limit and the encoder's own bit rate, and to the least one at least."""
+        """Use the lower of the limit and the configured bit rate, but at least `MIN_BIT_RATE_BPS`."""
         wanted_bps = self._bit_rate_bps if limit_bps is None else min(limit_bps, self._bit_rate_bps)
-        self._encoder.set_bit_rate(max(wanted_bps, LEAST_BIT_RATE_BPS))
+        self._encoder.set_bit_rate(max(wanted_bps, MIN_BIT_RATE_BPS))
 
 
 class VideoReceiver:
-    """Decodes H.264; pictures must be of the `shape` that was configured, (height, width); None: of any.
+    """An H.264 receiver for pictures of the configured `shape`, (height, width); None: of any shape.
 
-    `read` reads the stamp from the luma: `read_stamp`, or `read_clear_stamp` for a check that is weaker.
+    `read` reads the stamp from the luma: `read_stamp`, or `read_clear_stamp` if the check of the stamp is weaker.
     """
 
     def __init__(
@@ -135,22 +135,22 @@ class VideoReceiver:
         """Read the stamp from the luma."""
         if self._shape is not None and received.luma.shape != self._shape:
             height_px, width_px = received.luma.shape
-            raise BadPacket(f"a picture of {width_px} x {height_px} pixels, which is not what was configured")
+            raise BadPacket(f"a picture of {width_px} x {height_px} pixels: not the configured size")
         return self._read(received.luma)
 
 
 @value
 class RenderedPicture:
-    """A picture as it was rendered."""
+    """A received picture that is exactly the rendered one."""
 
     picture: Picture
     corrupt: bool = False
 
 
 class InMemoryFrameCodec:
-    """Both ends for pictures as they were rendered: the access unit is a key, the pixels wait here until it arrives.
+    """Both ends of a codec that keeps the rendered pictures in memory; the access unit is a key to them.
 
-    Access units arrive in order: what is older than one that arrived was lost, and goes.
+    Access units arrive in order, so pictures older than the one that arrived were lost and are dropped.
     """
 
     def __init__(self) -> None:
@@ -158,9 +158,9 @@ class InMemoryFrameCodec:
         self._key = 0
 
     def prepare(self, picture: Picture) -> tuple[Picture, int]:
-        """Take the picture itself: a camera that gives the same buffer again gives it with its stamp.
+        """Return the picture itself, with a CRC-32 of the pixels around the stamp.
 
-        The number is a CRC-32 of the pixels around the stamp.
+        The stamp's pixels are left out because a camera that reuses its buffer delivers it with the previous stamp.
         """
         crc = zlib.crc32(np.ascontiguousarray(picture[STAMP_PX:]).data)
         return picture, zlib.crc32(np.ascontiguousarray(picture[:STAMP_PX, STAMP_PX:]).data, crc)
@@ -171,74 +171,77 @@ class InMemoryFrameCodec:
         return prepared
 
     def encode(self, stamped: Picture, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
-        """Keep a copy of the picture, as a camera may use its buffer again, and give its key."""
+        """Store a copy of the picture, as the camera may reuse its buffer, and return its key."""
         self._key += 1
         self._pictures[self._key] = stamped.copy()
-        self._pictures.pop(self._key - KEPT_PICTURES, None)
-        return _STANDS_ALONE + str(self._key).encode()
+        self._pictures.pop(self._key - MAX_STORED_PICTURES, None)
+        return _IDR_PREFIX + str(self._key).encode()
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """There is none."""
+        """Do nothing: this codec has no bit rate."""
 
     def decode(self, access_unit: bytes) -> RenderedPicture | None:
-        """Give the picture of a key."""
-        text = access_unit.removeprefix(_STANDS_ALONE)
+        """Return the picture of a key, once."""
+        text = access_unit.removeprefix(_IDR_PREFIX)
         key = int(text) if text.isdigit() else 0
         picture = self._pictures.get(key)
         if picture is None:
             return None
-        self._pictures = {each: kept for each, kept in self._pictures.items() if each > key}
+        self._pictures = {each: stored for each, stored in self._pictures.items() if each > key}
         return RenderedPicture(picture)
 
     def read_stamp(self, received: RenderedPicture) -> int:
-        """Read the stamp: black and white are so in each colour, green is as good as luma."""
+        """Read the stamp from the green channel: black and white are the same in each colour."""
         return read_stamp(received.picture[:, :, 1])
 
 
 @value
 class ReceivedLane:
-    """A lane that came in the place of a picture."""
+    """A lane that was received instead of a picture."""
 
     picture: SeenLane
     corrupt: bool = False
 
 
 class LaneSender:
-    """Puts the lane itself into the access unit, with its stamp and time: no pixels."""
+    """A sender that writes the lane itself, with its stamp and time, into the access unit: no pixels."""
 
     def prepare(self, picture: SeenLane) -> tuple[SeenLane, int]:
-        """Take its time for the number: the noise of two differs, even where the car stands; these differ by time."""
+        """Return the lane, with its time as the checksum.
+
+        Real pictures differ by their noise even when the car is stationary; lanes differ by their time.
+        """
         return picture, picture.at_ns & 0xFFFFFFFF
 
     def write_stamp(self, prepared: SeenLane, stamp_ns: int) -> SeenLane:
-        """Give the same with the stamp."""
+        """Return a copy of the lane with the stamp."""
         return SeenLane(stamp_ns, prepared.at_ns, prepared.lane)
 
     def encode(self, stamped: SeenLane, *, keyframe: bool) -> bytes:  # noqa: ARG002 (each one is)
-        """Write it in hexadecimal digits."""
-        return _STANDS_ALONE + _packed(stamped).hex().encode()
+        """Encode the lane in hexadecimal digits."""
+        return _IDR_PREFIX + _pack(stamped).hex().encode()
 
     def limit_bit_rate(self, limit_bps: int | None) -> None:
-        """There is none."""
+        """Do nothing: this codec has no bit rate."""
 
 
 class LaneReceiver:
-    """Takes a lane out of its access unit."""
+    """A receiver that reads a lane from its access unit."""
 
     def decode(self, access_unit: bytes) -> ReceivedLane | None:
-        """Read the digits; None where they are not those of a lane."""
+        """Decode a lane; None if the access unit does not contain one."""
         try:
-            packed = bytes.fromhex(access_unit.removeprefix(_STANDS_ALONE).decode())
+            packed = bytes.fromhex(access_unit.removeprefix(_IDR_PREFIX).decode())
             stamp_ns, at_ns, c0, c1, c2, *rest = _LANE.unpack(packed)
         except (ValueError, struct.error):
             return None
         return ReceivedLane(SeenLane(stamp_ns, at_ns, Lane((c0, c1, c2), *rest)))
 
     def read_stamp(self, received: ReceivedLane) -> int:
-        """Give the stamp."""
+        """Return the stamp."""
         return received.picture.stamp_ns
 
 
-def _packed(seen: SeenLane) -> bytes:
+def _pack(seen: SeenLane) -> bytes:
     lane = seen.lane
     return _LANE.pack(seen.stamp_ns, seen.at_ns, *lane.centre, lane.width_m, lane.near_m, lane.far_m, lane.confidence)

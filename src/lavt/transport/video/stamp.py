@@ -1,9 +1,9 @@
-"""The send time of a frame, inside its pixels.
+"""The stamp: the send time of a frame, written into its pixels.
 
-64 bits, nanoseconds of the server's wall clock just before encoding, as 8 x 8 cells of 8 x 8 pixels in the top left
-corner, row by row, most significant bit first, white for 1. The cells lie on the grid of H.264's transform, so the
-stamp survives a low bit rate. A picture that the decoder had to make up carries a stamp that looks right and is not;
-the frame's RTP timestamp, which says the same time in 90 kHz ticks, tells them apart.
+The stamp has 64 bits: nanoseconds of the server's wall clock just before encoding. It is 8 x 8 cells of 8 x 8 pixels in
+the top left corner, row by row, most significant bit first, white for 1. The cells lie on the grid of H.264's
+transform, so the stamp survives a low bit rate. A concealed picture may carry a stamp that is readable and wrong; the
+frame's RTP timestamp, which gives the same time in 90 kHz ticks, shows it.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _CELL_PX = STAMP_PX // _CELLS
 _CENTRE = slice(_CELL_PX // 4, _CELL_PX - _CELL_PX // 4)
 _CENTRE_PIXELS = (_CELL_PX // 2) ** 2
 _THRESHOLD = 128
-_BLACK_BELOW, _WHITE_ABOVE = 64, 192  # far from both is what a codec makes of a cell
+_BLACK_BELOW, _WHITE_ABOVE = 64, 192  # a codec leaves the cells of a stamp far from both thresholds
 
-_BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), what OpenCV makes of 0 and 255
+_BLACK, _WHITE, _NEUTRAL = 16, 235, 128  # limited range (ITU-R BT.601), to which OpenCV converts 0 and 255
 _CLEARLY_BLACK, _CLEARLY_WHITE = _BLACK + (_WHITE - _BLACK) // 3, _WHITE - (_WHITE - _BLACK) // 3
 _INNERMOST = (_CELL_PX // 2 - 1, _CELL_PX // 2)
-"""Row and column, from the corner of a cell, of two of the pixels in its middle."""
+"""Offset from the corner of a cell, in rows and columns alike, of two of the pixels in its middle."""
 _UNCLEAR = b"?"
 _DIGITS = b"0" * (_CLEARLY_BLACK + 1) + _UNCLEAR * (_CLEARLY_WHITE - _CLEARLY_BLACK - 1) + b"1" * (256 - _CLEARLY_WHITE)
-"""For each luma the digit of a cell that has it."""
+"""The digit of a cell for each luma."""
 _BITS_OF_BYTE = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _LUMA_OF_BYTE = np.where(_BITS_OF_BYTE, _WHITE, _BLACK).astype(np.uint8).repeat(_CELL_PX, axis=1)
 """(256, STAMP_PX): one row of pixels for each byte of a stamp."""
@@ -64,9 +64,9 @@ def write_stamp_luma(luma: NDArray[np.uint8], stamp_ns: int) -> None:
 
 
 def write_stamp_i420(planes: NDArray[np.uint8], stamp_ns: int) -> None:
-    """Write `stamp_ns` into the top left corner of an I420 picture, in place: what `write_stamp` and cv2 would make.
+    """Write `stamp_ns` into the top left corner of an I420 picture, in place, as `write_stamp` and cv2 would.
 
-    `planes` is (height * 3 // 2, width) as OpenCV has it, sides even: luma, then the U and the V plane, each
+    `planes` is (height * 3 // 2, width) as in OpenCV, with even sides: luma, then the U and the V plane, each
     (height / 2, width / 2) without gaps between its rows. Raises `UserError` for a picture that is too small and
     `ValueError` for an array with gaps.
     """
@@ -78,7 +78,7 @@ def write_stamp_i420(planes: NDArray[np.uint8], stamp_ns: int) -> None:
 
 
 def _check_room(height: int, width: int) -> None:
-    """Raise `UserError` where the stamp has no room."""
+    """Raise `UserError` for a picture that is smaller than the stamp."""
     if height < STAMP_PX or width < STAMP_PX:
         raise UserError(f"a picture must be at least {STAMP_PX} x {STAMP_PX} pixels for the stamp; use a larger one")
 
@@ -86,12 +86,12 @@ def _check_room(height: int, width: int) -> None:
 def read_stamp(luma: NDArray[np.uint8]) -> int:
     """Read the stamp from the luma plane (height, width) of a decoded picture.
 
-    Two pixels in the middle of each cell tell it, where all are clear, else the mean of its centre half.
-    What it returns is only a claim until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too
-    small to hold a stamp, and for what is no plane.
+    Two pixels in the middle of each cell decide if all of them are clear, else the mean of each cell's centre half.
+    The result is not trusted until `stamp_agrees` has confirmed it. Raises `BadPacket` for a picture that is too small
+    for a stamp, and for an array that is not a plane.
     """
     _check_plane(luma)
-    # Nearly always they are clear; summing takes five times as long.
+    # The pixels are nearly always clear; summing takes five times as long.
     one, other = (luma[at:STAMP_PX:_CELL_PX, at:STAMP_PX:_CELL_PX].tobytes().translate(_DIGITS) for at in _INNERMOST)
     if one == other and _UNCLEAR not in one:
         return int(one, 2)
@@ -99,10 +99,10 @@ def read_stamp(luma: NDArray[np.uint8]) -> int:
 
 
 def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
-    """Read the stamp as `read_stamp` does, but only where each cell is clearly black or clearly white.
+    """Read the stamp as `read_stamp` does, but only if each cell is clearly black or clearly white.
 
-    For a check that is weaker than `stamp_agrees`: a cell that is half old and half new is no cell. Raises `BadPacket`
-    where a cell is in the middle third between black and white, too.
+    Checks that are weaker than `stamp_agrees` need this: it rejects a cell that is half old and half new. Raises
+    `BadPacket` also if a cell is in the middle third between black and white.
     """
     sums = _cell_sums(luma)
     white = sums > _CLEARLY_WHITE * _CENTRE_PIXELS
@@ -112,7 +112,7 @@ def read_clear_stamp(luma: NDArray[np.uint8]) -> int:
 
 
 def _cell_sums(luma: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Sum the pixels in the centre half of each cell, (8, 8)."""
+    """Return the sum of the pixels in the centre half of each cell, (8, 8)."""
     _check_plane(luma)
     cells = luma[:STAMP_PX, :STAMP_PX].reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
     sums: NDArray[np.uint16] = cells[:, _CENTRE, :, _CENTRE].sum(axis=(1, 3), dtype=np.uint16)
@@ -121,15 +121,15 @@ def _cell_sums(luma: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 def _check_plane(luma: NDArray[np.uint8]) -> None:
     if luma.ndim != 2 or min(luma.shape) < STAMP_PX:
-        raise BadPacket(f"a picture of shape {luma.shape} holds no stamp")
+        raise BadPacket(f"a picture of shape {luma.shape} has no room for a stamp")
 
 
 def _number(white: NDArray[np.bool_]) -> int:
     return int.from_bytes(np.packbits(white).tobytes(), "big")
 
 
-def holds_stamp(picture_bgr: Picture) -> bool:
-    """Tell whether a picture, (height, width, 3), looks as if it carries a stamp: 64 cells, each black or white."""
+def has_stamp(picture_bgr: Picture) -> bool:
+    """Return whether a picture, (height, width, 3), seems to carry a stamp: 64 cells, each black or white."""
     if picture_bgr.shape[0] < STAMP_PX or picture_bgr.shape[1] < STAMP_PX:
         return False
     corner = picture_bgr[:STAMP_PX, :STAMP_PX].mean(axis=2).reshape(_CELLS, _CELL_PX, _CELLS, _CELL_PX)
@@ -139,13 +139,13 @@ def holds_stamp(picture_bgr: Picture) -> bool:
 
 
 def rtp_timestamp(stamp_ns: int) -> int:
-    """Give the RTP timestamp of a frame stamped `stamp_ns`: 90 kHz ticks, modulo 2^32 (RFC 6184, section 5.1)."""
+    """Return the RTP timestamp of a frame stamped `stamp_ns`: 90 kHz ticks, modulo 2^32 (RFC 6184, section 5.1)."""
     return stamp_ns * _RTP_CLOCK_HZ_BY_10000 // _NS_PER_S_BY_10000 % 2**32
 
 
 def stamp_agrees(stamp_ns: int, rtp_timestamp_of_frame: int) -> bool:
-    """Tell whether a stamp read from a picture and the RTP timestamp of its packets say the same time.
+    """Return whether a stamp read from a picture and the RTP timestamp of its packets are the same time.
 
-    Two stamps that differ agree with the same timestamp only when less than 12 us, or a multiple of 13.3 h, apart.
+    Two different stamps agree with the same timestamp only if they are less than 12 us, or a multiple of 13.3 h, apart.
     """
     return rtp_timestamp(stamp_ns) == rtp_timestamp_of_frame

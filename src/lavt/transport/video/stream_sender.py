@@ -1,11 +1,11 @@
-"""A video stream as its sender has it: packets, as many repair packets as it needs, reports, and what comes back."""
+"""Sender of a video stream: media packets, repair packets as needed, sender reports, and the receiver's feedback."""
 
 from __future__ import annotations
 
 from typing import Final
 
 from lavt.domain import NS_PER_MS, Now
-from lavt.transport.rtp.fec import RepairChooser, RepairSender
+from lavt.transport.rtp.fec import RedundancyController, RepairSender
 from lavt.transport.rtp.rtcp import BitRateLimit, Feedback, ReceptionReport, sender_report
 from lavt.transport.rtp.rtcp_xr import ReferenceAnswer, ReferenceTime
 from lavt.transport.rtp.rtp import MAX_PACKET_BYTES, RTP_HEADER_BYTES, Packetizer
@@ -13,24 +13,24 @@ from lavt.transport.video.stamp import rtp_timestamp
 from lavt.value import value
 
 REPORT_PERIOD_NS: Final = 500 * NS_PER_MS
-"""Of sender reports; RFC 3550 (6.2) allows what is a small share of the stream."""
+"""Period of sender reports; RFC 3550 (6.2) allows reports that are a small share of the stream."""
 
 
 @value
 class FramePackets:
-    """The datagrams of a frame. Plain receivers are sent `media` and `report`, which every tool understands."""
+    """The datagrams of a frame. Plain receivers get only `media` and `report`, which every tool understands."""
 
     media: list[bytes]
     repair: list[bytes]
     report: list[bytes]
-    """A sender report, where one is due."""
+    """A sender report, if one is due."""
 
 
 class StreamSender:
-    """Makes the datagrams of one stream, and hears what its receiver says.
+    """A sender that makes the datagrams of one stream and handles its receiver's feedback.
 
-    `repair_packets` is how many each block of a frame gets; None: as many as the reported loss asks for. Public:
-    `bit_rate_limit_bps`, what the receiver asks the encoder to keep to, None where it asks nothing.
+    `repair_packets` is the number for each block of a frame; None: it follows the reported loss. Public:
+    `bit_rate_limit_bps`, the receiver's limit for the encoder, or None.
     """
 
     def __init__(self, packetizer: Packetizer, repairs: RepairSender, repair_packets: int | None = None) -> None:
@@ -42,17 +42,17 @@ class StreamSender:
         self.forget_receiver()
 
     def forget_receiver(self) -> None:
-        """Another receiver begins: what was heard is of the one before."""
+        """Discard the feedback of the previous receiver, since another one begins."""
         self.bit_rate_limit_bps: int | None = None
-        self._chooser = RepairChooser()
+        self._redundancy = RedundancyController()
         self._reported: ReceptionReport | None = None
         self._reference: tuple[ReferenceTime, int] | None = None
 
     def packets(self, access_unit: bytes, stamp_ns: int, now: Now) -> FramePackets:
-        """Make the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
+        """Return the datagrams of a frame that was stamped at `stamp_ns` of the wall clock."""
         timestamp = rtp_timestamp(stamp_ns)
         media = self._packetizer.packetize(access_unit, timestamp)
-        count = self._chooser.count(now.mono_ns) if self._repair_packets is None else self._repair_packets
+        count = self._redundancy.repair_packets(now.mono_ns) if self._repair_packets is None else self._repair_packets
         repair = self._repairs.repair(media, count) if count else []
         self._packets += len(media)
         self._octets += sum(map(len, media)) - RTP_HEADER_BYTES * len(media)
@@ -62,45 +62,50 @@ class StreamSender:
             report.append(self._report(now))
         return FramePackets(media, repair, report)
 
-    def hear(self, feedback: Feedback, now_ns: int) -> None:
-        """Take in what the receiver says."""
+    def receive_feedback(self, feedback: Feedback, now_ns: int) -> None:
+        """Handle feedback of the receiver."""
         ssrc = self._packetizer.ssrc
         for report in feedback.reports:
             if report.media_ssrc == ssrc:
-                self._note_reception(report, now_ns)
+                self._note_loss(report, now_ns)
         for limit in feedback.limits:
             if limit.media_ssrc == ssrc:
-                self.bit_rate_limit_bps = _of_payload(limit)
+                self.bit_rate_limit_bps = _payload_bit_rate_bps(limit)
         if feedback.reference_times:
             self._reference = feedback.reference_times[-1], now_ns
 
     def _report(self, now: Now) -> bytes:
-        """Write a sender report: which wall time belongs to which RTP timestamp, now (RFC 3550, section 6.4.1)."""
+        """Write a sender report: the current wall time and the RTP timestamp of it (RFC 3550, section 6.4.1)."""
         answers = []
         if self._reference is not None:
-            reference, came_ns = self._reference
-            answers.append(ReferenceAnswer(reference.receiver_ssrc, reference.time, now.mono_ns - came_ns))
+            reference, arrived_ns = self._reference
+            answers.append(ReferenceAnswer(reference.receiver_ssrc, reference.time, now.mono_ns - arrived_ns))
             self._reference = None
         ssrc = self._packetizer.ssrc
         return sender_report(
-            ssrc, wall_ns=now.wall_ns, rtp_timestamp=rtp_timestamp(now.wall_ns), packets=self._packets,
-            octets=self._octets, cname=f"{ssrc:08x}@lavt", answered=answers,
-        )  # fmt: skip
+            ssrc,
+            wall_ns=now.wall_ns,
+            rtp_timestamp=rtp_timestamp(now.wall_ns),
+            packets=self._packets,
+            octets=self._octets,
+            cname=f"{ssrc:08x}@lavt",
+            answered=answers,
+        )
 
-    def _note_reception(self, report: ReceptionReport, now_ns: int) -> None:
-        """Take the losses between two reports; the first one, and one that is out of order, is between none."""
+    def _note_loss(self, report: ReceptionReport, now_ns: int) -> None:
+        """Note the losses between two reports; the first report, and one that is out of order, adds none."""
         last, self._reported = self._reported, report
         if last is None:
             return
         expected = (report.highest_sequence - last.highest_sequence) % 2**32
         if 0 < expected < 2**31:
             lost = min(max(report.cumulative_lost - last.cumulative_lost, 0), expected)
-            self._chooser.note(lost, expected, now_ns)
+            self._redundancy.note_loss(lost, expected, now_ns)
         elif expected:
             self._reported = last
 
 
-def _of_payload(limit: BitRateLimit) -> int:
-    """Give the bit rate of the payload within a limit that counts the headers of each packet."""
+def _payload_bit_rate_bps(limit: BitRateLimit) -> int:
+    """Return the bit rate of the payload within a limit that counts the headers of each packet."""
     payload_bytes = MAX_PACKET_BYTES - RTP_HEADER_BYTES
     return limit.bit_rate_bps * payload_bytes // (payload_bytes + limit.overhead_bytes)

@@ -1,1 +1,1 @@
-"""Drive-by-wire on CAN: messages and their CRC (`docs/can.md`)."""
+"""The adapter for drive-by-wire kits on CAN, with their messages (`docs/can.md`)."""

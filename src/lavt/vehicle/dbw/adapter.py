@@ -1,4 +1,4 @@
-"""The by-wire adapter, sans-IO: frames and `now` in, frames out. Its states are in `states.py`."""
+"""The by-wire adapter, sans-IO: it takes frames and times and returns frames. `states.py` has its state machine."""
 
 from __future__ import annotations
 
@@ -21,158 +21,158 @@ from lavt.vehicle.dbw.profile import (
 )
 from lavt.vehicle.dbw.reports import NewestReports
 from lavt.vehicle.dbw.sending import DriveCommand, FrameSender, KitCommands
-from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STATIONARY_BELOW_MPS, Situation, State, following
+from lavt.vehicle.dbw.states import ENABLING_LIMIT_NS, STATIONARY_BELOW_MPS, Situation, State, next_state
 from lavt.vehicle.vehicle import ReachedCommand
 
-SHIFT_NS: Final = NS_PER_S
-"""Ours: a shift that was begun may be reported so late."""
-STOOD_NS: Final = 300 * NS_PER_MS
-"""Ours: the car is reported to stand for so long before PARK is asked for. One report may be wrong, or of wheels that
-lock; at 4 m/s2 a car that still slides is 1.2 m/s slower by then."""
-LOOK_NS: Final = 100 * NS_PER_MS
-"""So often the adapter wants to be called when nothing else is due."""
+SHIFT_REPORT_LIMIT_NS: Final = NS_PER_S
+"""Our choice: a shift may be reported this long after it began."""
+STATIONARY_BEFORE_PARK_NS: Final = 300 * NS_PER_MS
+"""Our choice: PARK is requested after the car was reported stationary for this long. A single report may be wrong, or
+come from locked wheels; at 4 m/s2 a car that still slides is 1.2 m/s slower by then."""
+IDLE_PERIOD_NS: Final = 100 * NS_PER_MS
+"""Call period of the adapter when nothing else is due."""
 ECHO_LIMIT_NS: Final = 200 * NS_PER_MS
-"""A command that the kit has not reported for so long was overtaken by another."""
+"""A command that the kit has not reported for this long was superseded by another."""
 SEPARATOR: Final = "; "
 NO_AXES: Final[frozenset[Axis]] = frozenset()
 
 
 class ByWireAdapter:
-    """Speaks to one by-wire kit by a profile.
+    """A controller for one by-wire kit, described by a profile.
 
-    A tick is a call of `ask`; frames leave only while the newest is at most 60 ms old. `inhibit_reason` is of the
-    installation: where it is not empty, the kit is never engaged.
+    Each call of `set_actuation` is a tick; frames are sent only while the newest tick is at most 60 ms old.
+    `inhibit_reason` is a property of the installation: unless it is empty, the kit is never engaged.
     """
 
     def __init__(self, profile: Profile, *, start_ns: int, inhibit_reason: str = "") -> None:
         self._profile = profile
         self._reports, self._sender = NewestReports(profile, start_ns), FrameSender(profile, start_ns)
-        signless = "the steering's sign is not known: set vehicle.dbw.steering_sign"
-        self._installation = _joined([inhibit_reason, signless if profile.car.steering_sign is None else ""])
+        unknown_sign = "the steering's sign is not known: set vehicle.dbw.steering_sign"
+        self._installation = _join([inhibit_reason, unknown_sign if profile.car.steering_sign is None else ""])
         self._state: State = "idle"
         self._entered_ns = self._now_ns = start_ns
-        self._why = ""
-        """Why the state is lost or overridden."""
-        self._wanted, self._gone = False, ""
-        self._kept: frozenset[Axis] = NO_AXES
-        """Axes that were enabled when driving ended, and still are."""
+        self._stop_reason = ""
+        """Reason for the state `lost` or `overridden`."""
+        self._wanted, self._bus_error = False, ""
+        self._still_enabled: frozenset[Axis] = NO_AXES
+        """Axes that were enabled when driving ended and still are."""
         self._moved_ns = start_ns
-        """When the car was last reported to move."""
+        """Time of the last report that the car moves."""
         self._is_shifting = False
-        """DRIVE was asked for, and is not reported yet: PARK that is reported is none to rely on."""
+        """DRIVE was requested and is not reported yet, so that a report of PARK is not reliable."""
         self._requested = Actuation(0.0, 0.0, 0.0)
         self._requested_ns: int | None = None
-        self._plan: KitCommands | None = None
-        """What the last set said; None: nothing is being said."""
+        self._last_commands: KitCommands | None = None
+        """Commands of the last set; None: nothing is being sent."""
         self._is_late = False
-        self._told: frozenset[str] = frozenset()
+        self._known_problems: frozenset[str] = frozenset()
         self._events: list[VehicleEvent] = []
-        self._echoes: deque[tuple[int, int]] = deque()
-        """Steering commands sent and not yet seen in a report: in its steps, and when they were asked for."""
-        self._expected: int | None = None
-        """The steering command of the last set, in its steps; None: it had none."""
+        self._awaited_echoes: deque[tuple[int, int]] = deque()
+        """Steering commands sent and not yet reported, in steps of the kit, with the times of their request."""
+        self._last_steering: int | None = None
+        """The steering command of the last set, in steps of the kit; None if it had none."""
         self._reached: list[ReachedCommand] = []
         self._counts: Counter[str] = Counter()
-        self._seen = self._situation(start_ns)
-        """What the table of states looked at last."""
+        self._situation = self._current_situation(start_ns)
+        """The last input of the state machine."""
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing is asked of the kit: it has let go, or a driver has the car."""
+        """Whether nothing is requested of the kit: it is released, or a driver overrides it."""
         return self._state in {"idle", "overridden"}
 
-    # What comes in.
+    # Inputs.
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
-        """Take a frame from the bus, whatever it is."""
-        self._gone = ""
+        """Process any frame from the bus."""
+        self._bus_error = ""
         before = self._reports.command
         self._reports.receive(frame, now_ns)
         if self._reports.command != before:
-            self._echo(now_ns)
-        self._settle(now_ns)
+            self._match_echo(now_ns)
+        self._update_state(now_ns)
 
-    def bus_gone(self, why: str, now_ns: int) -> None:
-        """Hear from the port that the bus is gone; it is back when a frame comes."""
-        self._gone = why
-        self._settle(now_ns)
+    def on_bus_gone(self, reason: str, now_ns: int) -> None:
+        """Note that the bus is gone; the next frame ends this condition."""
+        self._bus_error = reason
+        self._update_state(now_ns)
 
-    def ask(self, actuation: Actuation, now_ns: int) -> None:
-        """Take what the car is to do: a tick. What is no number is dropped and counted, and is no tick."""
+    def set_actuation(self, actuation: Actuation, now_ns: int) -> None:
+        """Set the requested actuation: a tick. Non-finite values are dropped and counted, and are no tick."""
         if not all(map(math.isfinite, (actuation.steering_rad, actuation.throttle, actuation.brake))):
             self._counts["actuations_rejected"] += 1
             return
         self._requested, self._requested_ns = actuation, now_ns
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Hear whether somebody wants to drive."""
+        """Note whether driving is wanted."""
         if wanted != self._wanted:
             self._wanted = wanted
-            self._settle(now_ns)
+            self._update_state(now_ns)
 
-    # States.
+    # State machine.
 
-    def _settle(self, now_ns: int) -> None:
-        """Go from state to state until none follows."""
+    def _update_state(self, now_ns: int) -> None:
+        """Apply transitions until none matches."""
         self._now_ns = now_ns
-        is_silent = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
-        still_enabled = NO_AXES if is_silent else self._reports.enabled  # reports may have waited for us
-        self._kept &= still_enabled
+        has_timed_out = now_ns - self._sender.sent_ns >= COMMAND_TIMEOUT_NS
+        still_enabled = NO_AXES if has_timed_out else self._reports.enabled  # reports may have waited for us
+        self._still_enabled &= still_enabled
         self._is_shifting &= self._reports.gear != "drive"
         if not self._is_stationary():
             self._moved_ns = now_ns
-        self._tell(now_ns)
+        self._record_new_problems(now_ns)
         while True:
-            self._seen = self._situation(now_ns)
-            state, why = following(self._state, self._seen)
+            self._situation = self._current_situation(now_ns)
+            state, reason = next_state(self._state, self._situation)
             if state == self._state:
                 return
             if state in {"lost", "overridden"}:
-                self._why = why
-                if not self._told.issuperset(why.split(SEPARATOR)):
-                    self._events.append(VehicleEvent(now_ns, "fault", why))
+                self._stop_reason = reason
+                if not self._known_problems.issuperset(reason.split(SEPARATOR)):
+                    self._events.append(VehicleEvent(now_ns, "fault", reason))
             if state in {"lost", "parking"}:
-                self._kept = still_enabled
+                self._still_enabled = still_enabled
             self._state, self._entered_ns = state, now_ns
 
     def _is_stationary(self) -> bool:
         return abs(self._reports.speed_mps) < STATIONARY_BELOW_MPS
 
-    def _situation(self, now_ns: int) -> Situation:
+    def _current_situation(self, now_ns: int) -> Situation:
         reports = self._reports
-        unheard = _joined([self._gone, *reports.missing(now_ns)])
-        faults = _joined([reports.foreign(now_ns), *reports.said("fault")])
+        missing_reports = _join([self._bus_error, *reports.missing(now_ns)])
+        faults = _join([reports.other_commander(now_ns), *reports.texts("fault")])
         return Situation(
             wanted=self._wanted,
             is_stationary=self._is_stationary(),
-            inhibit_reason=_joined([self._installation, unheard, faults]),
-            unheard=unheard,
-            silent_ns=now_ns - self._sender.sent_ns,
+            inhibit_reason=_join([self._installation, missing_reports, faults]),
+            missing_reports=missing_reports,
+            since_sent_ns=now_ns - self._sender.sent_ns,
             faults=faults,
-            overrides=_joined(reports.said("override")),
-            trips=_joined(reports.said("trip")),
-            lapses=_joined(reports.said("lapse")),
-            reasons=_joined(reports.said("reason")),
+            overrides=_join(reports.texts("override")),
+            trips=_join(reports.texts("trip")),
+            command_errors=_join(reports.texts("command_error")),
+            reasons=_join(reports.texts("reason")),
             enabled=reports.enabled,
             gear=reports.gear,
-            since_ns=now_ns - self._entered_ns,
+            in_state_ns=now_ns - self._entered_ns,
         )
 
-    def _tell(self, now_ns: int) -> None:
-        """Say once what the kit reports anew."""
+    def _record_new_problems(self, now_ns: int) -> None:
+        """Emit an event for each newly reported problem."""
         reports = self._reports
-        told = [*reports.said("override"), *reports.said("trip"), *reports.said("fault")]
-        self._events += [VehicleEvent(now_ns, "fault", words) for words in told if words not in self._told]
-        self._told = frozenset(told)
+        problems = [*reports.texts("override"), *reports.texts("trip"), *reports.texts("fault")]
+        self._events += [VehicleEvent(now_ns, "fault", text) for text in problems if text not in self._known_problems]
+        self._known_problems = frozenset(problems)
 
-    # What goes out.
+    # Frames to send.
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
-        """Give the frames that leave now: none where the newest tick is too old, or there is nothing to say."""
-        self._settle(now_ns)
-        plan = self._planned()
-        if plan is None or self._gone:
-            self._plan = None
+        """Return the frames to send now: none if the newest tick is too old or nothing is due."""
+        self._update_state(now_ns)
+        commands = self._kit_commands()
+        if commands is None or self._bus_error:
+            self._last_commands = None
             return []
         if not self._is_fresh(now_ns):
             if not self._is_late:
@@ -180,27 +180,26 @@ class ByWireAdapter:
             self._is_late = True
             return []
         self._is_late = False
-        requested = self._to_ask()
-        is_new = plan != self._plan
-        if not is_new and now_ns < self._due_ns(requested):
+        requested = self._drive_command()
+        if commands == self._last_commands and now_ns < self._due_ns(requested):
             return []
-        self._plan = plan
-        self._is_shifting |= plan.gear == "drive"
-        frames = self._sender.frames(plan, requested, self._reports.wheel_deg, now_ns)
-        self._expect_echo(plan)
+        self._last_commands = commands
+        self._is_shifting |= commands.gear == "drive"
+        frames = self._sender.frames(commands, requested, self._reports.wheel_deg, now_ns)
+        self._expect_echo(commands)
         return frames
 
     def _is_fresh(self, now_ns: int) -> bool:
         return self._requested_ns is not None and now_ns - self._requested_ns <= TICK_LIMIT_NS
 
     def _due_ns(self, requested: DriveCommand) -> int:
-        """Tell when the next set is due: soon where it brings something new."""
+        """Return when the next set is due: earlier if the command has changed."""
         if self._state == "clearing":
             return self._sender.sent_ns + CLEARING_PERIOD_NS
         return self._sender.sent_ns + (PERIOD_NS if requested == self._sender.sent else LEAST_GAP_NS)
 
-    def _planned(self) -> KitCommands | None:
-        """Give what each state says to the kit."""
+    def _kit_commands(self) -> KitCommands | None:
+        """Return the commands to the kit in the current state."""
         reports, everything = self._reports, frozenset(AXES)
         if self._state == "clearing":
             return KitCommands(NO_AXES, is_clearing=True)
@@ -212,60 +211,61 @@ class ByWireAdapter:
         if self._state == "engaged":
             return KitCommands(everything, system="enable")
         if self._state == "lost":
-            return KitCommands(self._kept, system="enable" if self._kept else "")
+            return KitCommands(self._still_enabled, system="enable" if self._still_enabled else "")
         if self._state == "parking":
-            return self._parking()
+            return self._parking_commands()
         return KitCommands(NO_AXES) if self._state == "overridden" else None
 
-    def _parking(self) -> KitCommands:
-        """Brake, then PARK, then let go: a kit that is let go of in gear trips."""
-        is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_NS
+    def _parking_commands(self) -> KitCommands:
+        """Return the commands to brake, then shift to PARK, then disengage: a kit disengaged in gear trips."""
+        is_shifting = self._is_shifting and self._now_ns - self._entered_ns < SHIFT_REPORT_LIMIT_NS
         if self._reports.gear == "park" and not is_shifting:
             return KitCommands(NO_AXES, system="disable")
-        has_stood = self._now_ns - self._moved_ns >= STOOD_NS
+        may_park = self._now_ns - self._moved_ns >= STATIONARY_BEFORE_PARK_NS
         return KitCommands(
-            self._kept,
-            gear="park" if has_stood and self._kept else None,
-            system="enable" if self._kept else "",
+            self._still_enabled,
+            gear="park" if may_park and self._still_enabled else None,
+            system="enable" if self._still_enabled else "",
         )
 
-    def _to_ask(self) -> DriveCommand:
-        """Give how the car is to drive in this state, before the limits."""
+    def _drive_command(self) -> DriveCommand:
+        """Return the drive command of the current state, before the limits."""
         requested, limits = self._requested, self._profile.limits
         wheel_deg = self._profile.wheel_deg(requested.steering_rad)
         if self._state == "engaged":
             return DriveCommand(wheel_deg, requested.throttle, requested.brake)
-        is_held = self._state in {"enabling", "parking"}
-        return DriveCommand(wheel_deg, 0.0, max(requested.brake, limits.holding_brake) if is_held else requested.brake)
+        needs_brake = self._state in {"enabling", "parking"}
+        brake = max(requested.brake, limits.holding_brake) if needs_brake else requested.brake
+        return DriveCommand(wheel_deg, 0.0, brake)
 
-    # What has reached the wheels.
+    # Commands that reached the wheels.
 
-    def _expect_echo(self, plan: KitCommands) -> None:
-        if "steering" not in plan.enabled or self._requested_ns is None:
-            self._echoes.clear()
-            self._expected = None
+    def _expect_echo(self, commands: KitCommands) -> None:
+        if "steering" not in commands.enabled or self._requested_ns is None:
+            self._awaited_echoes.clear()
+            self._last_steering = None
             return
-        while self._echoes and self._requested_ns - self._echoes[0][1] > ECHO_LIMIT_NS:
-            self._echoes.popleft()
+        while self._awaited_echoes and self._requested_ns - self._awaited_echoes[0][1] > ECHO_LIMIT_NS:
+            self._awaited_echoes.popleft()
         number = round(self._sender.sent.wheel_deg / self._profile.command_step_deg)
-        if number != (self._reports.command if self._expected is None else self._expected):
-            self._echoes.append((number, self._requested_ns))
-        self._expected = number
+        if number != (self._reports.command if self._last_steering is None else self._last_steering):
+            self._awaited_echoes.append((number, self._requested_ns))
+        self._last_steering = number
 
-    def _echo(self, now_ns: int) -> None:
-        """Find the newest report's command among those sent; those before it were overtaken."""
-        if not any(number == self._reports.command for number, _ in self._echoes):
+    def _match_echo(self, now_ns: int) -> None:
+        """Match the newest reported command with those sent; earlier ones were superseded."""
+        if not any(number == self._reports.command for number, _ in self._awaited_echoes):
             return
-        while self._echoes:
-            number, requested_ns = self._echoes.popleft()
+        while self._awaited_echoes:
+            number, requested_ns = self._awaited_echoes.popleft()
             if number == self._reports.command:
                 self._reached.append(ReachedCommand(requested_ns, now_ns))
                 return
 
-    # What it tells.
+    # Outputs.
 
     def state(self) -> VehicleState:
-        """Tell the newest state; its time is that of the newest speed."""
+        """Return the newest state; its time is that of the newest speed."""
         reports = self._reports
         return VehicleState(
             mono_ns=reports.speed_ns,
@@ -278,44 +278,44 @@ class ByWireAdapter:
         )
 
     def _inhibit_reason(self) -> str:
-        now = self._seen
-        said = [self._why if self._state in {"lost", "overridden"} else "", now.inhibit_reason]
-        if self._state == "parking" and now.is_stationary and now.since_ns >= ENABLING_LIMIT_NS:
-            said.append(_joined(["the car stands and is not parked", now.reasons]))
-        return _joined(said)
+        now = self._situation
+        reasons = [self._stop_reason if self._state in {"lost", "overridden"} else "", now.inhibit_reason]
+        if self._state == "parking" and now.is_stationary and now.in_state_ns >= ENABLING_LIMIT_NS:
+            reasons.append(_join(["the car is stationary but not in park", now.reasons]))
+        return _join(reasons)
 
     def next_wake_ns(self) -> int:
-        """Tell when `frames_due` is to be called at the latest."""
-        wake_ns = self._now_ns + LOOK_NS
-        if self._plan is not None and self._is_fresh(self._now_ns):
-            wake_ns = min(wake_ns, max(self._due_ns(self._to_ask()), self._now_ns + 1))
+        """Return the latest time for the next call of `frames_due`."""
+        wake_ns = self._now_ns + IDLE_PERIOD_NS
+        if self._last_commands is not None and self._is_fresh(self._now_ns):
+            wake_ns = min(wake_ns, max(self._due_ns(self._drive_command()), self._now_ns + 1))
         deadline_ns = self._reports.deadline_ns(self._now_ns)
         return wake_ns if deadline_ns is None else min(wake_ns, deadline_ns)
 
     def take_events(self) -> list[VehicleEvent]:
-        """Take what has happened since the last call, in words."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Take which changes of the steering the kit has reported since the last call to steer by."""
+        """Return the steering commands that the kit reported as reached since the last call."""
         reached, self._reached = self._reached, []
         return reached
 
     @property
     def tick_ns(self) -> int | None:
-        """When the newest tick was: no frame may leave later than 60 ms after it."""
+        """Time of the newest tick; no frame is sent later than 60 ms after it."""
         return self._requested_ns
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How often what was dropped, refused, limited or late."""
+        """Counters of dropped, rejected, limited and late inputs and frames."""
         return {**self._profile.codec.counts, **self._reports.counts, **self._sender.counts, **self._counts}
 
 
-def _joined(words: Iterable[str]) -> str:
-    """Put sentences together, each once."""
-    said = [each for each in words if each]
-    if not said:  # nearly always
+def _join(texts: Iterable[str]) -> str:
+    """Join texts of one or more sentences, each sentence once."""
+    present = [each for each in texts if each]
+    if not present:  # nearly always
         return ""
-    return SEPARATOR.join(dict.fromkeys(part for each in said for part in each.split(SEPARATOR) if part))
+    return SEPARATOR.join(dict.fromkeys(part for each in present for part in each.split(SEPARATOR) if part))

@@ -1,7 +1,7 @@
-"""A CAN bus by python-can, of any of its interfaces: frames leave at once or not at all, and what comes is queued.
+"""A CAN bus through python-can, on any of its interfaces. Writes never block; received frames are queued.
 
-The only module that knows python-can, of the extra `can`. Nothing here sends by itself: neither python-can's periodic
-sending nor the kernel's (CAN_BCM) may be used anywhere, or a frozen program's last command would stand
+This is the only module that uses python-can, which comes with the extra `can`. Periodic sending, by python-can or by
+the kernel (CAN_BCM), must not be used anywhere: it would repeat the last command of a frozen program
 (`tests/test_no_periodic_sending.py`).
 """
 
@@ -30,57 +30,57 @@ if TYPE_CHECKING:
     from can import BusABC, Message
 
 TICK_LIMIT_NS: Final = 60 * NS_PER_MS
-"""A frame made longer ago is not written: whoever made it may have been frozen since."""
+"""An older frame is not written: the program that made it may have been frozen since."""
 REOPEN_NS: Final = NS_PER_S
-"""A bus that went away is tried again after so long."""
+"""Shortest time between attempts to reopen a lost bus."""
 QUEUE_FRAMES: Final = 8192
-"""What nobody took in the meantime: two seconds of a full bus of 500 kbit/s. Then the oldest go."""
+"""Capacity of the receive queue: two seconds of a full 500 kbit/s bus. If it is full, the oldest frames are dropped."""
 POLL_S: Final = 0.1
-"""The reader looks so often whether the port was closed."""
+"""Period at which the reader checks whether the port was closed."""
 LATEST_READ_NS: Final = NS_PER_S
-"""A frame that has waited longer is dropped: whoever read it was frozen, or the wall clock was stepped in between."""
+"""A frame that has waited longer is dropped: the reader was frozen, or the wall clock was stepped in between."""
 IP_TIMEOUT_S: Final = 2
 
-logging.getLogger("can").addHandler(logging.NullHandler())  # what it says of errors is in the errors
+logging.getLogger("can").addHandler(logging.NullHandler())  # its messages are in the errors
 
 VIRTUAL_INTERFACES: Final = frozenset({"inside", "virtual", "udp_multicast"})
 STAMPED_BY_KERNEL: Final = frozenset({"socketcan", "udp_multicast"})
-"""Their frames carry the kernel's wall time of arrival; others' times are of devices' own clocks."""
-HEARS_ITSELF: Final = "udp_multicast"
-"""Its socket is a member of the group it sends to. So own frames carry a mark."""
+"""Interfaces whose frames carry the kernel's wall time of arrival; the others use clocks of their devices."""
+RECEIVES_OWN_FRAMES: Final = "udp_multicast"
+"""Its socket is a member of the group it sends to, so own frames are marked."""
 BUS_OFF_BIT: Final = 0x40
 """In the identifier of an error frame of SocketCAN (linux/can/error.h, CAN_ERR_BUSOFF)."""
-PASSING: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})
-"""Errors of a write that say that there is no room now; a new socket would have no more."""
+TEMPORARY_ERRORS: Final = frozenset({None, errno.ENOBUFS, errno.EAGAIN})
+"""Errors of a write that mean that a buffer is full; a new socket would not help."""
 
 
 class CanPort:
-    """A `Port` on a bus; `send` and `take` are for one thread, and one of its own reads.
+    """A `BusPort` on a CAN bus. `send` and `take` are for one thread; a thread of the port reads.
 
     `counts`: `frames_too_old` were not sent; `error_frames`, `remote_frames`, `fd_frames`, `unreadable`,
-    `read_too_late` and `own_frames` were heard and dropped; `overflowed` is what had to go because nobody took it.
+    `read_too_late` and `own_frames` were received and dropped; `overflowed` were dropped from a full queue.
 
-    Raises `UserError` where python-can is missing or the bus cannot be opened.
+    Raises `UserError` if python-can is missing or the bus cannot be opened.
     """
 
     def __init__(self, interface: str, channel: str, options: Mapping[str, Any], *, clock: Clock) -> None:
         self._interface, self._channel, self._options = interface, channel, dict(options)
         self._clock = clock
-        self._mark = secrets.token_hex(8) if interface == HEARS_ITSELF else None
-        self._heard: deque[ReceivedCanFrame] = deque(maxlen=QUEUE_FRAMES)
-        self._why = ""
+        self._mark = secrets.token_hex(8) if interface == RECEIVES_OWN_FRAMES else None
+        self._received: deque[ReceivedCanFrame] = deque(maxlen=QUEUE_FRAMES)
+        self._gone_reason = ""
         self._tried_ns = clock.now().mono_ns
         self.counts: Counter[str] = Counter()
         self._open()
 
     def send(self, frames: Sequence[CanFrame], made_ns: int) -> None:
-        """Write frames that were made at a time, in order and without waiting, but none older than `TICK_LIMIT_NS`.
+        """Write frames made at `made_ns`, in order and without blocking, but none older than `TICK_LIMIT_NS`.
 
-        The age is looked at just before each write. Raises `BusGone`; then the rest is not written.
+        The age is checked right before each write. Raises `BusGone` without writing the remaining frames.
         """
         for frame in frames:
             if self._bus is None:
-                raise BusGone(self._why)
+                raise BusGone(self._gone_reason)
             message = self._message(frame)
             if self._clock.now().mono_ns - made_ns > TICK_LIMIT_NS:
                 self.counts["frames_too_old"] += 1
@@ -88,82 +88,82 @@ class CanPort:
             try:
                 self._bus.send(message, timeout=0)
             except Exception as error:  # of any driver
-                why = f"{self._interface} {self._channel} cannot be written to ({_text(error)})"
-                if _number(error) not in PASSING:
-                    self._lose(why)
-                raise BusGone(why) from error
+                reason = f"{self._interface} {self._channel} cannot be written to ({_error_text(error)})"
+                if _error_number(error) not in TEMPORARY_ERRORS:
+                    self._lose(reason)
+                raise BusGone(reason) from error
 
     def take(self, now_ns: int) -> list[ReceivedCanFrame]:
-        """Take what has come since the last call, in order; own frames are not among it.
+        """Return the frames received since the last call, in order, without own frames.
 
-        A bus that has gone is opened again, at most each `REOPEN_NS`. Raises `BusGone` until that is done.
+        A lost bus is reopened, at most once each `REOPEN_NS`. Raises `BusGone` until that succeeds.
         """
-        taken = [self._heard.popleft() for _ in range(len(self._heard))]
+        taken = [self._received.popleft() for _ in range(len(self._received))]
         if self._bus is None and not taken:
             self._reopen(now_ns)
         return taken
 
     def next_wake_ns(self) -> int | None:
-        """Nobody knows when the next frame comes."""
+        """Return None: the arrival of frames cannot be predicted."""
         return None
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus and wait for the reader."""
         self._lose("the port is closed")
         self._reader.join()
 
     def _open(self) -> None:
-        bus = _opened(self._interface, self._channel, self._options)
+        bus = _open_bus(self._interface, self._channel, self._options)
         self._bus: BusABC | None = bus
         self._reader = threading.Thread(target=self._read, args=(bus,), name="can", daemon=True)
         self._reader.start()
 
     def _reopen(self, now_ns: int) -> None:
         if now_ns - self._tried_ns < REOPEN_NS or self._reader.is_alive():
-            raise BusGone(self._why)
+            raise BusGone(self._gone_reason)
         self._tried_ns = now_ns
         try:
             self._open()
         except UserError as error:
-            self._why = str(error)
-            raise BusGone(self._why) from error
+            self._gone_reason = str(error)
+            raise BusGone(self._gone_reason) from error
 
-    def _lose(self, why: str) -> None:
-        self._why = why
-        self._bus = None  # the reader ends, and shuts it down
+    def _lose(self, reason: str) -> None:
+        self._gone_reason = reason
+        self._bus = None  # makes the reader end and shut the bus down
 
     def _read(self, bus: BusABC) -> None:
-        """Hear frames until the bus has gone or the port is closed; the bus is this thread's to shut down."""
+        """Read frames until the bus is lost or the port closed, then shut the bus down."""
         try:
             while self._bus is bus:
                 self._read_once(bus)
         except Exception as error:  # of any driver
             if self._bus is bus:
-                self._lose(f"{self._interface} {self._channel} cannot be read ({_text(error)})")
+                self._lose(f"{self._interface} {self._channel} cannot be read ({_error_text(error)})")
         finally:
-            with suppress(Exception):  # of a bus that is broken already
+            with suppress(Exception):  # the bus may be broken already
                 bus.shutdown()
 
     def _read_once(self, bus: BusABC) -> None:
         try:
             message = bus.recv(POLL_S)
-        except BlockingIOError:  # another datagram than was announced: its checksum was wrong
+        except BlockingIOError:  # the announced datagram was dropped for its wrong checksum
             return
         except Exception as error:
-            if self._interface != HEARS_ITSELF or isinstance(error.__cause__, OSError):
+            if self._interface != RECEIVES_OWN_FRAMES or isinstance(error.__cause__, OSError):
                 raise
-            self.counts["unreadable"] += 1  # a datagram that is no frame: anybody can send one
+            self.counts["unreadable"] += 1  # a datagram that is not a frame: anyone can send one
             return
         if message is not None:
-            self._hear(message, self._clock.now())
+            self._receive(message, self._clock.now())
 
-    def _hear(self, message: Message, now: Now) -> None:
+    def _receive(self, message: Message, now: Now) -> None:
         if self._mark is not None and message.channel == self._mark:
             self.counts["own_frames"] += 1
             return
         if message.is_error_frame and message.arbitration_id & BUS_OFF_BIT:
             raise BusGone("the controller is bus-off")
-        frame = _frame(message, self.counts)
+        frame = _data_frame(message, self.counts)
         if frame is None:
             return
         arrived_ns = now.mono_ns
@@ -173,8 +173,8 @@ class CanPort:
                 self.counts["read_too_late"] += 1
                 return
             arrived_ns -= max(waited_ns, 0)
-        self.counts["overflowed"] += len(self._heard) == QUEUE_FRAMES
-        self._heard.append(ReceivedCanFrame(frame, arrived_ns))
+        self.counts["overflowed"] += len(self._received) == QUEUE_FRAMES
+        self._received.append(ReceivedCanFrame(frame, arrived_ns))
 
     def _message(self, frame: CanFrame) -> Message:
         message: Message = _library().Message(
@@ -187,7 +187,7 @@ class CanPort:
 
 
 def is_virtual(interface: str, channel: str) -> bool:
-    """Whether a bus exists in computers only, so that no real kit can be on it; what cannot be found out is none."""
+    """Return whether a bus exists in software only, so that no real kit can be on it; False if that is not known."""
     if interface in VIRTUAL_INTERFACES:
         return True
     if interface != "socketcan":
@@ -196,29 +196,29 @@ def is_virtual(interface: str, channel: str) -> bool:
 
 
 def read_log(path: Path) -> Iterator[ReceivedCanFrame]:
-    """Read the frames of a log (candump's `.log`, or another that python-can knows), with the log's own times.
+    """Yield the frames of a log (candump's `.log`, or another format of python-can) with the log's own times.
 
-    Raises `UserError` where it cannot be read.
+    Raises `UserError` if it cannot be read.
     """
     counts: Counter[str] = Counter()
-    heard = 0
+    count = 0
     try:
         with _library().LogReader(path) as messages:
             for message in messages:
-                frame = _frame(message, counts)
+                frame = _data_frame(message, counts)
                 if frame is not None:
-                    heard += 1
+                    count += 1
                     yield ReceivedCanFrame(frame, round(message.timestamp * NS_PER_S))
-    except Exception as error:  # of any of the readers
+    except Exception as error:  # of any reader
         raise UserError(
-            f"{path} cannot be read after {heard} frames ({_text(error)}): name a log, as `candump -L` writes it"
+            f"{path} cannot be read after {count} frames ({_error_text(error)}): name a log, as `candump -L` writes it"
         ) from error
 
 
-def log_line(heard_ns: int, channel: str, frame: CanFrame) -> str:
-    """Write a frame as a line of `candump -L`."""
+def log_line(received_ns: int, channel: str, frame: CanFrame) -> str:
+    """Format a frame as a line of `candump -L`."""
     digits = 8 if frame.is_extended else 3
-    seconds, nanoseconds = divmod(heard_ns, NS_PER_S)
+    seconds, nanoseconds = divmod(received_ns, NS_PER_S)
     return f"({seconds}.{nanoseconds // 1000:06d}) {channel} {frame.identifier:0{digits}X}#{frame.data.hex().upper()}\n"
 
 
@@ -229,8 +229,8 @@ def _library() -> Any:
         raise UserError(f"a CAN bus needs python-can ({error}): pip install 'lavt[can]'") from error
 
 
-def _opened(interface: str, channel: str, options: Mapping[str, Any]) -> BusABC:
-    """A bus of python-can; settings of the user's account (`~/.canrc`) are left out of it."""
+def _open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> BusABC:
+    """Open a bus of python-can, without the settings of the user's account (`~/.canrc`)."""
     library = _library()
     known = library.interfaces.BACKENDS
     if interface not in known:
@@ -238,45 +238,45 @@ def _opened(interface: str, channel: str, options: Mapping[str, Any]) -> BusABC:
     if not channel:
         raise UserError(f"a bus of {interface} needs a channel: name one, like can0")
     if options.get("receive_own_messages"):
-        raise UserError("a port does not hear what it sends: leave out receive_own_messages")
+        raise UserError("a port does not receive its own frames: leave out receive_own_messages")
     if interface == "socketcan" and channel not in (name for _, name in socket.if_nameindex()):
-        # python-can would say so as well, and leave a socket behind
+        # python-can would report this as well, but leave a socket open
         raise UserError(f"socketcan {channel} cannot be opened (no such device): {REMEDIES[errno.ENODEV]}")
-    # It counts as virtual: no gateway on another machine is to hear it.
-    own = {"hop_limit": 0} if interface == HEARS_ITSELF else {}
+    # The bus counts as virtual, so no gateway on another machine may receive it.
+    defaults = {"hop_limit": 0} if interface == RECEIVES_OWN_FRAMES else {}
     try:
-        bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**own, **options})
+        bus: BusABC = library.Bus(channel=channel, interface=interface, ignore_config=True, **{**defaults, **options})
     except Exception as error:  # of any driver
-        remedy = REMEDIES.get(_number(error), "see python-can's page on this interface")
-        raise UserError(f"{interface} {channel} cannot be opened ({_text(error)}): {remedy}") from error
+        remedy = REMEDIES.get(_error_number(error), "see python-can's page on this interface")
+        raise UserError(f"{interface} {channel} cannot be opened ({_error_text(error)}): {remedy}") from error
     return bus
 
 
 REMEDIES: Final[Mapping[int | None, str]] = {
     errno.ENODEV: "name a channel that `ip link` shows",
-    errno.EPERM: "run it as a user who may",
-    errno.EACCES: "run it as a user who may",
-    errno.EAFNOSUPPORT: "this kernel has no SocketCAN; `modprobe can_raw` loads it where it is installed",
+    errno.EPERM: "run it as a user with the permission",
+    errno.EACCES: "run it as a user with the permission",
+    errno.EAFNOSUPPORT: "this kernel has no SocketCAN; load it with `modprobe can_raw` where it is installed",
 }
 
 
-def _frame(message: Message, counts: Counter[str]) -> CanFrame | None:
-    """The data frame that a message is; None for anything else, counted."""
+def _data_frame(message: Message, counts: Counter[str]) -> CanFrame | None:
+    """Return the data frame of a message; count anything else and return None."""
     if message.is_error_frame:
         counts["error_frames"] += 1
     elif message.is_remote_frame:
         counts["remote_frames"] += 1
     elif message.is_fd:
         counts["fd_frames"] += 1
-    elif type(message.arbitration_id) is not int or len(message.data) > 8:  # by udp_multicast anything comes
+    elif type(message.arbitration_id) is not int or len(message.data) > 8:  # udp_multicast carries anything
         counts["unreadable"] += 1
     else:
         return CanFrame(message.arbitration_id, bytes(message.data), bool(message.is_extended_id))
     return None
 
 
-def _number(error: Exception) -> int | None:
-    """The system's number of an error, where it has one."""
+def _error_number(error: Exception) -> int | None:
+    """Return the system's error number, or None."""
     for candidate in (error, error.__cause__):
         if isinstance(candidate, OSError):
             return candidate.errno
@@ -286,20 +286,22 @@ def _number(error: Exception) -> int | None:
     return None
 
 
-def _text(error: Exception) -> str:
-    """What an error says, in one line, and what is behind it."""
-    said = [str(candidate).partition("\n")[0] for candidate in (error, error.__cause__) if candidate is not None]
-    return ": ".join(dict.fromkeys(text for text in said if text)) or type(error).__name__
+def _error_text(error: Exception) -> str:
+    """Return the first lines of an error's and its cause's messages."""
+    lines = [str(candidate).partition("\n")[0] for candidate in (error, error.__cause__) if candidate is not None]
+    return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 
 def _link_kind(channel: str) -> str:
-    """What kind of network interface a channel is, by the kernel; empty: nobody says."""
+    """Return the kernel's name of a network interface's kind, empty if it is not known."""
     try:
-        told = subprocess.run(  # noqa: S603 (its arguments go through no shell)
+        output = subprocess.run(  # noqa: S603 (the arguments go through no shell)
             ["ip", "-details", "-json", "link", "show", "dev", channel],  # noqa: S607 (wherever the system has it)
-            capture_output=True, check=True, timeout=IP_TIMEOUT_S,
-        ).stdout  # fmt: skip
-        (link,) = json.loads(told)
+            capture_output=True,
+            check=True,
+            timeout=IP_TIMEOUT_S,
+        ).stdout
+        (link,) = json.loads(output)
         return str(link["linkinfo"]["info_kind"])
     except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
         return ""

@@ -1,9 +1,9 @@
-"""Messages of a DBC file as bytes and back, and what the file says of them. The only module that knows cantools.
+"""A codec for the messages of a DBC file, with the file's facts about them. The only module that uses cantools.
 
-cantools is of the extra `can`. Values are physical, in the DBC's units; a value that the DBC has a name for stays a
-number (`SignalFacts.names` has the name), and one that is named as none (`NO_VALUE`), or is no number, is None.
+cantools comes with the extra `can`. Values are physical, in the DBC's units. A value with a name in the DBC stays a
+number (`SignalFacts.names` has the name). A value whose name means "none" (`NO_VALUE`), or that is not finite, is None.
 
-A frame of 8 bytes and 15 signals takes 4 us to decode, one of 9 signals 10 us to encode (medians of 7 times 20 000;
+Decoding a frame of 8 bytes and 15 signals takes 4 us, encoding one of 9 signals 10 us (medians of 7 times 20 000;
 Python 3.11, cantools 45.1, one core of a virtual machine).
 """
 
@@ -25,47 +25,47 @@ if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
 
 NO_VALUE: Final = frozenset({"INVALID", "UNKNOWN"})
-"""Names that a DBC gives to what stands in a signal when there is nothing to say."""
+"""Names that a DBC gives to numbers that mean "no value"."""
 RANGE_SLACK_STEPS: Final = 1e-6
-"""A value so little over its range is at its end: the step of a signal is seldom a number that floats have."""
+"""Tolerance of the range check: the step of a signal is rarely representable as a float."""
 
 
 @dataclass(frozen=True, slots=True)
 class SignalFacts:
-    """What the DBC says of a signal; physical = number * scale + offset."""
+    """A signal in the DBC; physical = number * scale + offset."""
 
     name: str
     start: int
-    """Bit, as DBC counts."""
+    """First bit, in the DBC's numbering."""
     bits: int
     is_signed: bool
     is_float: bool
     scale: float
     offset: float
     minimum: float
-    """Physical; that of the bits, where the DBC has none."""
+    """Physical; the range of the bits if the DBC gives none."""
     maximum: float
     unit: str
     names: Mapping[int, str]
-    """Of numbers on the wire."""
+    """By raw number."""
     is_unverified: bool
-    """Its place is an assumption (`docs/can.md`)."""
+    """Its position is an assumption (`docs/can.md`)."""
     is_multiplexer: bool
     multiplexer: str
-    """The signal that says whether this one is in the frame; empty: it always is."""
+    """The signal that selects whether this one is in the frame; empty: it always is."""
     branches: frozenset[int]
-    """Numbers of the multiplexer with which it is."""
+    """Numbers of the multiplexer for which it is."""
     no_value: frozenset[float]
-    """Physical values that stand for none."""
+    """Physical values that mean "no value"."""
 
     def number(self, value: float) -> int:
-        """What stands on the wire for a physical value."""
+        """Return the raw number of a physical value."""
         return round((value - self.offset) / self.scale)
 
 
 @dataclass(frozen=True, slots=True)
 class MessageFacts:
-    """What the DBC says of a message."""
+    """A message in the DBC."""
 
     name: str
     identifier: int
@@ -74,7 +74,7 @@ class MessageFacts:
     """Bytes."""
     signals: Mapping[str, SignalFacts]
     timeout_ns: int | None
-    """Attribute `TimeoutMs`: so long after the last one its receiver does without."""
+    """Attribute `TimeoutMs`: a receiver ignores the last message after this time."""
     period_ns: int | None
     """Attribute `GenMsgCycleTime`."""
     senders: tuple[str, ...]
@@ -83,18 +83,20 @@ class MessageFacts:
 class Codec:
     """The messages of one DBC file.
 
-    `counts` has what `decode` could not read: `unknown_identifier`, `wrong_length`, `unknown_multiplexer`.
+    `counts` has what `decode` rejected: `unknown_identifier`, `wrong_length`, `unknown_multiplexer`.
 
-    Raises `UserError` where cantools is missing, or the file is missing or no DBC.
+    Raises `UserError` if cantools or the file is missing, or the file is not a DBC.
     """
 
     def __init__(self, dbc: Path) -> None:
-        loaded = _loaded(dbc)
-        self.messages: Mapping[str, MessageFacts] = {message.name: _facts(message) for message in loaded.messages}
+        loaded = _load(dbc)
+        self.messages: Mapping[str, MessageFacts] = {
+            message.name: _message_facts(message) for message in loaded.messages
+        }
         self.counts: Counter[str] = Counter()
         self._messages = {message.name: message for message in loaded.messages}
         self._decoders = {(message.frame_id, message.is_extended_frame): message for message in loaded.messages}
-        self._perhaps_none = {
+        self._nullable_signals = {
             name: [signal for signal in facts.signals.values() if signal.no_value or signal.is_float]
             for name, facts in self.messages.items()
         }
@@ -104,18 +106,18 @@ class Codec:
         }
 
     def encode(self, message: str, values: Mapping[str, float], *, length: int | None = None) -> bytes:
-        """Make a message's bytes; bits of signals not named are 0. `length` cuts.
+        """Encode a message and cut it to `length` bytes. Signals that are not given have the raw number 0.
 
-        Rounds to the nearest step. Raises ValueError for a message or signal that the DBC has not, a signal that is not
-        in this frame by its multiplexer, and a value out of its range.
+        Values are rounded to the nearest step. Raises ValueError for a message or signal that is not in the DBC, for a
+        signal that its multiplexer excludes from this frame, and for a value out of range.
         """
         facts = self.messages.get(message)
         if facts is None:
             raise ValueError(f"the DBC has no message {message}")
         for name, value in values.items():
-            _check(facts, name, value)
+            _check_value(facts, name, value)
         full = {**self._zeros[message], **values}
-        absent = [signal.name for signal in facts.signals.values() if not _is_in(signal, full, facts)]
+        absent = [signal.name for signal in facts.signals.values() if not _is_included(signal, full, facts)]
         if strays := [name for name in absent if name in values]:
             raise ValueError(f"{strays[0]} of {message} is not in a frame with this multiplexer")
         for name in absent:
@@ -124,10 +126,10 @@ class Codec:
         return data if length is None else data[:length]
 
     def decode(self, frame: CanFrame, *, short: bool = False) -> tuple[str, dict[str, float | None]] | None:
-        """Tell a frame's message and its physical values; None for what the DBC does not know, counted.
+        """Return a frame's message name and physical values, or None (counted) if the DBC does not describe it.
 
-        A frame must have the message's length; with `short` it may have less, and tells the signals that are whole in
-        it. Never raises, whatever the frame is.
+        A frame must have the message's length. With `short` it may be shorter; only the signals that are complete in it
+        are returned. Never raises.
         """
         message = self._decoders.get((frame.identifier, frame.is_extended))
         if message is None:
@@ -139,36 +141,36 @@ class Codec:
             return None
         try:
             values: Any = message.decode(frame.data, decode_choices=False, allow_truncated=short)
-        except Exception:  # whatever a library makes of garbage from the bus, the loop goes on
+        except Exception:  # an error of the library on garbage from the bus must not end the loop
             self.counts["unknown_multiplexer"] += 1
             return None
-        for signal in self._perhaps_none[message.name]:
+        for signal in self._nullable_signals[message.name]:
             value = values.get(signal.name)
             if value is not None and (value in signal.no_value or not math.isfinite(value)):
                 values[signal.name] = None
         return message.name, values
 
 
-def _check(facts: MessageFacts, name: str, value: float) -> None:
+def _check_value(facts: MessageFacts, name: str, value: float) -> None:
     signal = facts.signals.get(name)
     if signal is None:
         raise ValueError(f"{facts.name} has no signal {name}")
     slack = abs(signal.scale) * RANGE_SLACK_STEPS
-    if not signal.minimum - slack <= value <= signal.maximum + slack:  # nan neither
+    if not signal.minimum - slack <= value <= signal.maximum + slack:  # excludes NaN
         raise ValueError(
-            f"{name} of {facts.name} is {value}, but goes from {signal.minimum:g} to {signal.maximum:g} {signal.unit}"
+            f"{name} of {facts.name} is {value}, but ranges from {signal.minimum:g} to {signal.maximum:g} {signal.unit}"
         )
 
 
-def _is_in(signal: SignalFacts, values: Mapping[str, float], facts: MessageFacts) -> bool:
-    """Whether a signal is in the frame that has these values: by its multiplexer, and that one's, if it has one."""
+def _is_included(signal: SignalFacts, values: Mapping[str, float], facts: MessageFacts) -> bool:
+    """Return whether the multiplexers, with these values, include a signal in the frame."""
     if not signal.multiplexer:
         return True
     selector = facts.signals[signal.multiplexer]
-    return selector.number(values[selector.name]) in signal.branches and _is_in(selector, values, facts)
+    return selector.number(values[selector.name]) in signal.branches and _is_included(selector, values, facts)
 
 
-def _loaded(dbc: Path) -> Database:
+def _load(dbc: Path) -> Database:
     try:
         cantools = import_module("cantools")  # an extra
     except ImportError as error:
@@ -177,23 +179,23 @@ def _loaded(dbc: Path) -> Database:
         loaded: Database = cantools.database.load_file(dbc, database_format="dbc")
     except OSError as error:
         raise UserError(f"{dbc} cannot be read ({error.strerror}): name a DBC file") from error
-    except Exception as error:  # a parser that is given anything fails with anything
-        why = str(error).partition("\n")[0]
-        raise UserError(f"{dbc} is no DBC file that can be read ({why}): name one that is") from error
+    except Exception as error:  # a parser can fail with anything
+        reason = str(error).partition("\n")[0]
+        raise UserError(f"{dbc} is not a valid DBC file ({reason}): name one that is") from error
     if not loaded.messages:
         raise UserError(f"{dbc} has no message: name a DBC file")
     return loaded
 
 
-def _facts(message: Message) -> MessageFacts:
+def _message_facts(message: Message) -> MessageFacts:
     return MessageFacts(
         name=message.name,
         identifier=message.frame_id,
         is_extended=message.is_extended_frame,
         length=message.length,
         signals={signal.name: _signal_facts(signal) for signal in message.signals},
-        timeout_ns=_milliseconds(_attribute(message, "TimeoutMs")),
-        period_ns=_milliseconds(message.cycle_time),
+        timeout_ns=_from_milliseconds(_attribute(message, "TimeoutMs")),
+        period_ns=_from_milliseconds(message.cycle_time),
         senders=tuple(message.senders),
     )
 
@@ -228,7 +230,7 @@ def _signal_facts(signal: Signal) -> SignalFacts:
 
 
 def _number_range(signal: Signal) -> tuple[float, float]:
-    """What numbers the signal's bits hold."""
+    """Return the range of raw numbers."""
     if signal.conversion.is_float:
         return -math.inf, math.inf
     if signal.is_signed:
@@ -241,6 +243,6 @@ def _attribute(owner: Message | Signal, name: str) -> Any:
     return attributes[name].value if name in attributes else None
 
 
-def _milliseconds(count: Any) -> int | None:
-    """As nanoseconds; a DBC says 0 where it has none."""
+def _from_milliseconds(count: Any) -> int | None:
+    """Convert to nanoseconds; a DBC has 0 for "none"."""
     return int(count) * NS_PER_MS if count else None

@@ -1,6 +1,7 @@
-"""A profile: how one kind of by-wire kit is spoken to, already checked against its DBC. Units and signs are here.
+"""A profile describes how to control one kind of by-wire kit. It is checked against its DBC before it gets here.
 
-On the bus the angle is the steering wheel's; here it is the road wheels', left positive. Pedals are fractions.
+This module converts units and signs. The bus has the steering wheel's angle; LAVT has the road wheels' angle, left
+positive. Pedals are fractions.
 """
 
 from __future__ import annotations
@@ -18,44 +19,44 @@ AXES: tuple[Axis, ...] = ("steering", "brake", "throttle")
 Gear = Literal["park", "reverse", "neutral", "drive"]
 
 LEAST_GAP_NS = 5 * NS_PER_MS
-"""Commands that change leave no closer to each other."""
+"""Shortest time between sets of commands when the commands change."""
 PERIOD_NS = 20 * NS_PER_MS
-"""Commands leave no further from each other: 50 Hz, the vendor's demo. The kit wants one within 100 ms."""
+"""Longest time between sets of commands: 50 Hz, as the vendor's demo. The kit needs one within 100 ms."""
 CLEARING_PERIOD_NS = 50 * NS_PER_MS
-"""20 Hz, as the facts have it."""
+"""20 Hz, as in the facts."""
 COMMAND_TIMEOUT_NS = 100 * NS_PER_MS
-"""A kit lets go so long after its last command."""
+"""A kit disengages this long after its last command."""
 TICK_LIMIT_NS = 60 * NS_PER_MS
-"""Nothing leaves that was asked for longer ago."""
+"""Commands requested longer ago are not sent."""
 
 IN_DEGREES = {"deg": 1.0, "rad": math.radians(1.0)}
 IN_FRACTIONS = {"": 1.0, "%": 100.0}
 IN_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 3.6}
 IN_DEGREES_PER_SECOND = {"": 1.0, "deg/s": 1.0, "rad/s": math.radians(1.0)}
-"""What one of ours is in a unit of a DBC; units that are not here are refused."""
+"""One unit of LAVT in the unit of a DBC; other units are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class AxisCommand:
-    """How an axis is commanded; an empty name: there is no such signal."""
+    """The signals that command an axis; an empty name means that the kit has no such signal."""
 
     message: str
     value: str
     per_unit: float
-    """Of the DBC's unit: for one degree of the steering wheel, or one whole pedal."""
+    """In the DBC's unit: one degree of the steering wheel, or one full pedal."""
     constants: Mapping[str, float]
-    """Signals that are always the same: the type of command, the greatest rate."""
+    """Values of signals that never change: the command type, the maximum rate."""
     enable: str
     clear: str
     count: str
     modulus: int
-    """Of the counter."""
+    """Of the counter: it wraps here."""
     checksum: str
 
 
 @dataclass(frozen=True, slots=True)
 class GearCommand:
-    """How a gear is asked for."""
+    """The signals that command a gear."""
 
     message: str
     value: str
@@ -66,7 +67,7 @@ class GearCommand:
 
 @dataclass(frozen=True, slots=True)
 class SystemCommand:
-    """How the kit as a whole is enabled and disabled."""
+    """The signals that enable and disable the kit as a whole."""
 
     message: str
     value: str
@@ -79,38 +80,38 @@ class SystemCommand:
 
 @dataclass(frozen=True, slots=True)
 class SignalCondition:
-    """A signal that means something: where it is `number`, or anything but 0 where that is None."""
+    """A condition on a signal: it equals `number`, or is not 0 if `number` is None."""
 
     signal: str
     number: int | None
-    words: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReportSpec:
-    """How a report is read."""
+    """The signals of a report."""
 
     part: str
-    """What it is about."""
+    """The part of the kit that the report describes."""
     timeout_ns: int
     values: Mapping[str, str]
-    """Our word: the signal."""
+    """Signal names by value name."""
     no_value: Mapping[str, float]
-    """Our word: what stands for none, in the DBC's unit. The lowest number of a signed signal does, though generation
-    2's facts do not say so."""
+    """By value name: the number that means "not known", in the DBC's unit. It is the lowest number of a signed signal,
+    although the facts on generation 2 do not say so."""
     override: tuple[SignalCondition, ...]
     trip: tuple[SignalCondition, ...]
-    lapse: tuple[SignalCondition, ...]
+    command_error: tuple[SignalCondition, ...]
     fault: tuple[SignalCondition, ...]
     needs: Mapping[str, frozenset[int]]
     reasons: tuple[str, ...]
-    """Signals that tell why something is refused; 0 is no reason."""
+    """Signals with the reason for a rejection; 0 means no reason."""
     checksum: str
 
 
 @dataclass(frozen=True, slots=True)
 class OwnBrake:
-    """The kit brakes by itself where a report's signal is more than `above` and its brake is not enabled."""
+    """Evidence that the kit brakes by itself: `signal` is more than `above` while the brake is not enabled."""
 
     message: str
     signal: str
@@ -119,19 +120,19 @@ class OwnBrake:
 
 @dataclass(frozen=True, slots=True)
 class ByWireCar:
-    """The car that the kit is in."""
+    """Properties of the car with the kit."""
 
     wheelbase_m: float
     steering_ratio: float
     steering_sign: Literal[1, -1] | None
-    """1: left is positive on the bus; None: not known."""
+    """1: left is positive on the bus; None: unknown."""
     max_acceleration_mps2: float
     max_braking_mps2: float
 
 
 @dataclass(frozen=True, slots=True)
 class ByWireLimits:
-    """What is never exceeded on the bus; rates of pedals are of pressing."""
+    """Limits on everything sent to the bus; pedal rates limit pressing, not releasing."""
 
     steering_wheel_deg: float
     steering_wheel_rate_degps: float
@@ -144,12 +145,12 @@ class ByWireLimits:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """How one kind of kit is spoken to, and the messages to do so."""
+    """A by-wire kit, its limits and its messages."""
 
     name: str
     kit: Literal["dataspeed_1", "dataspeed_2"]
     commands: Literal["remote", "user"] | None
-    """Which of the kit's sets of commands; None: it has one."""
+    """The kit's set of commands in use; None if it has only one."""
     car: ByWireCar
     limits: ByWireLimits
     command_step_deg: float
@@ -158,20 +159,20 @@ class Profile:
     system: SystemCommand | None
     clearing_bytes: int | None
     reports: Mapping[str, ReportSpec]
-    """By message."""
+    """By message name."""
     watchdog: OwnBrake | None
-    """How it is seen that the kit's watchdog brakes; None: it is not."""
+    """How to detect that the kit's watchdog brakes; None if that is not possible."""
     speed_per_mps: float
-    """Of the reported speed's unit."""
+    """Converts m/s into the unit of the reported speed."""
     angle_per_deg: float
     unverified: tuple[str, ...]
-    """Of the signals that are used, those whose place is an assumption: `message.signal`."""
+    """Names, as `message.signal`, of the signals in use whose position is an assumption."""
     codec: Codec
 
     def wheel_deg(self, road_rad: float) -> float:
-        """Give the steering wheel's angle on the bus for the road wheels' angle."""
+        """Convert a road-wheel angle to the steering wheel's angle on the bus."""
         return math.degrees(road_rad) * self.car.steering_ratio * (self.car.steering_sign or 1)
 
     def road_rad(self, wheel_deg: float) -> float:
-        """Give the road wheels' angle for the steering wheel's angle on the bus."""
+        """Convert a steering-wheel angle on the bus to the road wheels' angle."""
         return math.radians(wheel_deg) / self.car.steering_ratio * (self.car.steering_sign or 1)

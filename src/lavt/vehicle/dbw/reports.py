@@ -1,4 +1,4 @@
-"""What the kit has reported so far: values with their times, and what hinders driving, in words."""
+"""The newest reports of a kit: values with their times, and texts about what inhibits driving."""
 
 from __future__ import annotations
 
@@ -8,82 +8,80 @@ from typing import Final, Literal, get_args
 
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.dbw.crc8 import frame_crc8
+from lavt.vehicle.dbw.crc8 import has_valid_checksum
 from lavt.vehicle.dbw.profile import AXES, Axis, Gear, Profile, ReportSpec, SignalCondition
 
 Values = Mapping[str, float | None]
-Kind = Literal["override", "trip", "lapse", "fault", "reason"]
-"""What hinders driving, as the profile's reports distinguish it."""
+Kind = Literal["override", "trip", "command_error", "fault", "reason"]
+"""The kinds of texts; a profile maps report signals to them."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-FOREIGN_NS: Final = NS_PER_S
-"""Ours: somebody else who commanded the kit is taken to do so for so long."""
+OTHER_COMMANDER_NS: Final = NS_PER_S
+"""Our choice: another sender counts as present for this long after its last command."""
 
 
 class NewestReports:
-    """The newest of each report of a profile.
+    """The newest report of each message in a profile.
 
-    `counts` has the frames that could not be used: `wrong_checksum`, `value_unknown`; the codec's has the rest. And
-    `foreign_commands`: somebody else commands the kit.
+    `counts` has the reports that could not be used: `wrong_checksum`, `value_unknown` (the codec counts the others),
+    and `foreign_commands`, commands that another sender sent to the kit.
     """
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
-        self._said: dict[str, dict[Kind, list[str]]] = {}
-        """What each newest report says, by kind."""
-        self._all_said: dict[Kind, list[str]] = {kind: [] for kind in KINDS}
-        """What they say together; few reports say anything new."""
-        self._heard_ns: dict[str, int] = {}
-        """When each report came last with all its values."""
+        self._texts_by_message: dict[str, dict[Kind, list[str]]] = {}
+        """Texts of the newest report of each message, by kind."""
+        self._texts: dict[Kind, list[str]] = {kind: [] for kind in KINDS}
+        """Texts of all newest reports; recomputed only when one changes."""
+        self._received_ns: dict[str, int] = {}
+        """Time of the last report of each message in which all values were known."""
         self._commands = _commands(profile)
-        self._foreign: tuple[str, int] | None = None
-        """A command that somebody else sent last, and when it came."""
+        self._foreign_command: tuple[str, int] | None = None
+        """Name and arrival time of the last command from another sender."""
         self._gears = {number: gear for gear, number in profile.gear.numbers.items()}
         self.counts: Counter[str] = Counter()
         self.speed_mps, self.speed_ns = 0.0, start_ns
         self.wheel_deg = 0.0
-        """The steering wheel's angle, as on the bus."""
+        """The steering wheel's angle, with the bus's sign."""
         self.command: int | None = None
-        """The steering's command as the kit has it, in its own steps."""
+        """The steering command that the kit reports, in its own steps."""
         self.gear: Gear | None = None
-        """None: one that we do not know."""
+        """None: unknown."""
         self.enabled: frozenset[Axis] = frozenset()
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
-        """Take a frame, whatever it is."""
+        """Process any frame from the bus."""
         if (command := self._commands.get((frame.identifier, frame.is_extended))) is not None:  # of any length
             self.counts["foreign_commands"] += 1
-            self._foreign = command, now_ns
+            self._foreign_command = command, now_ns
             return
         decoded = self._profile.codec.decode(frame)
         if decoded is None or (report := self._profile.reports.get(decoded[0])) is None:
             return
         message, values = decoded
-        if report.checksum and frame.data[-1] != frame_crc8(
-            frame.identifier, frame.data[:-1], extended=frame.is_extended
-        ):
+        if report.checksum and not has_valid_checksum(frame):
             self.counts["wrong_checksum"] += 1
             return
-        self._note(message, self._read(message, report, values))
+        self._update_texts(message, self._texts_of(message, report, values))
         known = {
-            word: number
-            for word, signal in report.values.items()
-            if (number := values[signal]) is not None and number != report.no_value.get(word)
+            name: number
+            for name, signal in report.values.items()
+            if (number := values[signal]) is not None and number != report.no_value.get(name)
         }
-        self._take(report, known, now_ns)
+        self._update_values(report, known, now_ns)
         if len(known) == len(report.values):
-            self._heard_ns[message] = now_ns
+            self._received_ns[message] = now_ns
         else:
             self.counts["value_unknown"] += 1
 
-    def _note(self, message: str, said: dict[Kind, list[str]]) -> None:
-        if said != self._said.get(message):
-            self._said[message] = said
-            self._all_said = {
-                kind: list(dict.fromkeys(words for each in self._said.values() for words in each[kind]))
+    def _update_texts(self, message: str, texts: dict[Kind, list[str]]) -> None:
+        if texts != self._texts_by_message.get(message):
+            self._texts_by_message[message] = texts
+            self._texts = {
+                kind: list(dict.fromkeys(text for each in self._texts_by_message.values() for text in each[kind]))
                 for kind in KINDS
             }
 
-    def _take(self, report: ReportSpec, known: Mapping[str, float], now_ns: int) -> None:
+    def _update_values(self, report: ReportSpec, known: Mapping[str, float], now_ns: int) -> None:
         if "speed" in known:
             self.speed_mps, self.speed_ns = known["speed"] / self._profile.speed_per_mps, now_ns
         if "angle" in known:
@@ -97,69 +95,69 @@ class NewestReports:
             self.enabled = self.enabled | {axis} if known["enabled"] else self.enabled - {axis}
 
     def missing(self, now_ns: int) -> list[str]:
-        """Tell which reports are too old to drive by."""
+        """Return a text for each report that is missing or too old to drive by."""
         return [
             f"no {message} for {report.timeout_ns // NS_PER_MS} ms"
-            if message in self._heard_ns
+            if message in self._received_ns
             else f"no {message} yet"
             for message, report in self._profile.reports.items()
-            if message not in self._heard_ns or now_ns - self._heard_ns[message] >= report.timeout_ns
+            if message not in self._received_ns or now_ns - self._received_ns[message] >= report.timeout_ns
         ]
 
-    def foreign(self, now_ns: int) -> str:
-        """Tell who else commands the kit: a server that was ended and parks the car still, or another program."""
-        if self._foreign is None or now_ns - self._foreign[1] >= FOREIGN_NS:
+    def other_commander(self, now_ns: int) -> str:
+        """Return a text if another sender commands the kit, such as an ended server that still parks the car."""
+        if self._foreign_command is None or now_ns - self._foreign_command[1] >= OTHER_COMMANDER_NS:
             return ""
-        return f"somebody else on the bus commands the kit ({self._foreign[0]})"
+        return f"another sender on the bus commands the kit ({self._foreign_command[0]})"
 
     def deadline_ns(self, now_ns: int) -> int | None:
-        """Tell when the next report will be too old; None where none will."""
+        """Return when the next report will be too old, or None if none will."""
         reports = self._profile.reports
-        deadlines = (heard_ns + reports[message].timeout_ns for message, heard_ns in self._heard_ns.items())
+        deadlines = (received_ns + reports[message].timeout_ns for message, received_ns in self._received_ns.items())
         return min((deadline_ns for deadline_ns in deadlines if deadline_ns > now_ns), default=None)
 
-    def said(self, kind: Kind) -> Sequence[str]:
-        """Tell what the newest reports say of a kind, in words, each once."""
-        return self._all_said[kind]
+    def texts(self, kind: Kind) -> Sequence[str]:
+        """Return the texts of a kind in the newest reports, each once."""
+        return self._texts[kind]
 
-    def _read(self, message: str, report: ReportSpec, values: Values) -> dict[Kind, list[str]]:
-        """Put a report's signs into words."""
+    def _texts_of(self, message: str, report: ReportSpec, values: Values) -> dict[Kind, list[str]]:
+        """Return a report's texts by kind."""
         needs = [
-            f"{message} has {signal} {self._name(message, signal, values[signal])}"
+            f"{message} has {signal} {self._value_name(message, signal, values[signal])}"
             for signal, numbers in report.needs.items()
             if values[signal] not in numbers
         ]
         reasons = [
-            f"{message} says {self._name(message, signal, values[signal])}"
+            f"{message}: {self._value_name(message, signal, values[signal])}"
             for signal in report.reasons
             if values[signal]
         ]
         return {
-            "override": _shown(report.override, values),
-            "trip": _shown(report.trip, values),
-            "lapse": _shown(report.lapse, values),
-            "fault": _shown(report.fault, values) + needs,
+            "override": _matching(report.override, values),
+            "trip": _matching(report.trip, values),
+            "command_error": _matching(report.command_error, values),
+            "fault": _matching(report.fault, values) + needs,
             "reason": reasons,
         }
 
-    def _name(self, message: str, signal: str, number: float | None) -> str:
-        """Give a number as the DBC names it."""
+    def _value_name(self, message: str, signal: str, number: float | None) -> str:
+        """Return the DBC's name of a number."""
         names = self._profile.codec.messages[message].signals[signal].names
-        return "nothing" if number is None else names.get(round(number), f"{number:g}").lower().replace("_", " ")
+        return "no value" if number is None else names.get(round(number), f"{number:g}").lower().replace("_", " ")
 
 
 def _commands(profile: Profile) -> dict[tuple[int, bool], str]:
-    """Give the names of the commands that the profile sends, by what is on the bus: own frames are never heard."""
+    """Return the names of the profile's commands by identifier; a bus does not return own frames."""
     names = [*(command.message for command in profile.axes.values()), profile.gear.message]
     names += [] if profile.system is None else [profile.system.message]
     messages = profile.codec.messages
     return {(messages[name].identifier, messages[name].is_extended): name for name in names}
 
 
-def _shown(signs: Iterable[SignalCondition], values: Values) -> list[str]:
-    """Give the words of the signs that a report shows."""
+def _matching(conditions: Iterable[SignalCondition], values: Values) -> list[str]:
+    """Return the texts of the conditions that a report meets."""
     return [
-        sign.words
-        for sign in signs
-        if (values[sign.signal] if sign.number is None else values[sign.signal] == sign.number)
+        condition.text
+        for condition in conditions
+        if (values[condition.signal] if condition.number is None else values[condition.signal] == condition.number)
     ]

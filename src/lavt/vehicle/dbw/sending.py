@@ -1,4 +1,4 @@
-"""What leaves for the kit: limits, then bytes with counters and checksums. The limits are the last before the bus."""
+"""Frames for the kit: limits, encoding, counters and checksums. The limits are the last stage before the bus."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from lavt.vehicle.dbw.crc8 import frame_crc8
 from lavt.vehicle.dbw.profile import AXES, TICK_LIMIT_NS, Axis, AxisCommand, ByWireLimits, Gear, Profile, SystemCommand
 
 GEAR_PERIOD_NS = 100 * NS_PER_MS
-"""A gear is asked for again so often until it is reported (ours); a kit may be at it still."""
+"""Our choice: period at which a gear is requested until it is reported; the kit may still be shifting."""
 
 
 @value
 class KitCommands:
-    """What is said to the kit, besides how it is to drive."""
+    """Commands to the kit other than the actuation."""
 
     enabled: frozenset[Axis]
-    """Axes that are to obey; the others are told not to."""
+    """Axes to enable; the others are disabled."""
     is_clearing: bool = False
     gear: Gear | None = None
-    """The gear that is asked for."""
+    """The requested gear."""
     system: Literal["", "enable", "disable"] = ""
 
 
 @value
 class DriveCommand:
-    """How the car is to drive: the steering wheel's angle on the bus, and pedals as fractions."""
+    """The requested actuation: the steering wheel's angle with the bus's sign, and pedals as fractions."""
 
     wheel_deg: float
     throttle: float
     brake: float
 
 
-def limited(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
-    """Give what of `requested` is allowed `passed_ns` after `before` was sent; with the brake there is no throttle."""
+def apply_limits(limits: ByWireLimits, requested: DriveCommand, before: DriveCommand, passed_ns: int) -> DriveCommand:
+    """Limit `requested`, `passed_ns` after `before` was sent; a brake request zeroes the throttle."""
     passed_s = min(passed_ns, TICK_LIMIT_NS) / NS_PER_S
     turn_deg = limits.steering_wheel_rate_degps * passed_s
     wheel_deg = _within(requested.wheel_deg, -limits.steering_wheel_deg, limits.steering_wheel_deg)
@@ -55,64 +55,66 @@ def _within(number: float, least: float, most: float) -> float:
 
 
 class FrameSender:
-    """Makes the frames of each set, and knows what the last one said."""
+    """An encoder for sets of frames that keeps the last set's drive command."""
 
     def __init__(self, profile: Profile, start_ns: int) -> None:
         self._profile = profile
         self.sent = DriveCommand(0.0, 0.0, 0.0)
-        """What the last set asked for, where its axes were enabled."""
+        """The last set's drive command; a disabled axis has the reported angle or a released pedal."""
         self.sent_ns = start_ns
         self.counts: Counter[str] = Counter()
-        """`sets`, and how often each limit changed something: `limited_wheel_deg`, `limited_throttle`, .."""
-        self._numbers: Counter[str] = Counter()
-        """How many frames of each message were counted."""
+        """`sets`, and how often each limit took effect: `limited_wheel_deg`, `limited_throttle`, ..."""
+        self._frame_counts: Counter[str] = Counter()
+        """Number of frames per message, for its counter."""
         self._gear_ns: int | None = None
 
-    def frames(self, plan: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
-        """Make a set of frames; `wheel_deg` is where the steering wheel is, from which it turns once it is enabled."""
+    def frames(self, commands: KitCommands, requested: DriveCommand, wheel_deg: float, now_ns: int) -> list[CanFrame]:
+        """Return a set of frames. Steering starts from the reported angle `wheel_deg` once it is enabled."""
         profile, passed_ns = self._profile, now_ns - self.sent_ns
         self.sent_ns = now_ns
         self.counts["sets"] += 1
-        if plan.is_clearing:
+        if commands.is_clearing:
             self.sent = DriveCommand(wheel_deg, 0.0, 0.0)
-            return self._clearing()
-        allowed = limited(profile.limits, requested, self.sent, passed_ns)
-        self._count_limits(requested, allowed, plan.enabled)
+            return self._clearing_frames()
+        allowed = apply_limits(profile.limits, requested, self.sent, passed_ns)
+        self._count_limits(requested, allowed, commands.enabled)
         self.sent = DriveCommand(
-            allowed.wheel_deg if "steering" in plan.enabled else wheel_deg,
-            allowed.throttle if "throttle" in plan.enabled else 0.0,
-            allowed.brake if "brake" in plan.enabled else 0.0,
+            allowed.wheel_deg if "steering" in commands.enabled else wheel_deg,
+            allowed.throttle if "throttle" in commands.enabled else 0.0,
+            allowed.brake if "brake" in commands.enabled else 0.0,
         )
         values = {"steering": allowed.wheel_deg, "brake": allowed.brake, "throttle": allowed.throttle}
-        frames = [self.axis_frame(axis, values[axis], is_enabled=axis in plan.enabled) for axis in AXES]
-        if plan.system and profile.system is not None:
-            frames.append(self._system_frame(profile.system, plan.system))
-        if plan.gear is None:
+        frames = [self.axis_frame(axis, values[axis], is_enabled=axis in commands.enabled) for axis in AXES]
+        if commands.system and profile.system is not None:
+            frames.append(self._system_frame(profile.system, commands.system))
+        if commands.gear is None:
             self._gear_ns = None
         elif self._gear_ns is None or now_ns - self._gear_ns >= GEAR_PERIOD_NS:
             self._gear_ns = now_ns
-            frames.append(self.gear_frame(plan.gear))
+            frames.append(self.gear_frame(commands.gear))
         return frames
 
     def axis_frame(self, axis: Axis, number: float, *, is_enabled: bool) -> CanFrame:
-        """Make an axis's command: degrees of the steering wheel, or the fraction of a pedal."""
+        """Return an axis's command: degrees of the steering wheel, or the fraction of a pedal."""
         command = self._profile.axes[axis]
-        said = {command.value: number * command.per_unit if is_enabled else 0.0, command.enable: int(is_enabled)}
-        return self._frame(command.message, {**command.constants, **said, **self._next(command)}, command.checksum)
+        values = {command.value: number * command.per_unit if is_enabled else 0.0, command.enable: int(is_enabled)}
+        return self._frame(
+            command.message, {**command.constants, **values, **self._axis_counter(command)}, command.checksum
+        )
 
     def gear_frame(self, gear: Gear) -> CanFrame:
-        """Make the command for a gear."""
+        """Return the command for a gear."""
         command = self._profile.gear
         return self._frame(command.message, {command.value: command.numbers[gear]}, command.checksum)
 
-    def _clearing(self) -> list[CanFrame]:
-        """Make what takes back overrides: as short as the kit wants it."""
+    def _clearing_frames(self) -> list[CanFrame]:
+        """Return the frames that clear overrides, of the length that the kit requires."""
         profile, frames = self._profile, []
         for axis in AXES:
             command = profile.axes[axis]
             if profile.clearing_bytes is None:
-                said = {command.clear: 1, **self._next(command)}
-                frames.append(self._frame(command.message, said, command.checksum))
+                values = {command.clear: 1, **self._axis_counter(command)}
+                frames.append(self._frame(command.message, values, command.checksum))
             else:
                 frames.append(self._frame(command.message, {command.clear: 1}, "", profile.clearing_bytes))
         if profile.gear.clear:
@@ -120,23 +122,23 @@ class FrameSender:
         return frames
 
     def _system_frame(self, command: SystemCommand, request: Literal["enable", "disable"]) -> CanFrame:
-        said = {command.value: command.enable if request == "enable" else command.disable}
-        counted = self._counted(command.message, command.count, command.modulus)
-        return self._frame(command.message, {**said, **counted}, command.checksum)
+        values = {command.value: command.enable if request == "enable" else command.disable}
+        counter = self._next_counter(command.message, command.count, command.modulus)
+        return self._frame(command.message, {**values, **counter}, command.checksum)
 
-    def _next(self, command: AxisCommand) -> dict[str, int]:
-        return self._counted(command.message, command.count, command.modulus)
+    def _axis_counter(self, command: AxisCommand) -> dict[str, int]:
+        return self._next_counter(command.message, command.count, command.modulus)
 
-    def _counted(self, message: str, count: str, modulus: int) -> dict[str, int]:
+    def _next_counter(self, message: str, count: str, modulus: int) -> dict[str, int]:
         if not count:
             return {}
-        self._numbers[message] += 1
-        return {count: self._numbers[message] % modulus}
+        self._frame_counts[message] += 1
+        return {count: self._frame_counts[message] % modulus}
 
-    def _frame(self, message: str, said: Mapping[str, float], checksum: str, length: int | None = None) -> CanFrame:
+    def _frame(self, message: str, values: Mapping[str, float], checksum: str, length: int | None = None) -> CanFrame:
         codec = self._profile.codec
-        facts, data = codec.messages[message], codec.encode(message, said, length=length)
-        if checksum:  # the last byte, as the profile was checked
+        facts, data = codec.messages[message], codec.encode(message, values, length=length)
+        if checksum:  # always the last byte: the profile's check ensures it
             data = data[:-1] + bytes([frame_crc8(facts.identifier, data[:-1], extended=facts.is_extended)])
         return CanFrame(facts.identifier, data, facts.is_extended)
 

@@ -1,4 +1,4 @@
-"""The states of the by-wire adapter as a table, from which docs/by_wire.md is drawn."""
+"""The state machine of the by-wire adapter as a table, from which docs/by_wire.md is generated."""
 
 from __future__ import annotations
 
@@ -12,180 +12,181 @@ from lavt.vehicle.dbw.profile import AXES, COMMAND_TIMEOUT_NS, Axis, Gear
 State = Literal["idle", "clearing", "enabling", "engaged", "parking", "overridden", "lost"]
 
 STATIONARY_BELOW_MPS: Final = 0.1
-"""Ours: below it the car stands."""
+"""Our choice: below this speed the car is stationary."""
 ENABLING_LIMIT_NS: Final = 3 * NS_PER_S
-"""Ours: what a kit does not do in so long it does not do."""
+"""Our choice: clearing and enabling fail if they take longer."""
 PAUSE_NS: Final = 120 * NS_PER_MS
-"""Clearing takes at least so long, in which the system is not asked to enable: a kit that has let go does not hear it
-before it was quiet for 100 ms. And so long the kit is told to let go before it is taken to have."""
+"""Minimum duration of `clearing` and `parking`. A kit that has disengaged ignores requests to enable until none came
+for 100 ms, so none is sent while clearing; and a kit is taken to be disengaged only after disabling for this long."""
 
-SAID: Final[dict[State, str]] = {
-    "idle": "nothing: the adapter is silent",
-    "clearing": "CLEAR, every 50 ms; no axis enabled",
-    "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE, once all are reported enabled",
-    "engaged": "what is asked",
-    "parking": "as asked, but throttle 0, at least the holding brake; PARK after 300 ms of standing; then all off",
+SENT_IN_STATE: Final[dict[State, str]] = {
+    "idle": "nothing",
+    "clearing": "CLEAR every 50 ms; no axis enabled",
+    "enabling": "all axes enabled, throttle 0, the holding brake; DRIVE once all axes are reported enabled",
+    "engaged": "the requested actuation",
+    "parking": "requested steering and brake, at least the holding brake, throttle 0; PARK once the car was stationary "
+    "for 300 ms; then no axis enabled",
     "overridden": "no axis enabled",
-    "lost": "steering and brake as asked, throttle 0, on the axes that are still enabled",
+    "lost": "requested steering and brake, throttle 0, on the axes that are still enabled",
 }
-"""What is sent in each state."""
+"""Frames sent in each state."""
 
 
 @value
 class Situation:
-    """What the table looks at."""
+    """Inputs of the state machine."""
 
     wanted: bool
-    """Somebody wants to drive."""
+    """Driving is wanted."""
     is_stationary: bool
     inhibit_reason: str
     """Why driving cannot begin; empty: it can."""
-    unheard: str
-    """Bus gone, or reports missing."""
-    silent_ns: int
-    """How long ago the last set of frames left."""
+    missing_reports: str
+    """Reports that are missing, or why the bus is gone."""
+    since_sent_ns: int
+    """Time since the last set of frames was sent."""
     faults: str
     overrides: str
     trips: str
-    lapses: str
+    command_errors: str
     reasons: str
-    """What the kit gives as reasons."""
+    """Reasons that the kit reports."""
     enabled: frozenset[Axis]
     gear: Gear | None
-    since_ns: int
-    """How long the state has lasted."""
+    in_state_ns: int
+    """Time in the current state."""
 
 
 @value
 class TransitionRow:
-    """From some states, in a case, to a state; the first row that fits counts.
+    """A transition from any of its sources to its target; the first matching row counts.
 
-    `case` gives what happened in words, or whether it did.
+    `condition` returns whether the row matches, or the reason as a text that is empty if it does not.
     """
 
     sources: tuple[State, ...]
-    words: str
-    case: Callable[[Situation], str | bool]
+    description: str
+    condition: Callable[[Situation], str | bool]
     target: State
 
 
-def _release(now: Situation) -> str:
-    """Tell which axes do not obey any more."""
+def _released_axes(now: Situation) -> str:
+    """Return a text that names the axes that are not enabled."""
     axes = [axis for axis in AXES if axis not in now.enabled]
-    return f"the kit has let go of {' and '.join(axes)}{_reason(now)}" if axes else ""
+    return f"the kit released {' and '.join(axes)}{_details(now)}" if axes else ""
 
 
 def _out_of_gear(now: Situation) -> str:
     return "" if now.gear == "drive" else f"the gear is {now.gear or 'unknown'} instead of drive"
 
 
-def _did_not(what: str) -> Callable[[Situation], str]:
-    def case(now: Situation) -> str:
-        if now.since_ns < ENABLING_LIMIT_NS:
+def _timed_out(action: str) -> Callable[[Situation], str]:
+    def condition(now: Situation) -> str:
+        if now.in_state_ns < ENABLING_LIMIT_NS:
             return ""
-        left = [now.overrides, now.trips, now.lapses]
-        if what == "enable":
-            left += [f"not enabled: {axis}" for axis in AXES if axis not in now.enabled]
-            left += [_out_of_gear(now)]
-        said = "; ".join(filter(None, [*left, now.reasons]))
-        return f"the kit did not {what} in {ENABLING_LIMIT_NS // NS_PER_S} s: {said}"
+        causes = [now.overrides, now.trips, now.command_errors]
+        if action == "enable":
+            causes += [f"not enabled: {axis}" for axis in AXES if axis not in now.enabled]
+            causes += [_out_of_gear(now)]
+        text = "; ".join(filter(None, [*causes, now.reasons]))
+        return f"the kit did not {action} within {ENABLING_LIMIT_NS // NS_PER_S} s: {text}"
 
-    return case
+    return condition
 
 
-def _reason(now: Situation) -> str:
-    said = "; ".join(filter(None, [now.trips, now.lapses, now.reasons]))
-    return f" ({said})" if said else ""
+def _details(now: Situation) -> str:
+    text = "; ".join(filter(None, [now.trips, now.command_errors, now.reasons]))
+    return f" ({text})" if text else ""
 
 
 TABLE: Final[tuple[TransitionRow, ...]] = (
     TransitionRow(
         ("enabling", "engaged", "parking", "lost"),
-        "the driver in the car has taken over",
-        lambda now: now.overrides and f"the driver has taken over: {now.overrides}",
+        "override by the driver",
+        lambda now: now.overrides and f"override by the driver: {now.overrides}",
         "overridden",
     ),
     TransitionRow(
         ("clearing", "enabling", "engaged", "parking"),
         "the bus is gone, or a report is missing",
-        lambda now: now.unheard,
+        lambda now: now.missing_reports,
         "lost",
     ),
     TransitionRow(
         ("enabling", "engaged", "parking"),
-        "no command has left for 100 ms",
-        lambda now: now.silent_ns >= COMMAND_TIMEOUT_NS,
+        "no command was sent for 100 ms",
+        lambda now: now.since_sent_ns >= COMMAND_TIMEOUT_NS,
         "lost",
     ),
     TransitionRow(
         ("clearing", "enabling", "engaged"),
-        "the kit reports a fault, or somebody else commands it",
+        "the kit reports a fault, or another sender commands it",
         lambda now: now.faults,
         "lost",
     ),
     TransitionRow(
         ("enabling", "engaged"),
         "the kit's watchdog has tripped",
-        lambda now: now.trips and now.trips + _reason(now),
+        lambda now: now.trips and now.trips + _details(now),
         "lost",
     ),
-    TransitionRow(("engaged",), "the kit has let go of an axis", _release, "lost"),
-    TransitionRow(("engaged",), "the kit finds our commands late or wrong", lambda now: now.lapses, "lost"),
+    TransitionRow(("engaged",), "the kit released an axis", _released_axes, "lost"),
+    TransitionRow(("engaged",), "the kit reports late or invalid commands", lambda now: now.command_errors, "lost"),
     TransitionRow(("engaged",), "the gear is not DRIVE", _out_of_gear, "lost"),
     TransitionRow(
-        ("clearing", "enabling", "engaged"), "driving is not wanted any more", lambda now: not now.wanted, "parking"
+        ("clearing", "enabling", "engaged"), "driving is no longer wanted", lambda now: not now.wanted, "parking"
     ),
     TransitionRow(
         ("idle",),
-        "driving is wanted, the car stands, and nothing hinders it",
+        "driving is wanted, the car is stationary, and there is no inhibit reason",
         lambda now: now.wanted and now.is_stationary and not now.inhibit_reason,
         "clearing",
     ),
     TransitionRow(
         ("clearing",),
-        "no override and no trip is reported, at the earliest after 120 ms",
-        lambda now: now.since_ns >= PAUSE_NS and not now.overrides and not now.trips,
+        "no override and no trip is reported, after at least 120 ms",
+        lambda now: now.in_state_ns >= PAUSE_NS and not now.overrides and not now.trips,
         "enabling",
     ),
-    TransitionRow(("clearing",), "it has taken 3 s", _did_not("clear"), "lost"),
+    TransitionRow(("clearing",), "3 s have passed", _timed_out("clear"), "lost"),
     TransitionRow(
         ("enabling",),
         "all axes are reported enabled, and the gear is DRIVE",
         lambda now: len(now.enabled) == len(AXES) and now.gear == "drive",
         "engaged",
     ),
-    TransitionRow(("enabling",), "it has taken 3 s", _did_not("enable"), "lost"),
+    TransitionRow(("enabling",), "3 s have passed", _timed_out("enable"), "lost"),
     TransitionRow(
         ("parking",),
-        "no axis is reported enabled, at the earliest after 120 ms",
-        lambda now: now.since_ns >= PAUSE_NS and not now.enabled,
+        "no axis is reported enabled, after at least 120 ms",
+        lambda now: now.in_state_ns >= PAUSE_NS and not now.enabled,
         "idle",
     ),
     TransitionRow(
         ("lost",),
-        "driving is not wanted any more, reports come, and an axis is still enabled",
-        lambda now: not now.wanted and not now.unheard and bool(now.enabled),
+        "driving is no longer wanted, no report is missing, and an axis is still enabled",
+        lambda now: not now.wanted and not now.missing_reports and bool(now.enabled),
         "parking",
     ),
     TransitionRow(
         ("lost",),
-        "driving is not wanted any more, reports come, and no axis is enabled",
-        lambda now: not now.wanted and not now.unheard,
+        "driving is no longer wanted, no report is missing, and no axis is enabled",
+        lambda now: not now.wanted and not now.missing_reports,
         "idle",
     ),
     TransitionRow(
         ("overridden",),
-        "driving is not wanted any more, and the car stands",
-        lambda now: not now.wanted and now.is_stationary and not now.unheard and not now.enabled,
+        "driving is no longer wanted, no report is missing, no axis is enabled, and the car is stationary",
+        lambda now: not now.wanted and now.is_stationary and not now.missing_reports and not now.enabled,
         "idle",
     ),
 )
-"""What leads from state to state."""
+"""Transitions between the states."""
 
 
-def following(state: State, now: Situation) -> tuple[State, str]:
-    """Give the state that follows, the same where no row fits, and why."""
+def next_state(state: State, now: Situation) -> tuple[State, str]:
+    """Return the next state and the reason; the same state and no reason if no row matches."""
     for row in TABLE:
-        if state in row.sources and (why := row.case(now)):
-            return row.target, why if isinstance(why, str) else row.words
+        if state in row.sources and (reason := row.condition(now)):
+            return row.target, reason if isinstance(reason, str) else row.description
     return state, ""

@@ -1,6 +1,6 @@
-"""What is heard on a bus, in words: each message, how often, what it says, what changed and what is wrong with it.
+"""Statistics of the traffic on a bus: each message's rate, values, changes and errors.
 
-Sans-IO: frames and `now` in, what there is to tell out. It only listens.
+Sans-IO and passive: it takes received frames and times and returns summaries.
 """
 
 from __future__ import annotations
@@ -13,73 +13,74 @@ from dataclasses import dataclass, field
 from lavt.domain import NS_PER_MS, NS_PER_S
 from lavt.vehicle.can_frame import CanFrame, ReceivedCanFrame
 from lavt.vehicle.dbw.codec import Codec, MessageFacts, SignalFacts
-from lavt.vehicle.dbw.crc8 import frame_crc8
+from lavt.vehicle.dbw.crc8 import has_valid_checksum
 
 Values = Mapping[str, float | None]
 
-MOST_UNKNOWN = 1000
-"""So many identifiers that nobody knows are counted one by one."""
-OTHERS = (-1, False)
-"""Those after them."""
+MAX_UNKNOWN = 1000
+"""Unknown identifiers that are counted separately."""
+OTHER_IDENTIFIERS = (-1, False)
+"""The key that counts all further ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedMessages:
-    """What a profile says of messages, for whoever listens; without one nothing is expected."""
+    """A profile's expectations of the messages on the bus; none by default."""
 
     checksums: AbstractSet[str] = frozenset()
-    """Names of signals that are one."""
+    """Names of checksum signals."""
     counters: AbstractSet[str] = frozenset()
-    """Names of signals that count frames."""
+    """Names of counter signals."""
     timeouts_ns: Mapping[str, int] = field(default_factory=dict)
-    """Of messages that have to come."""
+    """By message name, for messages that must be received."""
     short_lengths: AbstractSet[int] = frozenset()
-    """Lengths that a frame may have though its message is longer."""
+    """Lengths that a frame may have although its message is longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class MessageSummary:
-    """What there is to tell of one message."""
+    """Statistics of one message."""
 
     facts: MessageFacts
     frames: int
     rate_hz: float
     values: Values
-    """The newest; a value that is not there is None."""
+    """The newest values; None for a missing value."""
     changed: tuple[str, ...]
-    """Signals that changed since the last time, but for counters and checksums."""
+    """Signals that changed in the period, without counters and checksums."""
     wrong: tuple[str, ...]
+    """Errors in the period."""
 
 
 class BusTraffic:
-    """Listens to a bus; `unknown` counts frames of no message, by identifier (and whether it has 29 bits)."""
+    """Statistics of a bus; `unknown` counts frames of unknown messages, by identifier and whether it has 29 bits."""
 
     def __init__(self, codec: Codec, expected: ExpectedMessages, *, start_ns: int) -> None:
         self.unknown: Counter[tuple[int, bool]] = Counter()
         self._codec, self._expected = codec, expected
-        self._start_ns = self._told_ns = start_ns
+        self._start_ns = self._period_start_ns = start_ns
         self._names = {(facts.identifier, facts.is_extended): name for name, facts in codec.messages.items()}
-        self._heard = {name: _Heard() for name in codec.messages if name in expected.timeouts_ns}
+        self._received = {name: _ReceivedMessage() for name in codec.messages if name in expected.timeouts_ns}
 
-    def hear(self, heard: ReceivedCanFrame) -> None:
-        """Take a frame, whatever it is."""
-        key = (heard.frame.identifier, heard.frame.is_extended)
+    def receive(self, received: ReceivedCanFrame) -> None:
+        """Process any frame from the bus."""
+        key = (received.frame.identifier, received.frame.is_extended)
         name = self._names.get(key)
         if name is None:
-            self.unknown[key if key in self.unknown or len(self.unknown) < MOST_UNKNOWN else OTHERS] += 1
+            self.unknown[key if key in self.unknown or len(self.unknown) < MAX_UNKNOWN else OTHER_IDENTIFIERS] += 1
             return
-        message = self._heard.setdefault(name, _Heard())
-        facts, tallies = self._codec.messages[name], (message.lately, message.in_all)
+        message = self._received.setdefault(name, _ReceivedMessage())
+        facts, tallies = self._codec.messages[name], (message.period, message.total)
         if message.last_ns is not None:
             for tally in tallies:
-                tally.longest_gap_ns = max(tally.longest_gap_ns, heard.arrived_ns - message.last_ns)
-        message.last_ns = heard.arrived_ns
-        wrong = self._wrong(heard.frame, facts)
-        decoded = self._codec.decode(heard.frame, short=True)
+                tally.longest_gap_ns = max(tally.longest_gap_ns, received.arrived_ns - message.last_ns)
+        message.last_ns = received.arrived_ns
+        wrong = self._frame_errors(received.frame, facts)
+        decoded = self._codec.decode(received.frame, short=True)
         if decoded is None:
-            wrong.append("cannot be read")
+            wrong.append("cannot be decoded")
         else:
-            wrong += self._miscounted(message, decoded[1])
+            wrong += self._counter_errors(message, decoded[1])
             for tally in tallies:
                 tally.changed |= self._changes(message.values, decoded[1])
             message.values = decoded[1]
@@ -87,56 +88,61 @@ class BusTraffic:
             tally.frames += 1
             tally.wrong.update(wrong)
 
-    def tell(self, now_ns: int) -> list[MessageSummary]:
-        """Tell each message that was ever heard or has to come, as of now; rate, changes and wrongs since last told."""
-        told = [self._told(name, message, message.lately, self._told_ns, now_ns) for name, message in self._sorted()]
-        for message in self._heard.values():
-            message.lately = _Tally()
-        self._told_ns = now_ns
-        return told
+    def take_period(self, now_ns: int) -> list[MessageSummary]:
+        """Return a summary of each received or expected message since the last call, and start a new period."""
+        summaries = [
+            self._summary(name, message, message.period, self._period_start_ns, now_ns)
+            for name, message in self._sorted()
+        ]
+        for message in self._received.values():
+            message.period = _Tally()
+        self._period_start_ns = now_ns
+        return summaries
 
-    def tell_all(self, now_ns: int) -> list[MessageSummary]:
-        """The same of the whole time."""
-        return [self._told(name, message, message.in_all, self._start_ns, now_ns) for name, message in self._sorted()]
+    def total(self, now_ns: int) -> list[MessageSummary]:
+        """Return a summary of each received or expected message since the start."""
+        return [self._summary(name, message, message.total, self._start_ns, now_ns) for name, message in self._sorted()]
 
-    def _sorted(self) -> list[tuple[str, _Heard]]:
-        return sorted(self._heard.items(), key=lambda item: self._codec.messages[item[0]].identifier)
+    def _sorted(self) -> list[tuple[str, _ReceivedMessage]]:
+        return sorted(self._received.items(), key=lambda item: self._codec.messages[item[0]].identifier)
 
-    def _told(self, name: str, message: _Heard, tally: _Tally, since_ns: int, now_ns: int) -> MessageSummary:
-        wrong = [words if count == 1 else f"{words} ({count} times)" for words, count in tally.wrong.items()]
+    def _summary(
+        self, name: str, message: _ReceivedMessage, tally: _Tally, since_ns: int, now_ns: int
+    ) -> MessageSummary:
+        wrong = [text if count == 1 else f"{text} ({count} times)" for text, count in tally.wrong.items()]
         timeout_ns = self._expected.timeouts_ns.get(name)
         if message.last_ns is None:
-            wrong.append("never came")
+            wrong.append("never received")
         elif timeout_ns is not None:
-            silent_ns = max(tally.longest_gap_ns, now_ns - message.last_ns)
-            if silent_ns > timeout_ns:
-                wrong.append(f"silent for {silent_ns // NS_PER_MS} ms, longer than {timeout_ns // NS_PER_MS} ms")
+            gap_ns = max(tally.longest_gap_ns, now_ns - message.last_ns)
+            if gap_ns > timeout_ns:
+                wrong.append(f"gap of {gap_ns // NS_PER_MS} ms, longer than {timeout_ns // NS_PER_MS} ms")
         ignored = self._expected.checksums | self._expected.counters
         return MessageSummary(
             facts=self._codec.messages[name],
-            frames=message.in_all.frames,
+            frames=message.total.frames,
             rate_hz=tally.frames * NS_PER_S / max(1, now_ns - since_ns),
             values=message.values,
             changed=tuple(sorted(tally.changed - ignored)),
             wrong=tuple(wrong),
         )
 
-    def _wrong(self, frame: CanFrame, facts: MessageFacts) -> list[str]:
-        """What is wrong with a frame as a whole."""
+    def _frame_errors(self, frame: CanFrame, facts: MessageFacts) -> list[str]:
+        """Return the errors of a frame's length and checksum."""
         length = len(frame.data)
         if length != facts.length:
             return [] if length in self._expected.short_lengths else [f"has {length} bytes, not {facts.length}"]
         has_checksum = not self._expected.checksums.isdisjoint(facts.signals)
-        if has_checksum and frame.data[-1] != frame_crc8(frame.identifier, frame.data[:-1], extended=frame.is_extended):
-            return ["its checksum is wrong"]
+        if has_checksum and not has_valid_checksum(frame):
+            return ["wrong checksum"]
         return []
 
-    def _miscounted(self, message: _Heard, values: Values) -> list[str]:
-        """What is wrong with a frame's counter: it has to differ from the one before."""
+    def _counter_errors(self, message: _ReceivedMessage, values: Values) -> list[str]:
+        """Return an error if a frame's counter equals the one before."""
         for name in self._expected.counters & values.keys():
             before, message.count = message.count, values[name]
             if before == message.count:
-                return [f"{name} stands still"]
+                return [f"{name} does not count"]
         return []
 
     def _changes(self, before: Values, after: Values) -> set[str]:
@@ -145,7 +151,7 @@ class BusTraffic:
 
 @dataclass(slots=True)
 class _Tally:
-    """What was heard of a message in a while."""
+    """Counts of a message in a period."""
 
     frames: int = 0
     longest_gap_ns: int = 0
@@ -154,18 +160,18 @@ class _Tally:
 
 
 @dataclass(slots=True)
-class _Heard:
-    """A message that came, or has to."""
+class _ReceivedMessage:
+    """The state of a received or expected message."""
 
     last_ns: int | None = None
     values: Values = field(default_factory=dict)
     count: float | None = None
-    lately: _Tally = field(default_factory=_Tally)
-    in_all: _Tally = field(default_factory=_Tally)
+    period: _Tally = field(default_factory=_Tally)
+    total: _Tally = field(default_factory=_Tally)
 
 
-def signal_words(signal: SignalFacts, value: float | None) -> str:
-    """Say a signal's value as a person would; empty for a flag that is not set. `?` marks an unverified signal."""
+def signal_text(signal: SignalFacts, value: float | None) -> str:
+    """Format a signal's value; empty for a flag that is not set. `?` marks an unverified signal."""
     name = signal.name + "?" * signal.is_unverified
     if value is None:
         return f"{name} -"

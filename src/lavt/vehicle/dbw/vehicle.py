@@ -1,4 +1,4 @@
-"""A car with a by-wire kit, as a `Vehicle`: an adapter on a port, and the truth where a software car tells it."""
+"""A car with a by-wire kit as a `Vehicle`: an adapter, a bus port, and a source of ground truth for a software car."""
 
 from __future__ import annotations
 
@@ -9,66 +9,66 @@ from lavt.domain import NS_PER_MS, Actuation, GroundTruth, VehicleEvent, Vehicle
 from lavt.vehicle.can_frame import BusGone, BusPort, CanFrame
 from lavt.vehicle.vehicle import Capabilities, ReachedCommand
 
-HEAR_PERIOD_NS = 10 * NS_PER_MS
-"""So often the bus is listened to; a kit's fastest report comes as often."""
+POLL_PERIOD_NS = 10 * NS_PER_MS
+"""Period at which the bus is read; it is the period of a kit's most frequent report."""
 
 
 class KitAdapter(Protocol):
-    """What speaks to a kind of kit, sans-IO: frames and times in, frames out."""
+    """A sans-IO controller for one kind of kit: it takes frames and times and returns frames."""
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted."""
+        """Event counters by name."""
         ...
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing is sent: the kit has let go, or a driver has the car."""
+        """Whether no commands are sent: the kit is released, or a driver overrides it."""
         ...
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
-        """Take a frame from the bus, whatever it is."""
+        """Process any frame from the bus."""
         ...
 
-    def bus_gone(self, why: str, now_ns: int) -> None:
-        """The bus cannot be written to or read from."""
+    def on_bus_gone(self, reason: str, now_ns: int) -> None:
+        """Note that the bus cannot be written to or read from."""
         ...
 
-    def ask(self, actuation: Actuation, now_ns: int) -> None:
-        """A tick: this is what the vehicle shall do now."""
+    def set_actuation(self, actuation: Actuation, now_ns: int) -> None:
+        """Set the actuation to request from now on: a tick."""
         ...
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Get the kit to obey, or let go of it."""
+        """Engage or disengage the kit."""
         ...
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
-        """Give the frames that have to leave now, of the newest tick."""
+        """Return the frames to send now for the newest tick."""
         ...
 
     def next_wake_ns(self) -> int:
-        """Tell when frames are due, or something is missing, at the latest."""
+        """Return the latest time at which frames are due or a report is missing."""
         ...
 
     def state(self) -> VehicleState:
-        """Tell what the kit reports of the car."""
+        """Return the state of the car as the kit reports it."""
         ...
 
     def take_events(self) -> list[VehicleEvent]:
-        """Take what has happened since the last call."""
+        """Return the events since the last call."""
         ...
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Take what was seen to have reached the wheels since the last call."""
+        """Return the commands that the kit reported as reached since the last call."""
         ...
 
 
-Truth = Callable[[int], tuple[GroundTruth | None, list[VehicleEvent]]]
-"""What a software car tells of itself by a time, beside the bus: the newest, and what has happened since then."""
+TruthSource = Callable[[int], tuple[GroundTruth | None, list[VehicleEvent]]]
+"""Returns a software car's newest ground truth, which is not on the bus, and its events since the last call."""
 
 
 class DbwVehicle:
-    """A `lavt.vehicle.vehicle.Vehicle`. Frames leave in `advance` and `apply` only: of the tick that is being made."""
+    """A `lavt.vehicle.vehicle.Vehicle` with a by-wire kit. Frames are sent only in `apply`, for its tick."""
 
     def __init__(
         self,
@@ -77,76 +77,76 @@ class DbwVehicle:
         capabilities: Capabilities,
         *,
         start_ns: int,
-        truth: Truth | None = None,
+        truth: TruthSource | None = None,
     ) -> None:
         self._adapter, self._port, self._truth = adapter, port, truth
         self._capabilities = capabilities
-        self._told = None if truth is None else truth(start_ns)[0]
-        self._heard_ns = start_ns
+        self._newest_truth = None if truth is None else truth(start_ns)[0]
+        self._polled_ns = start_ns
 
     @property
     def capabilities(self) -> Capabilities:
-        """What this vehicle is and can do."""
+        """The properties of this vehicle."""
         return self._capabilities
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """What was counted here and there."""
+        """Counters of the adapter and the port."""
         return {**self._adapter.counts, **self._port.counts}
 
     @property
     def is_silent(self) -> bool:
-        """Whether nothing is sent: the kit has let go, or a driver has the car."""
+        """Whether no commands are sent: the kit is released, or a driver overrides it."""
         return self._adapter.is_silent
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
-        """Hear what the kit has said, and return what happened, in order."""
-        self._hear(to_ns)
+        """Process received frames and return the events since the last call, in order."""
+        self._poll_bus(to_ns)
         events = self._adapter.take_events()
         if self._truth is not None:
-            truth, happened = self._truth(to_ns)
-            self._told = truth or self._told
-            events += happened
+            truth, new_events = self._truth(to_ns)
+            self._newest_truth = truth or self._newest_truth
+            events += new_events
         return sorted(events, key=lambda event: event.mono_ns)
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Ask the kit for `actuation`; what is due leaves at once, after what the kit has said by now was heard."""
-        self._hear(now_ns)
-        self._adapter.ask(actuation, now_ns)
+        """Process received frames, then request `actuation` and send the frames that are due."""
+        self._poll_bus(now_ns)
+        self._adapter.set_actuation(actuation, now_ns)
         try:
             self._port.send(self._adapter.frames_due(now_ns), now_ns)
         except BusGone as gone:
-            self._adapter.bus_gone(str(gone), now_ns)
+            self._adapter.on_bus_gone(str(gone), now_ns)
 
-    def _hear(self, now_ns: int) -> None:
-        self._heard_ns = now_ns
+    def _poll_bus(self, now_ns: int) -> None:
+        self._polled_ns = now_ns
         try:
-            for heard in self._port.take(now_ns):
-                self._adapter.receive(heard.frame, min(heard.arrived_ns, now_ns))
+            for received in self._port.take(now_ns):
+                self._adapter.receive(received.frame, min(received.arrived_ns, now_ns))
         except BusGone as gone:
-            self._adapter.bus_gone(str(gone), now_ns)
+            self._adapter.on_bus_gone(str(gone), now_ns)
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Get the kit to obey, or let go of it once the car stands."""
+        """Engage the kit, or disengage it once the car is stationary."""
         self._adapter.engage(wanted, now_ns)
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Take what the kit has reported to steer by since the last call."""
+        """Return the commands that the kit reported as reached since the last call."""
         return self._adapter.take_reached()
 
     def state(self) -> VehicleState:
-        """Tell what the kit reports."""
+        """Return the state that the kit reports."""
         return self._adapter.state()
 
     def ground_truth(self) -> GroundTruth | None:
-        """Tell the newest truth of a software car."""
-        return self._told
+        """Return a software car's newest ground truth, or None."""
+        return self._newest_truth
 
     def next_wake_ns(self) -> int:
-        """Tell when frames are due or expected."""
+        """Return the latest time at which frames are due or expected."""
         port_ns = self._port.next_wake_ns()
-        return min(self._adapter.next_wake_ns(), self._heard_ns + HEAR_PERIOD_NS if port_ns is None else port_ns)
+        return min(self._adapter.next_wake_ns(), self._polled_ns + POLL_PERIOD_NS if port_ns is None else port_ns)
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus."""
         self._port.close()

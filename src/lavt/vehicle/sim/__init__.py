@@ -1,1 +1,1 @@
-"""The built-in simulator: roads, a car's dynamics, a camera rendered on the CPU, and a judge."""
+"""The built-in simulator: roads, vehicle dynamics, a camera rendered on the CPU, and a route monitor."""

@@ -1,4 +1,7 @@
-"""Where a car is on its road, and what happens to it there: lanes left, rails hit, road left, route done, time over."""
+"""The route monitor: tracks a car on its road and reports lane invasions, collisions, leaving the road and completion.
+
+It also reports when the time limit is exceeded.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +19,24 @@ from lavt.vehicle.sim.road.road import PROJECTION_WINDOW_M, Road
 REFERENCE_SPEED_MPS = 30.0 / 3.6
 TIMEOUT_SLOWNESS = 3.0
 TIMEOUT_ALLOWANCE_S = 30.0
-"""A drive may take as long as the route takes at a third of 30 km/h, and this much more."""
+"""The default time limit is the route's time at a third of 30 km/h plus this allowance."""
 
 MOVING_MPS = 0.1
-"""The time of a drive counts from when the car is first faster than this."""
+"""A drive's time counts from the moment the car first exceeds this speed."""
 
 CONTACT_GAP_NS = NS_PER_S // 2
-"""A car that has been clear of all rails for so long and touches one again has another collision."""
+"""A contact later than this after the last one is another collision."""
 
-LONGEST_UNSEEN_M = PROJECTION_WINDOW_M / 3
-"""So far a body may move before it is looked at again: projections look around the station that was seen last."""
+MAX_UNCHECKED_M = PROJECTION_WINDOW_M / 3
+"""The farthest the body may move between checks, because projections search around the last known station."""
 
-Place = tuple[float, float, float]
-"""Station (m), lateral offset (m) and the road's heading (rad) of a point of the body."""
+RoadPosition = tuple[float, float, float]
+"""Station (m) and lateral offset (m) of a point of the body, and the road's heading (rad) there."""
 
 
 @value
 class TrackingError:
-    """A car against the centre of its lane; see `GroundTruth` for what is measured where."""
+    """A car's pose relative to its lane's centre; `GroundTruth` defines where each value is measured."""
 
     cross_track_m: float
     heading_error_rad: float
@@ -41,12 +44,12 @@ class TrackingError:
 
 
 def time_limit_s(length_m: float) -> float:
-    """Time that a drive of a route may take where nobody says otherwise."""
+    """Return the default time limit for a route of this length."""
     return length_m / (REFERENCE_SPEED_MPS / TIMEOUT_SLOWNESS) + TIMEOUT_ALLOWANCE_S
 
 
 class RouteMonitor:
-    """Judges one drive; each ending happens once, lanes are left and rails are touched as often as they are."""
+    """A monitor of one drive: it reports timeout, leaving the road and completion once, other events each time."""
 
     def __init__(self, road: Road, parameters: CarParameters, near_s_m: float, *, limit_s: float | None = None) -> None:
         self._road = road
@@ -57,58 +60,60 @@ class RouteMonitor:
         self._limit_ns = round((time_limit_s(road.length_m) if limit_s is None else limit_s) * NS_PER_S)
         self._began_ns: int | None = None
         self._lanes: tuple[int, int] | None = None
-        self._happened: set[EventKind] = set()
+        self._reported: set[EventKind] = set()
         self._near_s_m = near_s_m
-        self._touched_ns: int | None = None
+        self._last_contact_ns: int | None = None
         self._rails = tuple((rail, math.copysign(1.0, rail.offset_m)) for rail in road.rails)
-        self._quiet = _QuietInterval(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
+        self._event_margin = _EventMargin(road, reach_m=max(math.hypot(*corner) for corner in self._corners))
         self.contacts: tuple[Contact, ...] = ()
-        """Where the body touches a rail at the moment judged last."""
+        """The body's contacts with rails at the last update."""
 
     def track(self, motion: CarMotion) -> TrackingError:
-        """Measure the rear axle against the centre of the lane."""
+        """Return the rear axle's position and heading relative to the lane's centre."""
         s_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         return TrackingError(lateral_m, math.remainder(motion.heading_rad - heading_rad, 2 * math.pi), s_m)
 
-    def judge(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
-        """Tell what has happened since the last call; call it at every step."""
-        # In a rail it is looked at every time: the contact may deepen or end, and lasts while the car stands in it.
-        quiet = not self.contacts and self._quiet.holds(motion)
-        events = [] if quiet else self._look(motion, at_ns)
+    def update(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
+        """Return the events since the last call; it must be called at every step."""
+        # In contact with a rail, check every step: the contact may deepen or end, and lasts while the car stays in it.
+        can_skip = not self.contacts and self._event_margin.covers(motion)
+        events = [] if can_skip else self._check_body(motion, at_ns)
         if self._began_ns is None:
             if motion.speed_mps > MOVING_MPS:
                 self._began_ns = at_ns
         elif at_ns - self._began_ns > self._limit_ns:
-            events += self._once("timeout", f"{self._limit_ns / NS_PER_S:.0f} s were not enough", at_ns)
+            events += self._report_once("timeout", f"{self._limit_ns / NS_PER_S:.0f} s were not enough", at_ns)
         return events
 
-    def _look(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
-        """Find out where the whole body is, and what that means."""
+    def _check_body(self, motion: CarMotion, at_ns: int) -> list[VehicleEvent]:
+        """Project the whole body onto the road and return the events that follow."""
         progress_m, lateral_m, heading_rad = self._road.project(motion.x_m, motion.y_m, self._near_s_m)
         self._near_s_m = progress_m
-        *corners, middle = self._places(motion, (*self._corners, self._middle))
-        offsets_m = [place[1] for place in corners]
+        *corners, middle = self._project_points(motion, (*self._corners, self._middle))
+        offsets_m = [position[1] for position in corners]
         events = self._lane_events(max(offsets_m), min(offsets_m), at_ns)
-        self.contacts, hit = self._contacts(corners)
-        if hit is not None:
-            if self._touched_ns is None or at_ns - self._touched_ns > CONTACT_GAP_NS:
-                events.append(VehicleEvent(at_ns, "collision", f"the {hit.kind} was reached at {progress_m:.1f} m"))
-            self._touched_ns = at_ns
+        self.contacts, touched_rail = self._find_contacts(corners)
+        if touched_rail is not None:
+            if self._last_contact_ns is None or at_ns - self._last_contact_ns > CONTACT_GAP_NS:
+                events.append(
+                    VehicleEvent(at_ns, "collision", f"the {touched_rail.kind} was reached at {progress_m:.1f} m")
+                )
+            self._last_contact_ns = at_ns
         elif not self._on_asphalt(middle):
-            events += self._once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
+            events += self._report_once("off_road", f"the asphalt was left at {progress_m:.1f} m", at_ns)
         if progress_m >= self._road.length_m:
-            events += self._once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
-        self._quiet.begin(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
+            events += self._report_once("completed", f"{self._road.length_m:.1f} m were driven", at_ns)
+        self._event_margin.restart(motion, ((progress_m, lateral_m, heading_rad), *corners, middle))
         return events
 
-    def _once(self, kind: EventKind, detail: str, at_ns: int) -> list[VehicleEvent]:
-        if kind in self._happened:
+    def _report_once(self, kind: EventKind, detail: str, at_ns: int) -> list[VehicleEvent]:
+        if kind in self._reported:
             return []
-        self._happened.add(kind)
+        self._reported.add(kind)
         return [VehicleEvent(at_ns, kind, detail)]
 
-    def _places(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[Place]:
-        """Places of points of the body that are given ahead and to the left of the rear axle."""
+    def _project_points(self, motion: CarMotion, points: Iterable[tuple[float, float]]) -> list[RoadPosition]:
+        """Return the road positions of body points, which are given ahead and to the left of the rear axle."""
         cosine, sine = math.cos(motion.heading_rad), math.sin(motion.heading_rad)
         project, near_s_m = self._road.project, self._near_s_m
         return [
@@ -117,7 +122,7 @@ class RouteMonitor:
         ]
 
     def _lane_events(self, left_m: float, right_m: float, at_ns: int) -> list[VehicleEvent]:
-        """Make an event for each edge of the body that is in another lane than before; lanes count from the right.
+        """Return an event for each edge of the body that has changed lanes; lanes count from the right.
 
         An edge that is exactly on a line is still in the body's lane.
         """
@@ -132,44 +137,44 @@ class RouteMonitor:
             if old != new
         ]
 
-    def _contacts(self, corners: Sequence[Place]) -> tuple[tuple[Contact, ...], Rail | None]:
-        """Find the corners that are in a rail, and the rail; a body that is wholly behind a rail does not touch it."""
-        found, hit = [], None
+    def _find_contacts(self, corners: Sequence[RoadPosition]) -> tuple[tuple[Contact, ...], Rail | None]:
+        """Return the corners inside a rail and that rail; a body entirely behind a rail does not touch it."""
+        found, touched_rail = [], None
         highest_m, lowest_m = max([each[1] for each in corners]), min([each[1] for each in corners])
         for rail, side in self._rails:
             if (highest_m < rail.offset_m) if side > 0.0 else (lowest_m > rail.offset_m):
-                continue  # before the rail with every corner, as nearly always
+                continue  # the common case: all corners are clear of the rail
             depths_m = [side * (lateral_m - rail.offset_m) for _, lateral_m, _ in corners]
             if min(depths_m) >= 0.0:
                 continue
             for (ahead_m, left_m), (s_m, _, heading_rad), depth_m in zip(self._corners, corners, depths_m, strict=True):
                 if depth_m >= 0.0 and rail.from_m <= s_m <= rail.to_m:
-                    # Out is the shortest way: across, or along, for a car that has run against an end of the rail.
+                    # The way out is the shortest: across, or along the road for a car that hit an end of the rail.
                     ways = (
                         (depth_m, heading_rad - side * math.pi / 2),
                         (s_m - rail.from_m, heading_rad + math.pi),
                         (rail.to_m - s_m, heading_rad),
                     )
                     found.append(Contact(ahead_m, left_m, *min(ways)))
-                    hit = hit or rail
-        return tuple(found), hit
+                    touched_rail = touched_rail or rail
+        return tuple(found), touched_rail
 
-    def _on_asphalt(self, place: Place) -> bool:
-        s_m, lateral_m, _ = place
+    def _on_asphalt(self, position: RoadPosition) -> bool:
+        s_m, lateral_m, _ = position
         return any(
             strip.right_m <= lateral_m <= strip.left_m and strip.from_m <= s_m <= strip.to_m
             for strip in self._road.paved
         )
 
 
-class _QuietInterval:
-    """Knows for how far nothing can happen: until a point of the body may have reached the nearest line that counts.
+class _EventMargin:
+    """The margin the body may move before an event is possible: until it may have reached the nearest boundary.
 
-    Lines that count are edges of lanes and of asphalt, rails, the stations where these begin and end, and the end of
-    the route. A point's station changes by no more than the point moves over `_slowest`: on the inside of a curve
-    stations are closer together than metres. Its lateral offset changes by how far it moves across the road as that
-    runs where it was looked at, and by how far the road may have bent away from there. While the body is between the
-    rails, it does not matter where these begin and end.
+    Boundaries are the edges of lanes and asphalt, the rails, the stations where asphalt and rails begin and end, and
+    the end of the route. When a point moves by d, its station changes by at most d / `_station_scale`: on the inside of
+    a curve stations are closer together than metres. Its lateral offset changes by its movement across the road's
+    direction at the last check, plus the distance by which the road may have bent away since. While the body is between
+    the rails, their ends do not matter.
     """
 
     def __init__(self, road: Road, reach_m: float) -> None:
@@ -180,50 +185,54 @@ class _QuietInterval:
         rails = [end_m for rail in road.rails for end_m in (rail.from_m, rail.to_m)]
         self._stations_m = sorted({road.length_m, *filter(math.isfinite, asphalt)})
         self._all_stations_m = sorted({*self._stations_m, *filter(math.isfinite, rails)})
-        self._inside_m = (
+        self._between_rails_m = (
             max((rail.offset_m for rail in road.rails if rail.offset_m < 0.0), default=-math.inf),
             min((rail.offset_m for rail in road.rails if rail.offset_m >= 0.0), default=math.inf),
         )
         widest_m = max(abs(self._offsets_m[0]), abs(self._offsets_m[-1])) + reach_m
         tightest = max(max(abs(each.curvature_per_m), abs(each.end_curvature_per_m)) for each in road.segments)
-        self._slowest = 1.0 - tightest * widest_m
-        self._bend_per_m = tightest / self._slowest if self._slowest > 0.0 else math.inf
-        self._from = (math.inf, math.inf, 0.0)
-        self._across = (0.0, 1.0)
-        self._spread_rad = 0.0
-        self._room_m = self._stretch_m = 0.0
+        self._station_scale = 1.0 - tightest * widest_m
+        self._bend_per_m = tightest / self._station_scale if self._station_scale > 0.0 else math.inf
+        self._reference_pose = (math.inf, math.inf, 0.0)
+        self._across_direction = (0.0, 1.0)
+        self._heading_spread_rad = 0.0
+        self._across_margin_m = self._along_margin_m = 0.0
 
-    def begin(self, motion: CarMotion, places: Sequence[Place]) -> None:
-        """Note where the body was looked at, the rear axle first, and how far it is from what counts."""
-        if self._slowest <= 0.0:
-            return  # a road for which this reckoning does not hold is looked at every time
-        self._from = (motion.x_m, motion.y_m, motion.heading_rad)
-        road_rad = places[0][2]
-        self._across = (-math.sin(road_rad), math.cos(road_rad))
-        self._spread_rad = max([abs(heading_rad - road_rad) for _, _, heading_rad in places])
+    def restart(self, motion: CarMotion, positions: Sequence[RoadPosition]) -> None:
+        """Store a checked pose and its distance from the boundaries; the first position is the rear axle's."""
+        if self._station_scale <= 0.0:
+            return  # the bound does not hold on this road: check every step
+        self._reference_pose = (motion.x_m, motion.y_m, motion.heading_rad)
+        road_rad = positions[0][2]
+        self._across_direction = (-math.sin(road_rad), math.cos(road_rad))
+        self._heading_spread_rad = max([abs(heading_rad - road_rad) for _, _, heading_rad in positions])
         offsets_m = self._offsets_m
-        self._room_m = min([_distance_m(offsets_m, lateral_m) for _, lateral_m, _ in places])
-        right_m, left_m = self._inside_m
-        inside = all(right_m < lateral_m < left_m for _, lateral_m, _ in places)
+        self._across_margin_m = min([_distance_m(offsets_m, lateral_m) for _, lateral_m, _ in positions])
+        right_m, left_m = self._between_rails_m
+        inside = all(right_m < lateral_m < left_m for _, lateral_m, _ in positions)
         stations_m = self._stations_m if inside else self._all_stations_m
-        along_m = min([_distance_m(stations_m, s_m) for s_m, _, _ in places])
-        self._stretch_m = min(along_m * self._slowest, LONGEST_UNSEEN_M)
+        along_m = min([_distance_m(stations_m, s_m) for s_m, _, _ in positions])
+        self._along_margin_m = min(along_m * self._station_scale, MAX_UNCHECKED_M)
 
-    def holds(self, motion: CarMotion) -> bool:
-        """Whether no point of the body can have reached a line since it was looked at."""
-        x_m, y_m, heading_rad = self._from
+    def covers(self, motion: CarMotion) -> bool:
+        """Return whether no point of the body can have reached a boundary since the last check."""
+        x_m, y_m, heading_rad = self._reference_pose
         dx_m, dy_m = motion.x_m - x_m, motion.y_m - y_m
         moved_m = math.hypot(dx_m, dy_m)
         turned_m = self._reach_m * abs(motion.heading_rad - heading_rad)
-        most_m = moved_m + turned_m
-        if not most_m < self._stretch_m:
+        max_moved_m = moved_m + turned_m
+        if not max_moved_m < self._along_margin_m:
             return False
-        across_m = abs(dx_m * self._across[0] + dy_m * self._across[1]) + moved_m * self._spread_rad + turned_m
-        return across_m + self._bend_per_m * most_m * most_m / 2 < self._room_m
+        across_m = (
+            abs(dx_m * self._across_direction[0] + dy_m * self._across_direction[1])
+            + moved_m * self._heading_spread_rad
+            + turned_m
+        )
+        return across_m + self._bend_per_m * max_moved_m * max_moved_m / 2 < self._across_margin_m
 
 
 def _distance_m(lines_m: Sequence[float], at_m: float) -> float:
-    """Distance from a coordinate to the nearest of sorted lines."""
+    """Return the distance from a coordinate to the nearest of sorted lines."""
     index = bisect_left(lines_m, at_m)
     above_m = lines_m[index] - at_m if index < len(lines_m) else math.inf
     below_m = at_m - lines_m[index - 1] if index else math.inf

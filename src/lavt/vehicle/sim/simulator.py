@@ -1,4 +1,4 @@
-"""A simulated car on a road, on a fixed grid of the monotonic clock."""
+"""A simulated car on a road, sampled on a fixed time grid of the monotonic clock."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ STEPS_PER_S = 240
 START_LATERAL_M = 0.25
 START_HEADING_RAD = math.radians(1.5)
 START_AHEAD_M = 2.0
-"""How far the start may lie from the route's: to both sides, in heading, and ahead; drawn by the run's seed."""
+"""Bounds of a run's offset from the route's start: to both sides, in heading, and ahead; the seed draws the values."""
 
-AT_REST = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
+INITIAL_ACTUATION = Actuation(steering_rad=0.0, throttle=0.0, brake=1.0)
 
 
 def grid_ns(index: int) -> int:
-    """Time of a point of the grid; from the index each time, so that nothing drifts."""
+    """Return the time of a grid point, computed from its index so that no error accumulates."""
     return index * NS_PER_S // STEPS_PER_S
 
 
 def start_of(seed: int) -> tuple[float, float, float]:
-    """Give where a run begins against the route's start: metres ahead, metres to the left, heading in rad."""
+    """Return a run's start relative to the route's start: metres ahead, metres to the left, heading in rad."""
     return (
         float(stream(seed, "start position").uniform(0.0, START_AHEAD_M)),
         float(stream(seed, "start lateral").uniform(-START_LATERAL_M, START_LATERAL_M)),
@@ -38,11 +38,11 @@ def start_of(seed: int) -> tuple[float, float, float]:
 
 
 class Simulator:
-    """A `lavt.vehicle.vehicle.Vehicle`: it stands at the start, brake on, until it is told otherwise.
+    """A simulated `lavt.vehicle.vehicle.Vehicle`, stationary at the start with its brake on until a command arrives.
 
-    Its time is a grid of 1/240 s on the monotonic clock. It begins at the first point at or after `start_mono_ns`;
-    `advance` takes every step up to the time given, however late it is called. After a collision the car stays where
-    it is or, with `goes_on`, slides along what it has hit.
+    Physics is lazy: `advance` takes every step up to the time given, however late it is called. Steps lie on a grid of
+    1/240 s on the monotonic clock; the first grid point is at or after `start_mono_ns`. After a collision the car stays
+    where it is or, with `continue_after_collision`, slides along the obstacle.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class Simulator:
         seed: int,
         start_mono_ns: int,
         parameters: CarParameters = LINCOLN_MKZ,
-        goes_on: bool = False,
+        continue_after_collision: bool = False,
         limit_s: float | None = None,
     ) -> None:
-        self._parameters, self._goes_on = parameters, goes_on
+        self._parameters, self._continues_after_collision = parameters, continue_after_collision
         self._steering_dead_ns = round(parameters.steering_dead_time_s * NS_PER_S)
         self._pedal_dead_ns = round(parameters.pedal_dead_time_s * NS_PER_S)
         self._index = -(-start_mono_ns * STEPS_PER_S // NS_PER_S)
@@ -63,18 +63,18 @@ class Simulator:
         x_m, y_m = road.across(ahead_m, lateral_m).tolist()
         motion = CarMotion(x_m, y_m, float(road.point(ahead_m)[2]) + turned_rad)
         self._car = CarDynamics(parameters, motion, 1.0 / STEPS_PER_S)
-        self._judge = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
-        self._judge.judge(motion, grid_ns(self._index))
-        self._actuation = AT_REST
+        self._route_monitor = RouteMonitor(road, parameters, near_s_m=ahead_m, limit_s=limit_s)
+        self._route_monitor.update(motion, grid_ns(self._index))
+        self._actuation = INITIAL_ACTUATION
         self._steering: deque[tuple[int, float]] = deque()
         self._pedals: deque[tuple[int, float, float]] = deque()
-        self._wrecked = False
-        self._told: VehicleState | None = None
-        """The state at the newest point of the grid, once it was asked for."""
+        self._crashed = False
+        self._state: VehicleState | None = None
+        """The state at the newest grid point, cached once it has been read."""
 
     @property
     def capabilities(self) -> Capabilities:
-        """What this vehicle is and can do."""
+        """The vehicle's capabilities and limits."""
         parameters = self._parameters
         return Capabilities(
             simulated=True,
@@ -89,46 +89,46 @@ class Simulator:
         )
 
     def advance(self, to_ns: int) -> list[VehicleEvent]:
-        """Take every step of the grid up to `to_ns` and return what happened on the way, in order."""
+        """Take every step up to `to_ns` and return the events on the way, in order."""
         events: list[VehicleEvent] = []
-        car, judge, steering, pedals = self._car, self._judge, self._steering, self._pedals
+        car, monitor, steering, pedals = self._car, self._route_monitor, self._steering, self._pedals
         at_ns, next_ns = grid_ns(self._index), grid_ns(self._index + 1)
-        self._told = None
+        self._state = None
         while next_ns <= to_ns:
             if (steering and steering[0][0] <= at_ns) or (pedals and pedals[0][0] <= at_ns):
-                self._accept(at_ns)
+                self._apply_due_commands(at_ns)
             self._index += 1
             at_ns, next_ns = next_ns, grid_ns(self._index + 1)
-            if self._wrecked:
+            if self._crashed:
                 continue
             car.step(self._actuation)
-            happened = judge.judge(car.motion, at_ns)
-            if self._goes_on:
-                for contact in judge.contacts:
-                    car.slide(contact)
-            elif happened and any(event.kind == "collision" for event in happened):
-                self._wrecked = True
-                car.stop_dead()
-            events += happened
+            new_events = monitor.update(car.motion, at_ns)
+            if self._continues_after_collision:
+                for contact in monitor.contacts:
+                    car.resolve_contact(contact)
+            elif new_events and any(event.kind == "collision" for event in new_events):
+                self._crashed = True
+                car.stop()
+            events += new_events
         return events
 
     def apply(self, actuation: Actuation, now_ns: int) -> None:
-        """Obey `actuation` from the first point of the grid at or after `now_ns` and the dead times.
+        """Put `actuation` into effect at the first grid point at or after `now_ns` plus the dead times.
 
-        Call it with growing times.
+        Calls must have increasing times.
         """
         self._steering.append((now_ns + self._steering_dead_ns, actuation.steering_rad))
         self._pedals.append((now_ns + self._pedal_dead_ns, actuation.throttle, actuation.brake))
 
     def engage(self, wanted: bool, now_ns: int) -> None:
-        """Do nothing: it always obeys."""
+        """Do nothing: the simulator is always engaged."""
 
     def take_reached(self) -> list[ReachedCommand]:
-        """Tell nothing: what is applied is in force after the dead times."""
+        """Return nothing: every command takes effect after the dead times."""
         return []
 
-    def _accept(self, at_ns: int) -> None:
-        """Take over what has become due."""
+    def _apply_due_commands(self, at_ns: int) -> None:
+        """Put the commands into effect whose dead time has passed."""
         steering_rad, throttle, brake = self._actuation.steering_rad, self._actuation.throttle, self._actuation.brake
         while self._steering and self._steering[0][0] <= at_ns:
             _, steering_rad = self._steering.popleft()
@@ -139,15 +139,15 @@ class Simulator:
             self._actuation = Actuation(steering_rad, throttle, brake)
 
     def state(self) -> VehicleState:
-        """Tell speed and road wheel angle at the newest point of the grid."""
-        if self._told is None:
+        """Return speed and road wheel angle at the newest grid point."""
+        if self._state is None:
             motion = self._car.motion
-            self._told = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
-        return self._told
+            self._state = VehicleState(grid_ns(self._index), motion.speed_mps, motion.steering_rad, "drive")
+        return self._state
 
     def ground_truth(self) -> GroundTruth:
-        """Tell the truth at the newest point of the grid."""
-        motion, track = self._car.motion, self._judge.track(self._car.motion)
+        """Return the ground truth at the newest grid point."""
+        motion, track = self._car.motion, self._route_monitor.track(self._car.motion)
         return GroundTruth(
             grid_ns(self._index),
             motion.x_m,
@@ -161,10 +161,10 @@ class Simulator:
         )
 
     def pose(self) -> Pose:
-        """Tell where the car is at the newest point of the grid."""
+        """Return the car's pose at the newest grid point."""
         motion = self._car.motion
         return Pose(grid_ns(self._index), motion.x_m, motion.y_m, motion.heading_rad)
 
     def next_wake_ns(self) -> int:
-        """Tell the next point of the grid."""
+        """Return the time of the next grid point."""
         return grid_ns(self._index + 1)

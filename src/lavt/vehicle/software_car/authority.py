@@ -1,4 +1,4 @@
-"""Who drives: which axes of a kit obey, why it lets go of them, and the watchdog that brakes then."""
+"""Authority over the axes: which of them are enabled, why the kit releases them, and the watchdog that then brakes."""
 
 from __future__ import annotations
 
@@ -9,66 +9,67 @@ from lavt.vehicle.software_car.generations import Generation
 from lavt.vehicle.software_car.state import AXES, Axis, KitState, ReleaseReason, SystemOrder, SystemState
 
 COMMAND_TIMEOUT_NS: Final = 100 * NS_PER_MS
-"""An actuator disables itself this long after its last valid command; a request to enable is as old at most."""
+"""An actuator is disabled, and a request to enable expires, this long after the last valid one."""
 WATCHDOG_BRAKE: Final = 0.5
-"""Ours: how hard the watchdog brakes."""
+"""Our choice: the watchdog's brake, as a fraction."""
 ENABLE, DISABLE = 1, 2
 PAUSED, REMOTE, CONTROL_ALLOWED = 1, 2, 3
-"""States of the remote's switch; 0 is its emergency stop."""
+"""States of the remote's switch; 0 is the emergency stop."""
 
 
 class Authority:
-    """Decides over the axes of a kit's state; `settle` after whatever has changed.
+    """The logic that enables and releases the axes. Call `update` after every change of the kit's state.
 
-    Without `has_watchdog` nothing brakes by itself.
+    Without `has_watchdog` the kit never brakes by itself.
     """
 
     def __init__(self, state: KitState, generation: Generation, *, has_watchdog: bool) -> None:
         self._state, self._generation, self.has_watchdog = state, generation, has_watchdog
         self.inhibit_reason = ReleaseReason.NONE
-        """Why generation 2 is not ready, if nothing in the state says so."""
+        """Why generation 2 is not ready, if the state contains no other reason."""
         self._system_count: int | None = None
         self._requested_ns: int | None = None
-        """When the newest request to enable came, while they keep coming."""
-        self._is_requested, self._is_spent = False, False
-        """Whether the system is to become active; whether it was, so that requests have to begin anew."""
+        """Time of the newest request to enable; None once it has expired."""
+        self._is_enable_pending, self._is_enable_used = False, False
+        """Whether the system is to become active, and whether the current requests have enabled it before: then they
+        must stop before new ones count."""
 
-    def request(self, order: SystemOrder, now_ns: int) -> None:
-        """Take generation 2's request to the system."""
+    def receive_system_order(self, order: SystemOrder, now_ns: int) -> None:
+        """Process generation 2's order to the system."""
         if not order.is_valid or order.count == self._system_count:
             return
         self._system_count = order.count
         if order.request == ENABLE:
-            self._requested_ns, self._is_requested = now_ns, not self._is_spent
+            self._requested_ns, self._is_enable_pending = now_ns, not self._is_enable_used
             return
-        self._requested_ns, self._is_requested, self._is_spent = None, False, False
+        self._requested_ns, self._is_enable_pending, self._is_enable_used = None, False, False
         if order.request == DISABLE and self._state.system == SystemState.ACTIVE:
-            self.lose("steering", ReleaseReason.REQUESTED)
+            self.release("steering", ReleaseReason.REQUESTED)
 
-    def live(self, now_ns: int) -> None:
-        """Forget a request to enable that is too old."""
+    def expire_request(self, now_ns: int) -> None:
+        """Discard a request to enable that is too old."""
         if self._requested_ns is not None and self._requested_ns + COMMAND_TIMEOUT_NS <= now_ns:
-            self._requested_ns, self._is_requested, self._is_spent = None, False, False
+            self._requested_ns, self._is_enable_pending, self._is_enable_used = None, False, False
 
-    def settle(self) -> None:
-        """Let go of what may be enabled no longer, enable what may be, and see what comes out."""
+    def update(self) -> None:
+        """Release axes that may no longer be enabled, enable those that may be, and set the pedals."""
         state = self._state
         for axis in AXES:
             if not state.actuators[axis].may_be_enabled:
-                self.lose(axis, ReleaseReason.FAULT if state.actuators[axis].faults else ReleaseReason.DISABLED)
-        state.not_ready = self._why_not_ready()
+                self.release(axis, ReleaseReason.FAULT if state.actuators[axis].faults else ReleaseReason.DISABLED)
+        state.not_ready = self._not_ready_reason()
         if state.not_ready != ReleaseReason.NONE and self._generation.is_one_system:
-            self.lose("steering", state.not_ready)
+            self.release("steering", state.not_ready)
         ready = [
             axis for axis in AXES if state.actuators[axis].may_be_enabled and state.not_ready == ReleaseReason.NONE
         ]
-        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_requested):
+        if not self._generation.is_one_system or (len(ready) == len(AXES) and self._is_enable_pending):
             self._enable(ready)
         state.system = self._system_state()
         state.throttle, state.brake = self._pedals()
 
-    def _why_not_ready(self) -> ReleaseReason:
-        """Tell what hinders the kit as a whole."""
+    def _not_ready_reason(self) -> ReleaseReason:
+        """Return why the kit as a whole is not ready."""
         state = self._state
         if state.watchdog != ReleaseReason.NONE or not self._generation.is_one_system:
             return state.watchdog
@@ -88,45 +89,45 @@ class Authority:
     def _enable(self, axes: list[Axis]) -> None:
         for axis in axes:
             if axis == "steering" and not self._state.actuators[axis].is_enabled:
-                self._state.held_rad = self._state.wheel_rad
+                self._state.setpoint_rad = self._state.wheel_rad
             self._state.actuators[axis].is_enabled = True
 
-    def lose(self, axis: Axis, reason: ReleaseReason) -> None:
-        """Let go of an enabled axis: with the watchdog's brakes, unless somebody wanted it or has taken over."""
+    def release(self, axis: Axis, reason: ReleaseReason) -> None:
+        """Release an enabled axis. The watchdog brakes unless the release was commanded or a driver overrides."""
         state = self._state
         if not state.actuators[axis].is_enabled:
             return
-        is_wanted = reason in {ReleaseReason.REQUESTED, ReleaseReason.OVERRIDE} or (
+        is_commanded = reason in {ReleaseReason.REQUESTED, ReleaseReason.OVERRIDE} or (
             reason == ReleaseReason.DISABLED
             and (self._generation.is_one_system or (state.is_stationary and not state.is_in_gear))
         )
-        is_trip = self.has_watchdog and not is_wanted and not state.is_overridden
+        is_trip = self.has_watchdog and not is_commanded and not state.is_overridden
         if is_trip:
             state.watchdog, state.watchdog_axis, state.watchdog_brakes = reason, axis, True
         state.disengaged = reason
-        self._is_requested, self._is_spent = False, self._requested_ns is not None
+        self._is_enable_pending, self._is_enable_used = False, self._requested_ns is not None
         for each in AXES if is_trip or self._generation.is_one_system else (axis,):
             state.actuators[each].is_enabled = False
             if each == "steering":
-                self._state.held_rad = state.wheel_rad
+                self._state.setpoint_rad = state.wheel_rad
 
     def override(self, axis: Axis) -> None:
-        """Latch that the driver has taken an axis over, and let go of it."""
-        self.lose(axis, ReleaseReason.OVERRIDE)
+        """Release an axis because of the driver, and latch the override."""
+        self.release(axis, ReleaseReason.OVERRIDE)
         self._state.actuators[axis].is_overridden = True
 
     def clear(self, axis: Axis) -> None:
-        """Forget overrides, once hands and feet are off, and the watchdog, once somebody has taken over."""
+        """Clear overrides if the driver no longer acts, and the watchdog if a driver has ended its braking."""
         state = self._state
         for each in AXES if self._generation.is_one_system else (axis,):
             state.actuators[each].is_overridden &= state.actuators[each].driver_acts
-        if self._generation.is_one_system:  # its command for the gear has no such bit
+        if self._generation.is_one_system:  # its gear command has no CLEAR
             state.is_gear_overridden = False
         if not state.watchdog_brakes:
             state.watchdog, state.watchdog_axis = ReleaseReason.NONE, None
 
     def _pedals(self) -> tuple[float, float]:
-        """Give throttle and brake: the kit's and the driver's, whichever is more; without a gear nothing drives."""
+        """Return throttle and brake, each the maximum of kit and driver; out of gear the throttle has no effect."""
         state, requested = self._state, dict.fromkeys(AXES, 0.0)
         for axis, actuator in state.actuators.items():
             if actuator.is_enabled and actuator.order is not None:

@@ -1,4 +1,4 @@
-"""The software car: a by-wire kit and the simulator, living together."""
+"""The software car: a by-wire kit connected to the simulator."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from lavt.vehicle.software_car.kit import Kit
 
 
 class SoftwareCar:
-    """A kit whose wheels are a simulator's.
+    """A by-wire kit whose wheels are the simulator's.
 
-    The simulator takes its steps of 1/240 s; at each the kit senses it and says what reaches the wheels.
+    At each of the simulator's steps of 1/240 s the kit reads the car's state and sets its actuation.
     """
 
     def __init__(self, kit: Kit, simulator: Simulator) -> None:
         self.kit, self.simulator = kit, simulator
         self.events: list[VehicleEvent] = []
-        """What has happened to the car so far."""
+        """All events of the car so far."""
         self._applied: Actuation | None = None
 
     def advance(self, to_ns: int) -> list[CanFrame]:
-        """Live on to a time and give the frames that left on the way, in order; they say nothing of their times."""
+        """Advance to `to_ns` and return the frames sent until then, in order and without their times."""
         frames: list[CanFrame] = []
         while (wake_ns := self.next_wake_ns()) <= to_ns:
             self.events += self.simulator.advance(wake_ns)
@@ -34,11 +34,11 @@ class SoftwareCar:
         return frames
 
     def receive(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
-        """Take a frame from the bus at a time, and give those that left until then."""
-        left = self.advance(now_ns)
+        """Process a frame received at `now_ns`, and return the frames sent until then."""
+        sent = self.advance(now_ns)
         self.kit.receive(frame, now_ns)
-        return left
+        return sent
 
     def next_wake_ns(self) -> int:
-        """Tell when to call `advance` at the latest."""
+        """Return the latest time for the next call of `advance`."""
         return min(self.kit.next_wake_ns(), self.simulator.next_wake_ns())

@@ -1,4 +1,4 @@
-"""Words by which somebody acts on a software car: as its driver, or as what breaks."""
+"""Console commands that act on a software car: as its driver, or as a fault."""
 
 from __future__ import annotations
 
@@ -9,126 +9,143 @@ from typing import Final
 from lavt.errors import UserError
 from lavt.value import value
 from lavt.vehicle.software_car.gearbox import GEARS
-from lavt.vehicle.software_car.kit import Kit, known
+from lavt.vehicle.software_car.kit import Kit, check_known
 from lavt.vehicle.software_car.state import Gear
 
-SWITCH: Final = {"emergency_stop": 0, "pause": 1, "remote": 2, "control_allowed": 3}
+REMOTE_STATES: Final = {"emergency_stop": 0, "pause": 1, "remote": 2, "control_allowed": 3}
 """States of the remote's switch."""
 HELP: Final = "help"
-LONGEST_SHOWN = 40
+MAX_QUOTED = 40
+"""Characters of the input that an error quotes."""
 
 
 @value
 class ConsoleCommand:
-    """A word, what it takes, and what it does to a kit at a time."""
+    """A console command: its argument, its meaning and its effect on a kit."""
 
-    takes: str
-    """Empty: nothing."""
+    argument: str
+    """Empty: none."""
     meaning: str
-    act: Callable[[Kit, str, int], None]
+    execute: Callable[[Kit, str, int], None]
 
 
-def number(text: str) -> float:
-    """Read a number; raises `UserError`."""
+def parse_number(text: str) -> float:
+    """Parse a finite number. Raises `UserError`."""
     try:
-        read = float(text)
+        number = float(text)
     except ValueError:
-        read = math.nan
-    if not math.isfinite(read):
-        raise UserError(f"{text[:LONGEST_SHOWN]!r} is no number")
-    return read
+        number = math.nan
+    if not math.isfinite(number):
+        raise UserError(f"{text[:MAX_QUOTED]!r} is not a number")
+    return number
 
 
-def gear(text: str) -> Gear:
-    """Read the name of a gear; raises `UserError` with the known ones."""
-    return Gear[known(text.upper(), {each.name for each in GEARS}, "gear of this car")]
+def parse_gear(text: str) -> Gear:
+    """Parse the name of a gear. Raises `UserError` with the known names."""
+    return Gear[check_known(text.upper(), {each.name for each in GEARS}, "gear of this car")]
 
 
-def switch(text: str) -> int:
-    """Read a state of the remote's switch; raises `UserError` with the known ones."""
-    return SWITCH[known(text, set(SWITCH), "state of the remote's switch")]
+def parse_remote_state(text: str) -> int:
+    """Parse a state of the remote's switch. Raises `UserError` with the known states."""
+    return REMOTE_STATES[check_known(text, set(REMOTE_STATES), "state of the remote's switch")]
 
 
-WORDS: Final[dict[str, ConsoleCommand]] = {
+COMMANDS: Final[dict[str, ConsoleCommand]] = {
     "driver_steers": ConsoleCommand(
-        "NM", "hands on the wheel, with so much torque, left positive",
-        lambda kit, text, now_ns: kit.driver_steers(number(text), now_ns),
+        "NM",
+        "apply a torque to the steering wheel, left positive",
+        lambda kit, text, now_ns: kit.driver_steers(parse_number(text), now_ns),
     ),
     "driver_brakes": ConsoleCommand(
-        "FRACTION", "a foot on the brake, 0 to 1",
-        lambda kit, text, now_ns: kit.driver_brakes(number(text), now_ns),
+        "FRACTION",
+        "press the brake pedal, 0 to 1",
+        lambda kit, text, now_ns: kit.driver_brakes(parse_number(text), now_ns),
     ),
     "driver_throttles": ConsoleCommand(
-        "FRACTION", "a foot on the throttle, 0 to 1",
-        lambda kit, text, now_ns: kit.driver_throttles(number(text), now_ns),
+        "FRACTION",
+        "press the throttle pedal, 0 to 1",
+        lambda kit, text, now_ns: kit.driver_throttles(parse_number(text), now_ns),
     ),
     "driver_shifts": ConsoleCommand(
-        "GEAR", "PARK, NEUTRAL or DRIVE by the shifter",
-        lambda kit, text, now_ns: kit.driver_shifts(gear(text), now_ns),
+        "GEAR",
+        "move the shifter to PARK, NEUTRAL or DRIVE",
+        lambda kit, text, now_ns: kit.driver_shifts(parse_gear(text), now_ns),
     ),
     "fault": ConsoleCommand(
-        "PART.BIT", "break a part, as in steering.FLTPWR",
+        "PART.BIT",
+        "set a fault, such as steering.FLTPWR",
         lambda kit, text, now_ns: kit.set_fault(text, now_ns),
     ),
-    "mend": ConsoleCommand(
-        "PART.BIT", "mend it",
+    "clear_fault": ConsoleCommand(
+        "PART.BIT",
+        "clear a fault",
         lambda kit, text, now_ns: kit.set_fault(text, now_ns, is_set=False),
     ),
     "unknown": ConsoleCommand(
-        "VALUE", "report angle, speed or wheel_speed as unknown",
+        "VALUE",
+        "report angle, speed or wheel_speed as unknown",
         lambda kit, text, _: kit.set_unknown(text),
     ),
     "known": ConsoleCommand(
-        "VALUE", "report it again",
+        "VALUE",
+        "report the value again",
         lambda kit, text, _: kit.set_unknown(text, is_unknown=False),
     ),
     "inhibit": ConsoleCommand(
-        "WHAT", "generation 2 is not ready, because of: seat belt, door, speed, acceleration, reverse",
+        "REASON",
+        "make generation 2 not ready: seat belt, door, speed, acceleration or reverse",
         lambda kit, text, now_ns: kit.inhibit(text, now_ns),
     ),
-    "unhinder": ConsoleCommand(
-        "", "it is ready again",
+    "clear_inhibit": ConsoleCommand(
+        "",
+        "remove the inhibit reason",
         lambda kit, _, now_ns: kit.inhibit(None, now_ns),
     ),
     "switch_remote": ConsoleCommand(
-        "STATE", f"the remote's switch: {', '.join(SWITCH)}",
-        lambda kit, text, now_ns: kit.switch_remote(switch(text), now_ns),
+        "STATE",
+        f"set the remote's switch: {', '.join(REMOTE_STATES)}",
+        lambda kit, text, now_ns: kit.switch_remote(parse_remote_state(text), now_ns),
     ),
     "bus_off": ConsoleCommand(
-        "", "the kit says and hears nothing any more",
-        lambda kit, _, now_ns: kit.bus_off(now_ns),
+        "",
+        "disconnect the kit from the bus",
+        lambda kit, _, now_ns: kit.set_bus_off(now_ns),
     ),
     "bus_on": ConsoleCommand(
-        "", "it does again",
-        lambda kit, _, now_ns: kit.bus_off(now_ns, is_off=False),
+        "",
+        "reconnect the kit to the bus",
+        lambda kit, _, now_ns: kit.set_bus_off(now_ns, is_off=False),
     ),
     "no_watchdog": ConsoleCommand(
-        "", "a kit without the watchdog that brakes",
-        lambda kit, _, now_ns: kit.switch_watchdog(now_ns, is_there=False),
+        "",
+        "disable the watchdog's braking",
+        lambda kit, _, now_ns: kit.set_watchdog(now_ns, is_enabled=False),
     ),
     "watchdog": ConsoleCommand(
-        "", "with it again",
-        lambda kit, _, now_ns: kit.switch_watchdog(now_ns),
+        "",
+        "enable the watchdog's braking",
+        lambda kit, _, now_ns: kit.set_watchdog(now_ns),
     ),
-}  # fmt: skip
+}
 
 
 def help_lines() -> list[str]:
-    """List all words with what they take and mean."""
-    calls = {f"{name} {word.takes}".strip(): word.meaning for name, word in WORDS.items()} | {HELP: "this list"}
-    widest = max(map(len, calls))
-    return [f"{call:{widest}}  {meaning}" for call, meaning in calls.items()]
+    """Return one line for each command with its argument and meaning."""
+    usages = {f"{name} {command.argument}".strip(): command.meaning for name, command in COMMANDS.items()}
+    usages[HELP] = "list the commands"
+    width = max(map(len, usages))
+    return [f"{usage:{width}}  {meaning}" for usage, meaning in usages.items()]
 
 
-def act(kit: Kit, line: str, now_ns: int) -> None:
-    """Do what a line says; raises `UserError` with one sentence for one that cannot be done, and does nothing then."""
+def execute(kit: Kit, line: str, now_ns: int) -> None:
+    """Execute a command line. Raises `UserError` for an invalid one and changes nothing then."""
     name, _, rest = line.strip().partition(" ")
     text = rest.strip()
-    if name not in WORDS:
-        raise UserError(f"there is no word {name[:LONGEST_SHOWN]!r}: {HELP} lists them")
-    word = WORDS[name]
-    if word.takes and not text:
-        raise UserError(f"{name} needs a {word.takes}: {word.meaning}")
-    if text and not word.takes:
-        raise UserError(f"{name} takes nothing after it, not {text[:LONGEST_SHOWN]!r}")
-    word.act(kit, text, now_ns)
+    if name not in COMMANDS:
+        raise UserError(f"unknown command {name[:MAX_QUOTED]!r}: {HELP} lists the commands")
+    command = COMMANDS[name]
+    if command.argument and not text:
+        raise UserError(f"{name} needs {command.argument}: {command.meaning}")
+    if text and not command.argument:
+        raise UserError(f"{name} takes no argument: leave out {text[:MAX_QUOTED]!r}")
+    command.execute(kit, text, now_ns)

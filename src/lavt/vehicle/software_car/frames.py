@@ -1,4 +1,4 @@
-"""The bits of CAN frames, and their checksum."""
+"""Packing of CAN frames, and their checksum."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from lavt.vehicle.can_frame import CanFrame
 
 
 @value
-class Field:
-    """Bits of a message: the lowest is `bit` of the message taken as one little-endian number."""
+class BitField:
+    """A bit field of a message; `bit` is its lowest bit, with the message as one little-endian number."""
 
     name: str
     bit: int
@@ -17,40 +17,40 @@ class Field:
 
     @property
     def least(self) -> int:
-        """The smallest number that fits."""
+        """The smallest value of the field."""
         return -(1 << self.width - 1) if self.is_signed else 0
 
     @property
     def most(self) -> int:
-        """The greatest number that fits."""
+        """The largest value of the field."""
         return (1 << self.width - 1) - 1 if self.is_signed else (1 << self.width) - 1
 
 
 @value
 class Layout:
-    """What a message is made of."""
+    """The fields of a message."""
 
     length: int
     """In bytes."""
-    fields: tuple[Field, ...]
+    fields: tuple[BitField, ...]
 
 
 def pack(layout: Layout, values: dict[str, int]) -> bytes:
-    """Put numbers into a message; a field that is not named is 0, a number out of range becomes the nearest in range.
+    """Encode a message. Missing fields are 0, and values out of range are clamped.
 
-    Raises `KeyError` for a name that the layout has not.
+    Raises `KeyError` for a name that is not in the layout.
     """
-    left, number = dict(values), 0
+    remaining, number = dict(values), 0
     for field in layout.fields:
-        inside = min(max(left.pop(field.name, 0), field.least), field.most)
-        number |= (inside & (1 << field.width) - 1) << field.bit
-    if left:
-        raise KeyError(", ".join(left))
+        clamped = min(max(remaining.pop(field.name, 0), field.least), field.most)
+        number |= (clamped & (1 << field.width) - 1) << field.bit
+    if remaining:
+        raise KeyError(", ".join(remaining))
     return number.to_bytes(layout.length, "little")
 
 
 def unpack(layout: Layout, data: bytes) -> dict[str, int]:
-    """Take the numbers out of a message of the layout's length."""
+    """Decode a message of the layout's length."""
     number = int.from_bytes(data, "little")
     values: dict[str, int] = {}
     for field in layout.fields:
@@ -60,7 +60,7 @@ def unpack(layout: Layout, data: bytes) -> dict[str, int]:
 
 
 def crc8(data: bytes) -> int:
-    """Give the CRC-8 of SAE J1850: polynomial 0x1D, begun with 0xFF, inverted at the end."""
+    """Return the CRC-8 of SAE J1850: polynomial 0x1D, initial value 0xFF, inverted at the end."""
     remainder = 0xFF
     for byte in data:
         remainder ^= byte
@@ -70,7 +70,7 @@ def crc8(data: bytes) -> int:
 
 
 def checksum(identifier: int, data: bytes, *, is_extended: bool = False) -> int:
-    """Give the CRC-8 over an identifier, high byte first (2 bytes, extended 4), and the data before it."""
+    """Return the CRC-8 over an identifier, high byte first (2 bytes, 4 if extended), and the data before the CRC."""
     return crc8(identifier.to_bytes(4 if is_extended else 2, "big") + data)
 
 
@@ -79,8 +79,8 @@ def with_crc(identifier: int, data: bytes) -> bytes:
     return data[:-1] + bytes([checksum(identifier, data[:-1])])
 
 
-def has_crc(frame: CanFrame) -> bool:
-    """Tell whether the last byte is the right checksum."""
+def has_valid_crc(frame: CanFrame) -> bool:
+    """Return whether the last byte is the frame's checksum."""
     return bool(frame.data) and frame.data[-1] == checksum(
         frame.identifier, frame.data[:-1], is_extended=frame.is_extended
     )

@@ -1,4 +1,4 @@
-"""The gearbox: it shifts, or says why not."""
+"""The gearbox: it executes gear orders or rejects them with a reason."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import Final
 from lavt.vehicle.software_car.state import OVERRIDE_PEDAL, Gear, GearOrder, GearRejection, KitState
 
 GEARS: Final = {Gear.PARK, Gear.NEUTRAL, Gear.DRIVE}
-"""Ours: the simulator's car has no reverse and no low gear."""
+"""Our choice: the simulator's car has no reverse and no low gear."""
 
 
 def shift(state: KitState, order: GearOrder) -> None:
-    """Shift, or say why not."""
+    """Execute a gear order, or record why it is rejected."""
     if not order.is_valid:
         return
     if order.is_clearing:
         state.is_gear_overridden = False
-    state.gear_order, state.gear_reject = order.gear, reject(state, order.gear)
+    state.gear_order, state.gear_reject = order.gear, rejection(state, order.gear)
     if order.gear != Gear.NONE and state.gear_reject == GearRejection.NONE:
         state.gear = Gear(order.gear)
 
 
-def reject(state: KitState, gear: int) -> GearRejection:
-    """Tell why a gear cannot be had now."""
+def rejection(state: KitState, gear: int) -> GearRejection:
+    """Return why a gear cannot be engaged now."""
     if gear in {Gear.NONE, state.gear}:
         return GearRejection.NONE
     if state.gear_faults:

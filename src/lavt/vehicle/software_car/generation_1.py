@@ -1,4 +1,4 @@
-"""The messages of Dataspeed's generation 1, as a kit reads and writes them."""
+"""The messages of Dataspeed's generation 1, from the kit's side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import Field, Layout, pack, unpack
+from lavt.vehicle.software_car.frames import BitField, Layout, pack, unpack
 from lavt.vehicle.software_car.mechanics import (
     Mechanics,
     hundredths_of_kmh,
@@ -14,30 +14,30 @@ from lavt.vehicle.software_car.mechanics import (
     wheel_angle,
     within,
 )
-from lavt.vehicle.software_car.state import AXES, Axis, GearOrder, KitState, Order, ReleaseReason, SystemOrder
+from lavt.vehicle.software_car.state import AXES, Axis, AxisOrder, GearOrder, KitState, ReleaseReason, SystemOrder
 
 FULL_PEDAL = 65535
 FULL_TORQUE_NM = 3412
 UNKNOWN: Final = -0x8000
 CLEARING_LENGTH = 4
-"""A command of this length has no counter and asks only to clear."""
+"""A command of this length has no counter and only clears."""
 
 PEDAL_COMMAND = (
-    Field("command", 0, 16),
-    Field("type", 20, 4),
-    Field("enable", 24, 1),
-    Field("clear", 25, 1),
-    Field("ignore", 26, 1),
-    Field("count", 56, 8),
+    BitField("command", 0, 16),
+    BitField("type", 20, 4),
+    BitField("enable", 24, 1),
+    BitField("clear", 25, 1),
+    BitField("ignore", 26, 1),
+    BitField("count", 56, 8),
 )
 STEERING_COMMAND = (
-    Field("command", 0, 16, is_signed=True),
-    Field("enable", 16, 1),
-    Field("clear", 17, 1),
-    Field("ignore", 18, 1),
-    Field("type", 23, 1),
-    Field("rate", 24, 8),
-    Field("count", 56, 8),
+    BitField("command", 0, 16, is_signed=True),
+    BitField("enable", 16, 1),
+    BitField("clear", 17, 1),
+    BitField("ignore", 18, 1),
+    BitField("type", 23, 1),
+    BitField("rate", 24, 8),
+    BitField("count", 56, 8),
 )
 COMMANDS: dict[int, tuple[Axis, Layout]] = {
     0x060: ("brake", Layout(8, PEDAL_COMMAND)),
@@ -45,54 +45,54 @@ COMMANDS: dict[int, tuple[Axis, Layout]] = {
     0x064: ("steering", Layout(8, STEERING_COMMAND)),
 }
 GEAR_COMMAND_ID = 0x066
-GEAR_COMMAND = Layout(1, (Field("gear", 0, 3), Field("clear", 7, 1)))
+GEAR_COMMAND = Layout(1, (BitField("gear", 0, 3), BitField("clear", 7, 1)))
 
 PEDAL_REPORT = (
-    Field("input", 0, 16),
-    Field("command", 16, 16),
-    Field("output", 32, 16),
-    Field("watchdog_source", 52, 4),
-    Field("enabled", 56, 1),
-    Field("override", 57, 1),
-    Field("driver", 58, 1),
-    Field("FLTWDC", 59, 1),
-    Field("FLT1", 60, 1),
-    Field("FLT2", 61, 1),
-    Field("FLTPWR", 62, 1),
-    Field("timeout", 63, 1),
+    BitField("input", 0, 16),
+    BitField("command", 16, 16),
+    BitField("output", 32, 16),
+    BitField("watchdog_source", 52, 4),
+    BitField("enabled", 56, 1),
+    BitField("override", 57, 1),
+    BitField("driver", 58, 1),
+    BitField("FLTWDC", 59, 1),
+    BitField("FLT1", 60, 1),
+    BitField("FLT2", 61, 1),
+    BitField("FLTPWR", 62, 1),
+    BitField("timeout", 63, 1),
 )
-BRAKE_REPORT = Layout(8, (*PEDAL_REPORT, Field("watchdog_brakes", 51, 1)))
+BRAKE_REPORT = Layout(8, (*PEDAL_REPORT, BitField("watchdog_brakes", 51, 1)))
 THROTTLE_REPORT = Layout(8, PEDAL_REPORT)
 STEERING_REPORT = Layout(
     8,
     (
-        Field("angle", 0, 16, is_signed=True),
-        Field("command", 16, 15, is_signed=True),
-        Field("is_torque", 31, 1),
-        Field("speed", 32, 16, is_signed=True),
-        Field("torque", 48, 8, is_signed=True),
-        Field("enabled", 56, 1),
-        Field("override", 57, 1),
-        Field("FLTPWR", 58, 1),
-        Field("FLTWDC", 59, 1),
-        Field("FLTBUS1", 60, 1),
-        Field("FLTBUS2", 61, 1),
-        Field("FLTCAL", 62, 1),
-        Field("timeout", 63, 1),
+        BitField("angle", 0, 16, is_signed=True),
+        BitField("command", 16, 15, is_signed=True),
+        BitField("is_torque", 31, 1),
+        BitField("speed", 32, 16, is_signed=True),
+        BitField("torque", 48, 8, is_signed=True),
+        BitField("enabled", 56, 1),
+        BitField("override", 57, 1),
+        BitField("FLTPWR", 58, 1),
+        BitField("FLTWDC", 59, 1),
+        BitField("FLTBUS1", 60, 1),
+        BitField("FLTBUS2", 61, 1),
+        BitField("FLTCAL", 62, 1),
+        BitField("timeout", 63, 1),
     ),
 )
 GEAR_REPORT = Layout(
     2,
     (
-        Field("gear", 0, 3),
-        Field("override", 3, 1),
-        Field("command", 4, 3),
-        Field("FLTBUS", 7, 1),
-        Field("reject", 8, 3),
-        Field("ready", 15, 1),
+        BitField("gear", 0, 3),
+        BitField("override", 3, 1),
+        BitField("command", 4, 3),
+        BitField("FLTBUS", 7, 1),
+        BitField("reject", 8, 3),
+        BitField("ready", 15, 1),
     ),
 )
-WHEEL_SPEEDS = Layout(8, tuple(Field(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
+WHEEL_SPEEDS = Layout(8, tuple(BitField(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
 
 FAULTS: dict[str, tuple[str, ...]] = {
     "steering": ("FLTPWR", "FLTBUS1", "FLTBUS2", "FLTCAL"),
@@ -100,10 +100,10 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "throttle": ("FLT1", "FLT2", "FLTPWR"),
     "gear": ("FLTBUS",),
 }
-"""Faults of each part, by the bit that reports them; FLTWDC is the watchdog's own."""
+"""Faults of each part, by the bit that reports them; FLTWDC is reported by the watchdog."""
 
 PEDAL_TRAVEL = {"brake": (0.15, 0.50), "throttle": (0.15, 0.80)}
-"""From where to where a pedal goes, as a fraction of its number (CMD_TYPE 1)."""
+"""Start and end of a pedal's travel, as fractions of its number (CMD_TYPE 1)."""
 
 SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
     (axis, reason): 1 + 4 * place + kind
@@ -112,11 +112,11 @@ SOURCES: dict[tuple[Axis, ReleaseReason], int] = {
         (ReleaseReason.COUNTER, ReleaseReason.DISABLED, ReleaseReason.TIMEOUT, ReleaseReason.FAULT)
     )
 }
-"""Numbers of the watchdog's sources, 1 to 15: the facts give the range and the kinds, the numbers are ours."""
+"""Numbers of the watchdog's sources, 1 to 15. The facts give the range and the kinds; the numbers are our choice."""
 
 
 def pedal_fraction(axis: Axis, kind: int, command: int, mechanics: Mechanics) -> float | None:
-    """Give how much of a pedal a command asks for; None for a type that the kit has not."""
+    """Return the requested fraction of a pedal, or None for a command type that the kit does not have."""
     if kind == 1:
         released, full = PEDAL_TRAVEL[axis]
         return within((command / FULL_PEDAL - released) / (full - released), 0.0, 1.0)
@@ -129,8 +129,8 @@ def pedal_fraction(axis: Axis, kind: int, command: int, mechanics: Mechanics) ->
     return None
 
 
-def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | SystemOrder | None:
-    """Give what a frame orders; None for one that is not for the kit."""
+def parse_order(frame: CanFrame, mechanics: Mechanics, _: bool) -> AxisOrder | GearOrder | SystemOrder | None:
+    """Parse an order, or return None for a frame that is not for the kit."""
     if frame.is_extended:
         return None
     if frame.identifier == GEAR_COMMAND_ID and len(frame.data) == GEAR_COMMAND.length:
@@ -141,7 +141,7 @@ def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | 
     axis, layout = COMMANDS[frame.identifier]
     if len(frame.data) == CLEARING_LENGTH:
         requested = unpack(layout, frame.data + bytes(layout.length - CLEARING_LENGTH))
-        return Order(axis, is_valid=True, is_clearing=bool(requested["clear"]))
+        return AxisOrder(axis, is_valid=True, is_clearing=bool(requested["clear"]))
     if len(frame.data) != layout.length:
         return None
     requested = unpack(layout, frame.data)
@@ -150,7 +150,7 @@ def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | 
         target = wheel_angle(requested["command"]) if requested["type"] == 0 else None
     else:
         target = pedal_fraction(axis, requested["type"], requested["command"], mechanics)
-    return Order(
+    return AxisOrder(
         axis,
         is_valid=True,
         target=target or 0.0,
@@ -162,8 +162,8 @@ def read(frame: CanFrame, mechanics: Mechanics, _: bool) -> Order | GearOrder | 
     )
 
 
-def flags(state: KitState, axis: Axis) -> dict[str, int]:
-    """Give the bits that all three axes report."""
+def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
+    """Return the flags that the reports of all three axes have."""
     actuator = state.actuators[axis]
     return {
         "enabled": actuator.is_enabled,
@@ -174,8 +174,8 @@ def flags(state: KitState, axis: Axis) -> dict[str, int]:
     }
 
 
-def pedal(state: KitState, axis: Axis, driver: float, output: float) -> dict[str, int]:
-    """Give what the reports of both pedals have in common."""
+def pedal_fields(state: KitState, axis: Axis, driver: float, output: float) -> dict[str, int]:
+    """Return the fields that the reports of both pedals have."""
     actuator = state.actuators[axis]
     source = SOURCES.get((state.watchdog_axis, state.watchdog), 0) if state.watchdog_axis else 0
     return {
@@ -184,36 +184,36 @@ def pedal(state: KitState, axis: Axis, driver: float, output: float) -> dict[str
         "output": round(output * FULL_PEDAL),
         "watchdog_source": source,
         "driver": actuator.driver_acts,
-        **flags(state, axis),
+        **flag_fields(state, axis),
     }
 
 
 def brake_report(state: KitState, _: Mechanics) -> bytes:
-    """Tell about the brake."""
-    values = pedal(state, "brake", state.driver_brake, state.brake)
+    """Return the brake report."""
+    values = pedal_fields(state, "brake", state.driver_brake, state.brake)
     return pack(BRAKE_REPORT, values | {"watchdog_brakes": state.watchdog_brakes})
 
 
 def throttle_report(state: KitState, _: Mechanics) -> bytes:
-    """Tell about the throttle."""
-    return pack(THROTTLE_REPORT, pedal(state, "throttle", state.driver_throttle, state.throttle))
+    """Return the throttle report."""
+    return pack(THROTTLE_REPORT, pedal_fields(state, "throttle", state.driver_throttle, state.throttle))
 
 
 def steering_report(state: KitState, _: Mechanics) -> bytes:
-    """Tell about the steering wheel, and the car's speed."""
+    """Return the steering report, which has the car's speed as well."""
     order = state.actuators["steering"].order
     values = {
         "angle": UNKNOWN if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
         "command": tenths_of_degree(order.target) if order else 0,
         "speed": UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps),
         "torque": round(within(state.driver_torque_nm / 0.0625, -127, 127)),
-        **flags(state, "steering"),
+        **flag_fields(state, "steering"),
     }
     return pack(STEERING_REPORT, values)
 
 
 def gear_report(state: KitState, _: Mechanics) -> bytes:
-    """Tell about the gearbox."""
+    """Return the gear report."""
     values = {
         "gear": int(state.gear),
         "override": state.is_gear_overridden,
@@ -226,7 +226,7 @@ def gear_report(state: KitState, _: Mechanics) -> bytes:
 
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> bytes:
-    """Tell how fast each tyre turns: all alike."""
+    """Return the wheel speeds, which are all equal."""
     speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
     return pack(WHEEL_SPEEDS, dict.fromkeys((f"wheel_{index}" for index in range(4)), speed))
 
@@ -238,4 +238,4 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
     0x067: (100, gear_report),
     0x06A: (10, wheel_speeds),
 }
-"""What the kit sends, and every how many milliseconds. The facts give no periods: those of generation 2 are taken."""
+"""By identifier: the period in milliseconds, taken from generation 2 as the facts give none, and the report."""

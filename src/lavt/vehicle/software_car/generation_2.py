@@ -1,4 +1,4 @@
-"""The messages of Dataspeed's generation 2, as a kit reads and writes them."""
+"""The messages of Dataspeed's generation 2, from the kit's side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from lavt.vehicle.can_frame import CanFrame
-from lavt.vehicle.software_car.frames import has_crc, pack, unpack, with_crc
+from lavt.vehicle.software_car.frames import has_valid_crc, pack, unpack, with_crc
 from lavt.vehicle.software_car.generation_2_layouts import (
     GEAR_COMMAND,
     PEDAL_COMMAND,
@@ -25,25 +25,25 @@ from lavt.vehicle.software_car.mechanics import (
 from lavt.vehicle.software_car.state import (
     AXES,
     Axis,
+    AxisOrder,
     GearOrder,
     KitState,
-    Order,
     ReleaseReason,
     SystemOrder,
 )
 
 USER_SET, REMOTE_SET = 0x210, 0x200
 PARTS: Final[tuple[Axis | None, ...]] = ("steering", "brake", "throttle", None)
-"""What the commands of a set are for, by what is added to the set's identifier; the last is the gearbox."""
+"""The parts that a set's commands are for, by the offset from the set's identifier; the last is the gearbox."""
 SYSTEM_COMMAND_ID = 0x216
 UNKNOWN: Final = -0x8000
 
 ALL_OR_NONE = 2
-"""The third of the modes that the facts name: the number is ours."""
+"""The third of the modes in the facts; the number is our choice."""
 ANGLE, PERCENT = 2, 14
-"""The types of command that the kit obeys, of those that the facts list."""
+"""The command types that the kit accepts, of those in the facts."""
 FULL_PEDAL = {"brake": 10_000, "throttle": 4_000}
-"""A whole pedal in steps of percent commands: 0.01 % and 0.025 %."""
+"""A full pedal in steps of percent commands: 0.01 % and 0.025 %."""
 
 FAULTS: dict[str, tuple[str, ...]] = {
     "steering": ("fault",),
@@ -53,13 +53,13 @@ FAULTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | GearOrder | SystemOrder | None:
-    """Give what a frame orders; None for one that is not for the kit, or is of the other set."""
+def parse_order(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> AxisOrder | GearOrder | SystemOrder | None:
+    """Parse an order, or return None for a frame that is not for the kit or belongs to the other set."""
     if frame.is_extended:
         return None
     if frame.identifier == SYSTEM_COMMAND_ID and len(frame.data) == SYSTEM_COMMAND.length:
         requested = unpack(SYSTEM_COMMAND, frame.data)
-        return SystemOrder(has_crc(frame), requested["command"], requested["count"])
+        return SystemOrder(has_valid_crc(frame), requested["command"], requested["count"])
     part = frame.identifier - (REMOTE_SET if is_remote else USER_SET)
     if not 0 <= part < len(PARTS):
         return None
@@ -69,14 +69,14 @@ def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | Gear
         return None
     requested = unpack(layout, frame.data)
     if axis is None:
-        return GearOrder(has_crc(frame), requested["command"])
+        return GearOrder(has_valid_crc(frame), requested["command"])
     if axis == "steering":
         is_known, target = requested["type"] == ANGLE, wheel_angle(requested["command"])
     else:
         is_known, target = requested["type"] == PERCENT, within(requested["command"] / FULL_PEDAL[axis], 0.0, 1.0)
-    return Order(
+    return AxisOrder(
         axis,
-        is_valid=has_crc(frame),
+        is_valid=has_valid_crc(frame),
         target=target,
         is_enabling=bool(requested["enable"]) and is_known,
         is_clearing=bool(requested["clear"]),
@@ -86,8 +86,8 @@ def read(frame: CanFrame, mechanics: Mechanics, is_remote: bool) -> Order | Gear
     )
 
 
-def flags(state: KitState, axis: Axis) -> dict[str, int]:
-    """Give the bits that all three axes report."""
+def flag_fields(state: KitState, axis: Axis) -> dict[str, int]:
+    """Return the flags that the reports of all three axes have."""
     actuator = state.actuators[axis]
     others = (state.actuators[other] for other in AXES if other != axis)
     return {
@@ -105,29 +105,29 @@ def flags(state: KitState, axis: Axis) -> dict[str, int]:
 
 
 def steering_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Tell about the steering wheel."""
+    """Return the fields of the steering report."""
     order = state.actuators["steering"].order
     return {
         "angle": -0x2000 if "angle" in state.invalid else tenths_of_degree(state.wheel_rad),
         "command": tenths_of_degree(order.target) if order else 0,
         "torque": round(state.driver_torque_nm / 0.0625),
-        **flags(state, "steering"),
+        **flag_fields(state, "steering"),
     }
 
 
 def pedal_report(axis: Axis, state: KitState, driver: float, output: float) -> dict[str, int]:
-    """Tell about a pedal in steps of 0.025 %."""
+    """Return the fields of a pedal's report, in steps of 0.025 %."""
     order = state.actuators[axis].order
     return {
         "input": round(driver * 4_000),
         "command": round(order.target * 4_000) if order else 0,
         "output": round(output * 4_000),
-        **flags(state, axis),
+        **flag_fields(state, axis),
     }
 
 
 def gear_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Tell about the gearbox."""
+    """Return the fields of the gear report."""
     return {
         "gear": int(state.gear),
         "command": state.gear_order,
@@ -137,42 +137,42 @@ def gear_report(state: KitState, _: Mechanics) -> dict[str, int]:
     }
 
 
-def reported(reason: ReleaseReason) -> int:
-    """Give the number of a reason; 0 for one that the facts do not name."""
+def reason_number(reason: ReleaseReason) -> int:
+    """Return a reason's number, or 0 for a reason that is not in the facts."""
     return reason if reason <= ReleaseReason.LOCKOUT_REVERSE else 0
 
 
 def system_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Tell about the kit as a whole."""
+    """Return the fields of the system report."""
     return {
         "state": int(state.system),
-        "reason_disengage": reported(state.disengaged),
-        "reason_not_ready": reported(state.not_ready),
+        "reason_disengage": reason_number(state.disengaged),
+        "reason_not_ready": reason_number(state.not_ready),
         "sync_mode": ALL_OR_NONE,
     }
 
 
 def velocity_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Tell how fast the car goes."""
+    """Return the fields of the velocity report."""
     speed = UNKNOWN if "speed" in state.invalid else hundredths_of_kmh(state.speed_mps)
     return {"by_brakes": speed, "by_propulsion": speed}
 
 
 def wheel_speeds(state: KitState, mechanics: Mechanics) -> dict[str, int]:
-    """Tell how fast each tyre turns: all alike."""
+    """Return the wheel speeds, which are all equal."""
     speed = UNKNOWN if "wheel_speed" in state.invalid else round(mechanics.tyre_radps(state.speed_mps) * 100)
     return dict.fromkeys((f"wheel_{index}" for index in range(4)), speed)
 
 
 def remote_report(state: KitState, _: Mechanics) -> dict[str, int]:
-    """Tell who may command: the remote's switch."""
+    """Return the fields of the remote report: the remote's switch decides who may command."""
     return {"state": state.remote_state}
 
 
-def made(
+def report_encoder(
     identifier: int, values: Callable[[KitState, Mechanics], dict[str, int]]
 ) -> Callable[[KitState, Mechanics], bytes]:
-    """Pack what a report tells, with counter and checksum where there is room."""
+    """Return a function that encodes a report, with counter and checksum if there is room."""
     layout = REPORT_LAYOUTS[identifier]
     if layout == WHEEL_SPEEDS:  # full
         return lambda state, mechanics: pack(layout, values(state, mechanics))
@@ -185,7 +185,7 @@ def made(
 
 
 REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
-    identifier: (period_ms, made(identifier, values))
+    identifier: (period_ms, report_encoder(identifier, values))
     for identifier, (period_ms, values) in {
         0x100: (10, steering_report),
         0x101: (20, lambda state, _: pedal_report("brake", state, state.driver_brake, state.brake)),
@@ -197,4 +197,4 @@ REPORTS: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]] = {
         0x2D8: (100, remote_report),
     }.items()
 }
-"""What the kit sends, and every how many milliseconds."""
+"""By identifier: the period in milliseconds, and the report."""

@@ -1,44 +1,44 @@
-"""Where the bits of generation 2 are.
+"""Message layouts of generation 2.
 
-The facts give every command's fields in their order with most widths, and of reports only what is in them. What is laid
-out by us is in `UNVERIFIED`: such a position was never held against a real kit. Reports have a counter and a checksum
-where there is room: ours too.
+The facts give the fields of every command in order, most of them with widths, but only the contents of reports.
+Positions of our own choice are listed in `UNVERIFIED`: they were never compared with a real kit. Reports have a
+counter and a checksum where there is room, which is our choice, too.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from lavt.vehicle.software_car.frames import Field, Layout
+from lavt.vehicle.software_car.frames import BitField, Layout
 
 UNVERIFIED: Final = {
     **dict.fromkeys(
         (0x200, 0x201, 0x202, 0x210, 0x211, 0x212),
-        "order and widths of the fields, the checksum in the last byte: facts; counter in bits 48 to 51: ours",
+        "facts: order and widths of the fields, checksum in the last byte; our choice: the counter in bits 48 to 51",
     ),
-    **dict.fromkeys((0x203, 0x213), "4-bit command first, checksum last: facts; no counter, as none is listed"),
-    0x216: "command, counter and checksum in this order: facts; half of the first byte each: our reading",
+    **dict.fromkeys((0x203, 0x213), "facts: 4-bit command first, checksum last; no counter, as none is listed"),
+    0x216: "facts: command, counter and checksum in this order; our assumption: half of the first byte each",
     **dict.fromkeys(
-        (0x100, 0x101, 0x102, 0x103), "widths of the values: facts; all places and the pedals' steps: ours"
+        (0x100, 0x101, 0x102, 0x103), "facts: widths of the values; our choice: all positions and the pedals' steps"
     ),
-    0x106: "all places, the numbers of the reasons and of the mode: ours",
-    0x107: "two speeds of 16 bits, one after the other: our reading",
-    0x2A4: "laid out as in generation 1",
-    0x2D8: "all places: ours",
+    0x106: "our choice: all positions, the numbers of the reasons and of the mode",
+    0x107: "our assumption: two consecutive speeds of 16 bits",
+    0x2A4: "same layout as in generation 1",
+    0x2D8: "our choice: all positions",
 }
-"""What of each message is ours."""
+"""Assumptions and choices of our own, by identifier."""
 
 PEDAL_FIELDS = (
-    Field("type", 16, 4),
-    Field("enable", 20, 1),
-    Field("clear", 21, 1),
-    Field("ignore", 22, 1),
-    Field("count", 48, 4),
+    BitField("type", 16, 4),
+    BitField("enable", 20, 1),
+    BitField("clear", 21, 1),
+    BitField("ignore", 22, 1),
+    BitField("count", 48, 4),
 )
-STEERING_COMMAND = Layout(8, (Field("command", 0, 16, is_signed=True), *PEDAL_FIELDS, Field("rate", 24, 8)))
-PEDAL_COMMAND = Layout(8, (Field("command", 0, 16), *PEDAL_FIELDS))
-GEAR_COMMAND = Layout(4, (Field("command", 0, 4),))
-SYSTEM_COMMAND = Layout(2, (Field("command", 0, 4), Field("count", 4, 4)))
+STEERING_COMMAND = Layout(8, (BitField("command", 0, 16, is_signed=True), *PEDAL_FIELDS, BitField("rate", 24, 8)))
+PEDAL_COMMAND = Layout(8, (BitField("command", 0, 16), *PEDAL_FIELDS))
+GEAR_COMMAND = Layout(4, (BitField("command", 0, 4),))
+SYSTEM_COMMAND = Layout(2, (BitField("command", 0, 4), BitField("count", 4, 4)))
 
 FLAG_NAMES = (
     "ready",
@@ -52,43 +52,45 @@ FLAG_NAMES = (
     "override_latched",
     "external_control",
 )
-FLAGS = tuple(Field(name, 40 + place, 1) for place, name in enumerate(FLAG_NAMES))
-COUNT = Field("count", 52, 4)
-PEDAL_REPORT = Layout(8, (Field("input", 0, 12), Field("command", 12, 12), Field("output", 24, 12), *FLAGS, COUNT))
-WHEEL_SPEEDS = Layout(8, tuple(Field(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
+FLAGS = tuple(BitField(name, 40 + place, 1) for place, name in enumerate(FLAG_NAMES))
+COUNT = BitField("count", 52, 4)
+PEDAL_REPORT = Layout(
+    8, (BitField("input", 0, 12), BitField("command", 12, 12), BitField("output", 24, 12), *FLAGS, COUNT)
+)
+WHEEL_SPEEDS = Layout(8, tuple(BitField(f"wheel_{index}", 16 * index, 16, is_signed=True) for index in range(4)))
 REPORT_LAYOUTS: Final = {
     0x100: Layout(
         8,
         (
-            Field("angle", 0, 14, is_signed=True),
-            Field("command", 16, 14, is_signed=True),
-            Field("torque", 32, 8, is_signed=True),
+            BitField("angle", 0, 14, is_signed=True),
+            BitField("command", 16, 14, is_signed=True),
+            BitField("torque", 32, 8, is_signed=True),
             *FLAGS,
             COUNT,
         ),
     ),
     0x101: PEDAL_REPORT,
     0x102: PEDAL_REPORT,
-    0x103: Layout(8, (Field("gear", 0, 4), Field("command", 4, 4), *FLAGS, COUNT)),
+    0x103: Layout(8, (BitField("gear", 0, 4), BitField("command", 4, 4), *FLAGS, COUNT)),
     0x106: Layout(
         8,
         (
-            Field("state", 0, 4),
-            Field("sync_mode", 4, 4),
-            Field("reason_disengage", 8, 8),
-            Field("reason_not_ready", 16, 8),
+            BitField("state", 0, 4),
+            BitField("sync_mode", 4, 4),
+            BitField("reason_disengage", 8, 8),
+            BitField("reason_not_ready", 16, 8),
             COUNT,
         ),
     ),
     0x107: Layout(
         8,
         (
-            Field("by_brakes", 0, 16, is_signed=True),
-            Field("by_propulsion", 16, 16, is_signed=True),
-            Field("direction_source", 32, 4),
+            BitField("by_brakes", 0, 16, is_signed=True),
+            BitField("by_propulsion", 16, 16, is_signed=True),
+            BitField("direction_source", 32, 4),
             COUNT,
         ),
     ),
     0x2A4: WHEEL_SPEEDS,
-    0x2D8: Layout(8, (Field("mode", 0, 4), Field("state", 4, 4), COUNT)),
+    0x2D8: Layout(8, (BitField("mode", 0, 4), BitField("state", 4, 4), COUNT)),
 }

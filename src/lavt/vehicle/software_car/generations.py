@@ -1,4 +1,4 @@
-"""In what the kit's two generations differ."""
+"""The differences between the kit's two generations."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from lavt.value import value
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car import generation_1, generation_2
 from lavt.vehicle.software_car.mechanics import Mechanics
-from lavt.vehicle.software_car.state import GearOrder, KitState, Order, SystemOrder
+from lavt.vehicle.software_car.state import AxisOrder, GearOrder, KitState, SystemOrder
 
 
 @value
 class Generation:
-    """What a kit of one generation reads, writes and demands."""
+    """The messages and rules of one generation of the kit."""
 
-    read: Callable[[CanFrame, Mechanics, bool], Order | GearOrder | SystemOrder | None]
+    parse_order: Callable[[CanFrame, Mechanics, bool], AxisOrder | GearOrder | SystemOrder | None]
     reports: dict[int, tuple[int, Callable[[KitState, Mechanics], bytes]]]
-    """By identifier: every how many milliseconds, and what."""
+    """By identifier: the period in milliseconds, and the report."""
     faults: dict[str, tuple[str, ...]]
     follows: Callable[[int, int], bool]
-    """Whether a counter may come after another."""
+    """Whether a counter is a valid successor of another."""
     is_one_system: bool
-    """All axes are enabled together and let go together, and only after the system was told to enable."""
+    """All axes are enabled and released together, and enabled only after an order to the system."""
 
 
 GENERATIONS: Final = {
     1: Generation(
-        generation_1.read,
+        generation_1.parse_order,
         generation_1.REPORTS,
         generation_1.FAULTS,
         lambda before, count: count == (before + 1) % 256,
         is_one_system=False,
     ),
     2: Generation(
-        generation_2.read,
+        generation_2.parse_order,
         generation_2.REPORTS,
         generation_2.FAULTS,
         lambda before, count: count != before,

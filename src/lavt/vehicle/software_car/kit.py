@@ -1,7 +1,7 @@
-"""A by-wire kit, sans-IO: frames and times in, frames and what reaches the wheels out.
+"""A by-wire kit, sans-IO: it takes frames and times, and returns frames and the actuation of the wheels.
 
-It behaves as the facts say kits behave. Where they say nothing it does what shows an adapter's mistakes best; that is
-marked "ours".
+It behaves as the facts describe kits. Where the facts are silent, it does whatever reveals an adapter's mistakes best;
+such a behaviour is marked as our choice.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from lavt.vehicle.software_car.state import (
     AXES,
     OVERRIDE_PEDAL,
     Axis,
+    AxisOrder,
     Gear,
     GearOrder,
     KitState,
-    Order,
     ReleaseReason,
     SystemOrder,
 )
 
 OVERRIDE_TORQUE_NM: Final = 2.0
-"""Ours: from where on hands are an override."""
+"""Our choice: a torque on the steering wheel from here on is an override."""
 INHIBIT_REASONS: Final = {
     "seat belt": ReleaseReason.SEAT_BELT,
     "door": ReleaseReason.DOOR,
@@ -36,21 +36,21 @@ INHIBIT_REASONS: Final = {
     "acceleration": ReleaseReason.LOCKOUT_ACCELERATION,
     "reverse": ReleaseReason.LOCKOUT_REVERSE,
 }
-REPORTED: Final = {"angle", "speed", "wheel_speed"}
+REPORTED_VALUES: Final = {"angle", "speed", "wheel_speed"}
 
 
-def known(name: str, names: set[str], what: str) -> str:
-    """Give a name back; raises `UserError` with the known ones."""
+def check_known(name: str, names: set[str], kind: str) -> str:
+    """Return `name` if it is one of `names`. Raises `UserError` with the known names."""
     if name not in names:
-        raise UserError(f"there is no {what} {name!r}: the known ones are {', '.join(sorted(names))}")
+        raise UserError(f"there is no {kind} {name!r}: the known ones are {', '.join(sorted(names))}")
     return name
 
 
 class Kit:
-    """The kit. `now_ns` is of any monotonic clock, and never goes back.
+    """A by-wire kit. `now_ns` is a time of any monotonic clock and must not decrease.
 
-    `commands` chooses which of generation 2's sets is obeyed. Without `has_watchdog` nothing brakes by itself, and
-    generation 1 does not look at counters.
+    `commands` selects the set of commands that generation 2 accepts. Without `has_watchdog` the kit never brakes by
+    itself, and generation 1 does not check counters.
     """
 
     def __init__(
@@ -71,43 +71,43 @@ class Kit:
         self._now_ns, self._is_bus_off = start_ns, False
         self.state = KitState(remote_state=REMOTE if self._is_remote else CONTROL_ALLOWED)
         self._authority = Authority(self.state, self._generation, has_watchdog=has_watchdog)
-        self._authority.settle()
+        self._authority.update()
 
-    # What comes from the bus.
+    # Frames from the bus.
 
     def receive(self, frame: CanFrame, now_ns: int) -> None:
-        """Take a frame from the bus; what is not for the kit is dropped."""
-        self._live(now_ns)
+        """Process a frame from the bus; drop it if it is not for the kit."""
+        self._advance(now_ns)
         if self._is_bus_off:
             return
-        order = self._generation.read(frame, self._mechanics, self._is_remote)
-        if isinstance(order, Order):
-            self._hear(order)
+        order = self._generation.parse_order(frame, self._mechanics, self._is_remote)
+        if isinstance(order, AxisOrder):
+            self._receive_axis_order(order)
         elif isinstance(order, GearOrder):
             shift(self.state, order)
         elif isinstance(order, SystemOrder):
-            self._authority.request(order, self._now_ns)
-        self._authority.settle()
+            self._authority.receive_system_order(order, self._now_ns)
+        self._authority.update()
 
-    def _hear(self, order: Order) -> None:
-        """Take an axis's command, if its checksum and counter are right."""
+    def _receive_axis_order(self, order: AxisOrder) -> None:
+        """Process an axis's order if its checksum and counter are right."""
         actuator = self.state.actuators[order.axis]
         if not order.is_valid:
             actuator.is_crc_bad = True
-            self._authority.lose(order.axis, ReleaseReason.CRC)
+            self._authority.release(order.axis, ReleaseReason.CRC)
             return
         actuator.is_crc_bad = False
         if order.count is not None:
             before, actuator.count = actuator.count, order.count
             actuator.is_count_bad = not self._follows(before, order.count)
             if actuator.is_count_bad:
-                self._authority.lose(order.axis, ReleaseReason.COUNTER)
+                self._authority.release(order.axis, ReleaseReason.COUNTER)
                 return
         if order.is_clearing:
             self._authority.clear(order.axis)
         if order.count is None:
             return
-        actuator.order, actuator.heard_ns, actuator.has_timed_out = order, self._now_ns, False
+        actuator.order, actuator.received_ns, actuator.has_timed_out = order, self._now_ns, False
         if actuator.driver_acts and order.is_enabling and not order.ignores_driver:
             self._authority.override(order.axis)
 
@@ -117,41 +117,41 @@ class Kit:
 
     # Time.
 
-    def _live(self, now_ns: int) -> None:
-        """Live on to a time: commands time out, the steering wheel turns."""
+    def _advance(self, now_ns: int) -> None:
+        """Advance to `now_ns`: orders time out, the steering wheel turns."""
         state = self.state
-        for end_ns, axis in sorted(end for end in self._ends() if end[0] <= now_ns):
+        for deadline_ns, axis in sorted(each for each in self._deadlines() if each[0] <= now_ns):
             actuator = state.actuators[axis]
-            self._turn(end_ns)
+            self._turn(deadline_ns)
             actuator.has_timed_out = actuator.order is not None and actuator.order.is_enabling
-            self._authority.lose(axis, ReleaseReason.TIMEOUT)
+            self._authority.release(axis, ReleaseReason.TIMEOUT)
             actuator.order = None
-            self._authority.settle()
-        self._authority.live(now_ns)
+            self._authority.update()
+        self._authority.expire_request(now_ns)
         self._turn(now_ns)
 
-    def _ends(self) -> list[tuple[int, Axis]]:
-        """List when each axis's command times out."""
+    def _deadlines(self) -> list[tuple[int, Axis]]:
+        """Return the time at which each axis's order times out."""
         actuators = self.state.actuators
-        return [(actuators[axis].heard_ns + COMMAND_TIMEOUT_NS, axis) for axis in AXES if actuators[axis].order]
+        return [(actuators[axis].received_ns + COMMAND_TIMEOUT_NS, axis) for axis in AXES if actuators[axis].order]
 
     def _turn(self, to_ns: int) -> None:
-        """Turn the steering wheel towards its command, as fast as that allows."""
+        """Turn the steering wheel towards its target, at most at the ordered rate."""
         steering, passed_s = self.state.actuators["steering"], (to_ns - self._now_ns) / NS_PER_S
         self._now_ns = to_ns
         if steering.is_enabled and steering.order is not None:
-            furthest_rad = steering.order.rate_radps * passed_s
-            self.state.held_rad += within(steering.order.target - self.state.held_rad, -furthest_rad, furthest_rad)
+            limit_rad = steering.order.rate_radps * passed_s
+            self.state.setpoint_rad += within(steering.order.target - self.state.setpoint_rad, -limit_rad, limit_rad)
 
     def next_wake_ns(self) -> int:
-        """Tell when something happens by itself next: a report, or a command that times out."""
-        return min([self._next_due_ns, *(end_ns for end_ns, _ in self._ends())])
+        """Return the time of the next report or timeout."""
+        return min([self._next_due_ns, *(deadline_ns for deadline_ns, _ in self._deadlines())])
 
-    # What goes out.
+    # Outputs.
 
     def frames_due(self, now_ns: int) -> list[CanFrame]:
-        """Give the reports that are due, each once however late the call is."""
-        self._live(now_ns)
+        """Return the reports that are due, each once however late the call is."""
+        self._advance(now_ns)
         if now_ns < self._next_due_ns:
             return []
         frames = []
@@ -166,95 +166,96 @@ class Kit:
         return [] if self._is_bus_off else frames
 
     def actuation(self, now_ns: int) -> Actuation:
-        """Tell what reaches the wheels. With nobody steering, the wheel stays where it is (ours)."""
-        self._live(now_ns)
+        """Return the actuation of the wheels. While steering is not enabled, the wheel keeps its angle (our choice)."""
+        self._advance(now_ns)
         brake = 1.0 if self.state.gear == Gear.PARK else self.state.brake
-        return Actuation(self.state.held_rad / self._mechanics.steering_ratio, self.state.throttle, brake)
+        return Actuation(self.state.setpoint_rad / self._mechanics.steering_ratio, self.state.throttle, brake)
 
-    # The car, the people in it, and what breaks.
+    # The car, the driver, and faults.
 
     def sense(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Take speed and wheel angle of the car."""
-        self._live(now_ns)
+        """Update the car's speed and wheel angle."""
+        self._advance(now_ns)
         self.state.speed_mps = vehicle.speed_mps
         self.state.wheel_rad = vehicle.steering_rad * self._mechanics.steering_ratio
 
     def driver_steers(self, torque_nm: float, now_ns: int) -> None:
-        """Put hands on the steering wheel, until told otherwise."""
-        self._live(now_ns)
+        """Set the driver's torque on the steering wheel."""
+        self._advance(now_ns)
         self.state.driver_torque_nm = torque_nm
-        self._note_driver_input("steering", abs(torque_nm) >= OVERRIDE_TORQUE_NM)
+        self._set_driver_acts("steering", abs(torque_nm) >= OVERRIDE_TORQUE_NM)
 
     def driver_brakes(self, fraction: float, now_ns: int) -> None:
-        """Put a foot on the brake, until told otherwise."""
-        self._live(now_ns)
+        """Set the driver's brake pedal."""
+        self._advance(now_ns)
         self.state.driver_brake = within(fraction, 0.0, 1.0)
-        self._note_driver_input("brake", fraction >= OVERRIDE_PEDAL)
+        self._set_driver_acts("brake", fraction >= OVERRIDE_PEDAL)
 
     def driver_throttles(self, fraction: float, now_ns: int) -> None:
-        """Put a foot on the throttle, until told otherwise."""
-        self._live(now_ns)
+        """Set the driver's throttle pedal."""
+        self._advance(now_ns)
         self.state.driver_throttle = within(fraction, 0.0, 1.0)
-        self._note_driver_input("throttle", fraction >= OVERRIDE_PEDAL)
+        self._set_driver_acts("throttle", fraction >= OVERRIDE_PEDAL)
 
-    def _note_driver_input(self, axis: Axis, acts: bool) -> None:
+    def _set_driver_acts(self, axis: Axis, acts: bool) -> None:
         actuator = self.state.actuators[axis]
         actuator.driver_acts = acts
         order = actuator.order
         if acts and order is not None and order.is_enabling and not order.ignores_driver:
             self._authority.override(axis)
         self.state.watchdog_brakes &= not acts
-        self._authority.settle()
+        self._authority.update()
 
     def driver_shifts(self, gear: Gear, now_ns: int) -> None:
-        """Move the shifter."""
-        known(gear.name, {each.name for each in GEARS}, "gear of this car")
-        self._live(now_ns)
+        """Move the shifter as the driver. Raises `UserError` for a gear that the car does not have."""
+        check_known(gear.name, {each.name for each in GEARS}, "gear of this car")
+        self._advance(now_ns)
         state = self.state
         state.gear = gear
         if any(actuator.is_enabled for actuator in state.actuators.values()):
             if self._generation.is_one_system:
-                self._authority.lose("steering", ReleaseReason.OVERRIDE)
+                self._authority.release("steering", ReleaseReason.OVERRIDE)
             state.is_gear_overridden = True
         state.watchdog_brakes = False
-        self._authority.settle()
+        self._authority.update()
 
     def set_fault(self, name: str, now_ns: int, *, is_set: bool = True) -> None:
-        """Break a part, or mend it: `part.bit`, as in `steering.FLTPWR`; raises `UserError` with the known ones."""
+        """Set or clear a fault `part.bit`, such as `steering.FLTPWR`. Raises `UserError` with the known faults."""
         faults = self._generation.faults.items()
-        known(name, {f"{part}.{bit}" for part, bits in faults for bit in bits}, "fault")
-        self._live(now_ns)
+        check_known(name, {f"{part}.{bit}" for part, bits in faults for bit in bits}, "fault")
+        self._advance(now_ns)
         part, bit = name.split(".")
-        of_part: dict[str, set[str]] = {"gear": self.state.gear_faults}
-        of_part |= {axis: actuator.faults for axis, actuator in self.state.actuators.items()}
-        (of_part[part].add if is_set else of_part[part].discard)(bit)
-        self._authority.settle()
+        faults_of: dict[str, set[str]] = {"gear": self.state.gear_faults}
+        faults_of |= {axis: actuator.faults for axis, actuator in self.state.actuators.items()}
+        (faults_of[part].add if is_set else faults_of[part].discard)(bit)
+        self._authority.update()
 
     def set_unknown(self, name: str, *, is_unknown: bool = True) -> None:
-        """Have `angle`, `speed` or `wheel_speed` reported as unknown."""
-        known(name, REPORTED, "value that can be unknown")
+        """Report `angle`, `speed` or `wheel_speed` as unknown, or as known again."""
+        check_known(name, REPORTED_VALUES, "value that can be unknown")
         (self.state.invalid.add if is_unknown else self.state.invalid.discard)(name)
 
     def inhibit(self, name: str | None, now_ns: int) -> None:
-        """Let generation 2 have a reason not to be ready, one of `INHIBIT_REASONS`; None takes it away."""
-        self._live(now_ns)
-        self._authority.inhibit_reason = (
-            ReleaseReason.NONE if name is None else INHIBIT_REASONS[known(name, set(INHIBIT_REASONS), "inhibit reason")]
-        )
-        self._authority.settle()
+        """Make generation 2 not ready for a reason of `INHIBIT_REASONS`; None removes the reason."""
+        self._advance(now_ns)
+        reason = ReleaseReason.NONE
+        if name is not None:
+            reason = INHIBIT_REASONS[check_known(name, set(INHIBIT_REASONS), "inhibit reason")]
+        self._authority.inhibit_reason = reason
+        self._authority.update()
 
     def switch_remote(self, remote_state: int, now_ns: int) -> None:
-        """Turn the remote's switch: 0 emergency stop, 1 pause, 2 remote, 3 control allowed."""
-        self._live(now_ns)
+        """Set the remote's switch: 0 emergency stop, 1 pause, 2 remote, 3 control allowed."""
+        self._advance(now_ns)
         self.state.remote_state = remote_state
-        self._authority.settle()
+        self._authority.update()
 
-    def bus_off(self, now_ns: int, *, is_off: bool = True) -> None:
-        """Cut the kit from the bus, or bring it back."""
-        self._live(now_ns)
+    def set_bus_off(self, now_ns: int, *, is_off: bool = True) -> None:
+        """Disconnect the kit from the bus, or reconnect it."""
+        self._advance(now_ns)
         self._is_bus_off = is_off
 
-    def switch_watchdog(self, now_ns: int, *, is_there: bool = True) -> None:
-        """Have the watchdog that brakes, or do without it."""
-        self._live(now_ns)
-        self._authority.has_watchdog = is_there
+    def set_watchdog(self, now_ns: int, *, is_enabled: bool = True) -> None:
+        """Enable or disable the watchdog's braking."""
+        self._advance(now_ns)
+        self._authority.has_watchdog = is_enabled

@@ -1,4 +1,4 @@
-"""What of the car itself a by-wire kit has to know to turn numbers on the bus into what happens, and back."""
+"""Properties of the car, and conversions between numbers on the bus and physical values."""
 
 from __future__ import annotations
 
@@ -7,47 +7,47 @@ import math
 from lavt.value import value
 
 MAX_WHEEL_RAD = 9.6
-"""The furthest a steering wheel is turned by command."""
+"""The largest steering wheel angle that a command can set."""
 MAX_WHEEL_RATE_RADPS = 17.5
 
 
 @value
 class Mechanics:
-    """A car's numbers."""
+    """Properties of a car with a by-wire kit."""
 
     steering_ratio: float = 14.8
     """Steering wheel angle over road wheel angle."""
     max_braking_mps2: float = 6.0
-    """Deceleration at the whole of the brake: the simulator's."""
+    """Deceleration at full brake: the simulator's."""
     tyre_radius_m: float = 0.33
-    """Ours: no fact gives it."""
+    """Our choice: not in the facts."""
     steering_rate_step_deg: float = 4.0
-    """Of generation 1: 2 deg/s with old firmware."""
+    """For generation 1: 2 deg/s with old firmware."""
 
     def rate_radps(self, steps: int, step_deg: float) -> float:
-        """Give the rate of the steering wheel that a command names; 0 stands for the greatest (ours: a default)."""
+        """Return a command's rate of the steering wheel; 0 means the maximum (our choice: the kit's default)."""
         return min(math.radians(steps * step_deg), MAX_WHEEL_RATE_RADPS) if steps else MAX_WHEEL_RATE_RADPS
 
     def tyre_radps(self, speed_mps: float) -> float:
-        """Give how fast the tyres turn."""
+        """Return the angular speed of the tyres."""
         return speed_mps / self.tyre_radius_m
 
 
 def within(number: float, least: float, most: float) -> float:
-    """Give the nearest number in a range."""
+    """Clamp a number to a range."""
     return min(max(number, least), most)
 
 
 def wheel_angle(tenths_of_degree: int) -> float:
-    """Give a commanded steering wheel angle in rad, no further than the wheel is turned."""
+    """Return a commanded steering wheel angle in rad, within the limit."""
     return within(math.radians(tenths_of_degree / 10), -MAX_WHEEL_RAD, MAX_WHEEL_RAD)
 
 
 def tenths_of_degree(angle_rad: float) -> int:
-    """Give an angle as it is reported."""
+    """Return an angle in the reports' unit."""
     return round(math.degrees(angle_rad) * 10)
 
 
 def hundredths_of_kmh(speed_mps: float) -> int:
-    """Give a speed as it is reported."""
+    """Return a speed in the reports' unit."""
     return round(speed_mps * 360)

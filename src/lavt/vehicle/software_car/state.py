@@ -1,4 +1,4 @@
-"""What a by-wire kit knows: the orders it got, its actuators, the people in the car, and the car itself.
+"""The state of a by-wire kit: its orders, its actuators, the driver, and the car.
 
 Angles and torques are those of the steering wheel, left positive; pedals are fractions, 0 to 1.
 """
@@ -15,13 +15,13 @@ Axis = Literal["steering", "brake", "throttle"]
 AXES: Final[tuple[Axis, ...]] = ("steering", "brake", "throttle")
 
 STATIONARY_BELOW_MPS = 0.1
-"""Ours: below it the car stands."""
+"""Our choice: below this speed the car is stationary."""
 OVERRIDE_PEDAL: Final = 0.05
-"""Ours: from where on a foot is an override. So much brake is also what a shift needs."""
+"""Our choice: a pedal pressed from here on is an override. A shift needs as much brake."""
 
 
 class Gear(IntEnum):
-    """Gears by the number they have in both generations."""
+    """Gears with their numbers, which are the same in both generations."""
 
     NONE = 0
     PARK = 1
@@ -32,7 +32,7 @@ class Gear(IntEnum):
 
 
 class GearRejection(IntEnum):
-    """Why a gear was refused."""
+    """Why a gear order was rejected."""
 
     NONE = 0
     IN_PROGRESS = 1
@@ -43,7 +43,7 @@ class GearRejection(IntEnum):
 
 
 class SystemState(IntEnum):
-    """State of a kit of generation 2."""
+    """State of the system in generation 2."""
 
     MANUAL = 0
     READY = 1
@@ -52,11 +52,11 @@ class SystemState(IntEnum):
 
 
 class ReleaseReason(IntEnum):
-    """Why a kit let go, or is not ready.
+    """Why a kit released its axes, or is not ready.
 
-    The facts name those up to the lockouts and give no numbers: they are counted in the order of the names.
-    The rest are the kit's own and not reported. The tenth, a delay before engaging again, is not played: no fact
-    tells its length.
+    The facts name the reasons up to the lockouts and give no numbers: they are numbered in the order of the names. The
+    others are internal to the kit and not reported. The tenth, a delay before engaging again, is not simulated: its
+    length is not in the facts.
     """
 
     NONE = 0
@@ -71,33 +71,33 @@ class ReleaseReason(IntEnum):
     LOCKOUT_REVERSE = 9
     REQUESTED = 11
     DISABLED = 12
-    """A command came without its enable bit."""
+    """A command came without its enable bit, or none came."""
     FAULT = 13
     REMOTE = 14
     """The remote's switch is at emergency stop or pause."""
 
 
 @value
-class Order:
-    """A command for an actuator, whatever generation it came by."""
+class AxisOrder:
+    """An order to an axis, of either generation."""
 
     axis: Axis
     is_valid: bool
-    """Its checksum is right, where it has one."""
+    """The checksum is right, or there is none."""
     target: float = 0.0
-    """Steering wheel angle in rad, or a pedal's fraction."""
+    """Steering wheel angle in rad, or a pedal as a fraction."""
     is_enabling: bool = False
     is_clearing: bool = False
     ignores_driver: bool = False
     rate_radps: float = 0.0
-    """How fast the steering wheel may turn."""
+    """The largest rate of the steering wheel."""
     count: int | None = None
-    """None: the frame has no counter, and asks only to clear."""
+    """None: the frame has no counter and only clears."""
 
 
 @value
 class GearOrder:
-    """A command for the gearbox."""
+    """An order to the gearbox."""
 
     is_valid: bool
     gear: int
@@ -106,7 +106,7 @@ class GearOrder:
 
 @value
 class SystemOrder:
-    """A command to a kit of generation 2 as a whole."""
+    """An order to a kit of generation 2 as a whole."""
 
     is_valid: bool
     request: int
@@ -116,13 +116,13 @@ class SystemOrder:
 
 @dataclass(slots=True)
 class Actuator:
-    """One axis."""
+    """The state of an axis."""
 
-    order: Order | None = None
-    """The newest valid one, until it times out."""
-    heard_ns: int = 0
+    order: AxisOrder | None = None
+    """The newest valid order, until it times out."""
+    received_ns: int = 0
     count: int | None = None
-    """Of the newest frame with a right checksum."""
+    """The counter of the newest frame with a right checksum."""
     is_enabled: bool = False
     driver_acts: bool = False
     is_overridden: bool = False
@@ -134,29 +134,29 @@ class Actuator:
 
     @property
     def may_be_enabled(self) -> bool:
-        """Whether its own orders and state allow it."""
+        """Whether the axis's order and state allow it to be enabled."""
         order = self.order
         return order is not None and order.is_enabling and not self.is_overridden and not self.faults
 
 
 @dataclass(slots=True)
 class KitState:
-    """Everything that reports are made of."""
+    """The state from which reports are made."""
 
     actuators: dict[Axis, Actuator] = field(default_factory=lambda: {axis: Actuator() for axis in AXES})
-    # The car, as the simulator tells it.
+    # The car, as reported by the simulator.
     speed_mps: float = 0.0
     wheel_rad: float = 0.0
     """Angle of the steering wheel."""
     invalid: set[str] = field(default_factory=set)
-    """Which of `angle`, `speed`, `wheel_speed` are reported as unknown."""
-    # The people in it.
+    """Values reported as unknown: `angle`, `speed`, `wheel_speed`."""
+    # The driver.
     driver_torque_nm: float = 0.0
     driver_brake: float = 0.0
     driver_throttle: float = 0.0
-    # What goes to the wheels.
-    held_rad: float = 0.0
-    """Where the kit has the steering wheel."""
+    # The actuation.
+    setpoint_rad: float = 0.0
+    """The kit's setpoint for the steering wheel's angle."""
     brake: float = 0.0
     throttle: float = 0.0
     # The gearbox.
@@ -170,24 +170,24 @@ class KitState:
     disengaged: ReleaseReason = ReleaseReason.NONE
     not_ready: ReleaseReason = ReleaseReason.NONE
     watchdog: ReleaseReason = ReleaseReason.NONE
-    """Why the watchdog tripped; latched until it is cleared after somebody has taken over."""
+    """Why the watchdog tripped; latched until it is cleared after an override by the driver."""
     watchdog_axis: Axis | None = None
     watchdog_brakes: bool = False
     remote_state: int = 2
     sent: dict[int, int] = field(default_factory=dict)
-    """How often each report was sent."""
+    """Number of frames sent, by identifier."""
 
     @property
     def is_stationary(self) -> bool:
-        """Whether the car stands."""
+        """Whether the car is stationary."""
         return abs(self.speed_mps) < STATIONARY_BELOW_MPS
 
     @property
     def is_in_gear(self) -> bool:
-        """Whether the engine could move the car."""
+        """Whether the gear transmits power."""
         return self.gear in {Gear.REVERSE, Gear.DRIVE, Gear.LOW}
 
     @property
     def is_overridden(self) -> bool:
-        """Whether the driver has taken anything over."""
+        """Whether the driver overrides an axis or the gear."""
         return self.is_gear_overridden or any(actuator.is_overridden for actuator in self.actuators.values())

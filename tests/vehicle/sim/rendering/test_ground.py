@@ -18,7 +18,7 @@ marks: [{offset_m: 2, kind: broken, dash_m: 60, gap_m: 10, width_m: WIDTH}]
 
 
 def brightness(road: Road, s_m: FloatArray, offset_m: float, level: int) -> FloatArray:
-    """Give the mean of the three colours of the texels at stations and an offset."""
+    """Return the brightness of the texels at stations and an offset."""
     ground = Ground(road, LIGHTS["noon"], None)
     found = []
     for x_m, y_m in road.across(s_m, offset_m).tolist():
@@ -30,7 +30,7 @@ def brightness(road: Road, s_m: FloatArray, offset_m: float, level: int) -> Floa
 
 
 def test_a_long_dash_bends_with_the_road() -> None:
-    """Of a dash of 60 m in a bend of 50 m the paint is found where the mark is, all along."""
+    """A dash of 60 m in a bend of 50 m radius follows the mark along its whole length."""
     road = parse_road(BEND.replace("WIDTH", "0.3"), source="x")
     s_m = np.arange(2.0, 58.0, 0.5)
     painted, bare = brightness(road, s_m, 2.0, 1), brightness(road, s_m, 0.0, 1)
@@ -38,8 +38,8 @@ def test_a_long_dash_bends_with_the_road() -> None:
 
 
 @pytest.mark.parametrize(("width_m", "share"), [(0.125, 0.125 * 1.3 / 0.32), (1.2, 1.0)])
-def test_far_away_a_mark_is_as_bright_as_it_is_wide(width_m: float, share: float) -> None:
-    """At 32 cm a texel a thin line is fainter by as much as it is thinner; a wide one is as white as near by."""
+def test_a_distant_mark_fades_with_its_width(width_m: float, share: float) -> None:
+    """At 32 cm per texel a line thinner than a texel is fainter in proportion; a wide line keeps its brightness."""
     road = parse_road(BEND.replace("WIDTH", str(width_m)), source="x")
     s_m = np.arange(2.0, 58.0, 0.5)
     near, far = (

@@ -31,15 +31,15 @@ def y_at(lane: Lane, x_m: float) -> float:
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.1, -0.1])
 @pytest.mark.parametrize("lateral_m", [0.0, 0.5, -1.0])
-def test_the_lane_is_where_the_road_has_it(lateral_m: float, turned_rad: float) -> None:
-    """The fitted centre passes within 2 cm of the true one on a straight, and 15 cm where a curve begins or ends.
+def test_the_lane_follows_the_road(lateral_m: float, turned_rad: float) -> None:
+    """The fitted centre is within 2 cm of the true one on a straight, and 15 cm where a curve begins or ends.
 
-    No parabola follows the change from a straight to a radius of 42 m better, that of pixels neither.
+    No parabola follows the change from a straight to a radius of 42 m better, nor does one fitted to pixels.
     """
-    watching = camera()
+    lane_camera = camera()
     for s_m in range(0, int(ROAD.length_m) - 25, 3):
         pose = pose_at(s_m, lateral_m, turned_rad)
-        lane = watching.lane_from(pose)
+        lane = lane_camera.observe_lane(pose)
         assert lane.confidence > 0.8
         for ahead_m in (6.0, 10.0, 14.0):
             truth_x, truth_y = ROAD.across(s_m + ahead_m, 0.0).tolist()
@@ -50,10 +50,10 @@ def test_the_lane_is_where_the_road_has_it(lateral_m: float, turned_rad: float) 
             assert abs(y_at(lane, x_m) - y_m) < (0.02 if straight else 0.15)
 
 
-def test_confidence_is_what_is_in_view() -> None:
-    """In the lane it is 1; beside it, or turned, less and less; out of the detector's 7 m, or turned away, 0."""
-    beside = [camera().lane_from(pose_at(S_M, lateral_m)).confidence for lateral_m in (0.0, 2.0, 4.0, 6.0, 10.0)]
-    turned = [camera().lane_from(pose_at(S_M, 0.0, math.radians(deg))).confidence for deg in (0, 20, 40, 90, 180)]
+def test_confidence_is_the_visible_share_of_the_lane() -> None:
+    """The confidence falls from 1 in the lane to 0 beyond the detector's 7 m or turned away."""
+    beside = [camera().observe_lane(pose_at(S_M, lateral_m)).confidence for lateral_m in (0.0, 2.0, 4.0, 6.0, 10.0)]
+    turned = [camera().observe_lane(pose_at(S_M, 0.0, math.radians(deg))).confidence for deg in (0, 20, 40, 90, 180)]
     for confidences in (beside, turned):
         assert confidences[0] > 0.95
         assert confidences == sorted(confidences, reverse=True)
@@ -62,7 +62,7 @@ def test_confidence_is_what_is_in_view() -> None:
 
 
 @pytest.mark.parametrize(
-    ("yaw_deg", "y_m", "sees"),
+    ("yaw_deg", "y_m", "confidence"),
     [
         (0.0, 0.0, 1.0),
         (20.0, 0.0, 0.9),
@@ -73,21 +73,21 @@ def test_confidence_is_what_is_in_view() -> None:
         (0.0, 5.0, 0.8),
     ],
 )
-def test_a_camera_that_looks_aside_sees_less(yaw_deg: float, y_m: float, sees: float) -> None:
-    """Half of the lane's lines are left of a camera that looks 46 degrees to one side; behind the car there is none."""
+def test_a_camera_turned_aside_has_less_confidence(yaw_deg: float, y_m: float, confidence: float) -> None:
+    """A camera turned by 46 degrees sees half of the lane's lines, and one turned backwards sees none."""
     model = CameraModel(yaw_rad=math.radians(yaw_deg), y_m=y_m)
-    lane = camera(model=model).lane_from(pose_at(S_M))
-    assert lane.confidence == pytest.approx(sees, abs=0.1)
+    lane = camera(model=model).observe_lane(pose_at(S_M))
+    assert lane.confidence == pytest.approx(confidence, abs=0.1)
 
 
-def test_no_pose_no_picture() -> None:
-    """Before the vehicle has told where it is there is no picture."""
+def test_there_is_no_picture_without_a_pose() -> None:
+    """There is no picture before the first pose."""
     assert camera().capture(0, 0, None) is None
     assert camera().expose(0, 0, []) is None
 
 
-def test_an_exposure_is_seen_from_its_middle() -> None:
-    """With an exposure the lane is the one seen half-way, and so is the time it says."""
+def test_an_exposed_lane_is_that_of_the_middle_of_the_exposure() -> None:
+    """With an exposure the lane and the capture time are those of its middle."""
     poses = [pose_at(S_M, at_ns=0), pose_at(S_M, 0.4, at_ns=10_000_000), pose_at(S_M, 9.0, at_ns=20_000_000)]
     frame = camera(exposure_ns=10_000_000).expose(3, 0, poses)
     expected = camera().capture(3, 5_000_000, pose_at(S_M, 0.2))

@@ -1,4 +1,4 @@
-"""What the three lights do to a picture."""
+"""Pictures in the three lights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 from lavt.domain import FloatArray, Picture
 from lavt.vehicle.sim.rendering import renderer
 from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
-from lavt.vehicle.sim.rendering.pinhole import view_from
+from lavt.vehicle.sim.rendering.pinhole import place_camera
 from lavt.vehicle.sim.road.road import Road, load_road
 
 NAMES: tuple[LightName, ...] = ("noon", "low_sun", "overcast")
@@ -26,7 +26,7 @@ def road() -> Road:
 
 @cache
 def asphalt(light: LightName) -> FloatArray:
-    """Return the means (n, 3) of small pieces of the driven lane in front of the car, all along the route."""
+    """Return the mean colours (n, 3) of small areas of the driven lane ahead of the car along the route."""
     road = load_road("a_key")
     camera = camera_on(road, light=light)
     pictures = [picture_of(camera, pose_at(road, s_m)) for s_m in np.arange(2.0, road.length_m, 6.0)]
@@ -34,33 +34,33 @@ def asphalt(light: LightName) -> FloatArray:
 
 
 def test_the_low_sun_is_warm_and_dark() -> None:
-    """With a low sun the road is darker than at noon and redder than blue; under clouds it is bluish, if anything."""
+    """A low sun makes the road darker and redder than at noon; under clouds the road is not reddish."""
     noon, low, clouds = (np.median(asphalt(light), axis=0) for light in NAMES)
     assert low.mean() < 0.9 * noon.mean()
     assert low[2] / low[0] > 1.2 * noon[2] / noon[0]
     assert clouds[2] <= clouds[0]
 
 
-def test_only_the_sun_throws_shadows() -> None:
-    """With a low sun the lane has pieces in the shade, about half as bright as the others; under clouds it has none."""
+def test_only_the_sun_casts_shadows() -> None:
+    """With a low sun parts of the lane are in shade, about half as bright as the rest; under clouds none is."""
     low, clouds = asphalt("low_sun").mean(axis=1), asphalt("overcast").mean(axis=1)
     assert low.min() < 0.55 * np.median(low)
     assert clouds.min() > 0.8 * np.median(clouds)
 
 
 def grey_at(picture: Picture, road: Road, station_m: float, lateral_m: float, s_m: float) -> float:
-    u_px, v_px, _ = view_from(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose_at(road, s_m)).project(np.append(road.across(station_m, lateral_m), 0.0))
     return float(picture[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 2 : round(u_px) + 3].mean())
 
 
-def test_a_rails_shadow_is_where_the_sun_throws_it(road: Road) -> None:
-    """Beside the rail on the right the ground is dark as far as the sun throws its top, and bright beyond."""
+def test_a_rails_shadow_falls_away_from_the_sun(road: Road) -> None:
+    """The ground beside the right rail is dark up to the shadow of the rail's top, and bright beyond."""
     camera = camera_on(road, light="low_sun", scenery="light")
     picture = picture_of(camera, pose_at(road, 80.0))
     station_m = 88.0
     ahead, left = road.across(station_m, [0.0, 1.0])
     reach_m = 0.76 * float(LIGHTS["low_sun"].shadow_m @ (left - ahead))
-    assert reach_m > 3.0  # the sun stands to the right here
+    assert reach_m > 3.0  # the sun is to the right here
     inside = grey_at(picture, road, station_m, -9.15 + 0.85 * reach_m, 80.0)
     beyond = grey_at(picture, road, station_m, -9.15 + 1.5 * reach_m, 80.0)
     assert inside < 0.7 * beyond
@@ -68,7 +68,7 @@ def test_a_rails_shadow_is_where_the_sun_throws_it(road: Road) -> None:
 
 @pytest.mark.parametrize("light", NAMES)
 def test_marks_stand_out_in_every_light(road: Road, light: LightName) -> None:
-    """In every light a solid mark is at least half as bright again as the asphalt beside it."""
+    """In every light a solid mark is at least 1.5 times as bright as the asphalt beside it."""
     picture = picture_of(camera_on(road, light=light), pose_at(road, 0.0)).astype(np.uint8)
     assert grey_at(picture, road, 7.0, -1.75, 0.0) > 1.5 * grey_at(picture, road, 7.0, -1.2, 0.0)
 
@@ -84,8 +84,8 @@ print(digest(picture_of(camera_on(road, light="{light}"), pose_at(road, 70.0, 0.
 @pytest.mark.parametrize(
     "light", ["low_sun", *(pytest.param(light, marks=pytest.mark.full) for light in ("noon", "overcast"))]
 )
-def test_a_frame_is_the_same_to_the_byte_everywhere(road: Road, light: LightName) -> None:
-    """Equal pose, number and seed give an equal picture with cold and warm caches, and in another process."""
+def test_a_frame_is_byte_for_byte_reproducible(road: Road, light: LightName) -> None:
+    """Equal pose, number and seed give equal bytes with cold and warm caches, and in another process."""
     renderer.world.cache_clear()
     cold = digest(picture_of(camera_on(road, light=light), pose_at(road, 70.0, 0.3, 0.1), 5))
     warm_camera = camera_on(road, light=light)
@@ -94,5 +94,5 @@ def test_a_frame_is_the_same_to_the_byte_everywhere(road: Road, light: LightName
         picture_of(warm_camera, pose_at(road, s_m, -2.0, -0.4))
     warm = digest(picture_of(warm_camera, pose_at(road, 70.0, 0.3, 0.1), 5))
     command = [sys.executable, "-c", DIGEST.format(light=light)]
-    elsewhere = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.strip()
-    assert cold == warm == elsewhere
+    other_process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.strip()
+    assert cold == warm == other_process

@@ -7,7 +7,7 @@ from tests.vehicle.sim.rig import MODEL, camera_on, digest, picture_of, pose_at
 from lavt.domain import CameraModel, FloatArray, Picture, Pose
 from lavt.vehicle.camera import Camera
 from lavt.vehicle.sim.rendering.ground import Ground
-from lavt.vehicle.sim.rendering.pinhole import horizon_row, row_of_depth, view_from
+from lavt.vehicle.sim.rendering.pinhole import horizon_row, place_camera, row_of_depth
 from lavt.vehicle.sim.rendering.renderer import SceneryKind
 from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M
 from lavt.vehicle.sim.road.road import Road, load_road
@@ -19,8 +19,8 @@ def road() -> Road:
     return load_road("a_key")
 
 
-def test_a_frame_has_the_time_and_the_size_requested_for(road: Road) -> None:
-    """A frame carries its number and the time it was asked for, and a picture of the model's size."""
+def test_a_frame_has_the_requested_number_and_time(road: Road) -> None:
+    """A frame has the requested number and time, and a picture of the model's size."""
     camera: Camera = camera_on(road, scenery="none")
     frame = camera.capture(3, 1234, pose_at(road, 0.0))
     assert frame is not None
@@ -29,13 +29,13 @@ def test_a_frame_has_the_time_and_the_size_requested_for(road: Road) -> None:
 
 
 def test_there_is_no_picture_without_a_pose(road: Road) -> None:
-    """Before the vehicle has a pose the camera gives nothing."""
+    """There is no frame before the first pose."""
     assert camera_on(road, scenery="none").capture(0, 0, None) is None
 
 
 @pytest.mark.parametrize("scenery", ["full", "light", "none"])
 def test_frames_do_not_depend_on_history(road: Road, scenery: SceneryKind) -> None:
-    """A prepared camera, one fresh, and one that has been elsewhere give the same bytes."""
+    """A prepared camera and a fresh one give equal bytes for equal poses in any order."""
     prepared, fresh = camera_on(road, scenery=scenery), camera_on(road, scenery=scenery)
     prepared.prepare()
     poses = [pose_at(road, s_m, 0.4, -0.1) for s_m in (90.0, 12.0, 55.0, 12.0)]
@@ -45,8 +45,8 @@ def test_frames_do_not_depend_on_history(road: Road, scenery: SceneryKind) -> No
     assert first[1] != first[3]  # the same place, but another frame: other noise
 
 
-def test_the_seed_moves_only_the_sensors_noise(road: Road) -> None:
-    """Pictures of one pose under two seeds differ, but nowhere by more than noise."""
+def test_the_seed_changes_only_the_sensor_noise(road: Road) -> None:
+    """Pictures of one pose with two seeds differ only by noise."""
     pose = pose_at(road, 30.0)
     one, other = (picture_of(camera_on(road, seed=seed), pose).astype(int) for seed in (1, 2))
     difference = np.abs(one - other)
@@ -56,7 +56,7 @@ def test_the_seed_moves_only_the_sensors_noise(road: Road) -> None:
 
 def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, stations: FloatArray) -> FloatArray:
     ground = road.across(stations, offset_m)
-    points = view_from(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
+    points = place_camera(model, pose).project(np.column_stack([ground, np.zeros(len(ground))]))
     inside = (points[:, 0] > 4) & (points[:, 0] < model.width_px - 5) & (points[:, 1] < model.height_px - 2)
     assert inside.sum() >= 3
     return points[inside]
@@ -64,15 +64,15 @@ def marks_in_view(road: Road, pose: Pose, model: CameraModel, offset_m: float, s
 
 @pytest.mark.parametrize("turned_rad", [-0.2, 0.0, 0.15])
 @pytest.mark.parametrize("pitch_rad", [0.0, 0.12])
-def test_marks_are_where_the_pinhole_says(road: Road, turned_rad: float, pitch_rad: float) -> None:
-    """Across a solid mark up to 30 m away the middle of the bright pixels is its projection, within a pixel."""
+def test_marks_are_at_their_projection(road: Road, turned_rad: float, pitch_rad: float) -> None:
+    """A solid mark up to 30 m away is within a pixel of its projection."""
     model = dataclasses.replace(MODEL, pitch_rad=pitch_rad)
     pose = pose_at(road, 2.0, 0.3, turned_rad)
     picture = picture_of(camera_on(road, scenery="none", model=model), pose).astype(float).mean(axis=2)
     stations = np.arange(30.0, 43.0, 1.5)
     for u_px, v_px, _ in marks_in_view(road, pose, model, -5.25, stations):
         row, column = round(v_px), round(u_px)
-        # The mark's projection is exact at v_px; the row is up to half a pixel away, so follow the mark's slope to it.
+        # The mark's projection is exact at v_px; the row is up to half a pixel away, so follow the mark to the row.
         near = marks_in_view(road, pose, model, -5.25, np.arange(25.0, 50.0, 0.02))
         at_row = near[np.argmin(np.abs(near[:, 1] - row)), 0]
         reach = np.arange(max(column - 14, 0), min(column + 15, model.width_px))
@@ -81,64 +81,64 @@ def test_marks_are_where_the_pinhole_says(road: Road, turned_rad: float, pitch_r
         assert (bright * reach).sum() / bright.sum() == pytest.approx(at_row, abs=1.0)
 
 
-def test_a_dash_is_bright_and_a_gap_is_not(road: Road) -> None:
-    """On the broken line to the left the middles of dashes are at least 60 grey levels brighter than the gaps."""
+def test_dashes_are_bright_and_gaps_are_not(road: Road) -> None:
+    """On a broken line the middle of a dash is over 60 grey levels above its surroundings, that of a gap is not."""
     pose = pose_at(road, 0.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(float).mean(axis=2)
     dashes = np.array([9.0]) + DASH_M / 2
     for station, is_dash in [(float(dashes[0]), True), (float(dashes[0] + (DASH_M + GAP_M) / 2), False)]:
         ground = np.append(road.across(station, 1.75), 0.0)
-        u_px, v_px, _ = view_from(MODEL, pose).project(ground)
+        u_px, v_px, _ = place_camera(MODEL, pose).project(ground)
         around = picture[round(v_px), round(u_px) - 25 : round(u_px) + 26]
         assert (picture[round(v_px), round(u_px)] - np.median(around) > 60) == is_dash
 
 
-def test_yellow_is_yellow_and_white_is_not(road: Road) -> None:
-    """The mark at the median is yellow (red far above blue), the one at the shoulder white."""
+def test_marks_have_their_colours(road: Road) -> None:
+    """The mark at the median is yellow (red far above blue), and the mark at the shoulder is white."""
     pose = pose_at(road, 0.0, 6.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = view_from(MODEL, pose).project(np.append(road.across(10.0, 8.75), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, 8.75), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert red - blue > 60
     pose = pose_at(road, 0.0, -3.0)
     picture = picture_of(camera_on(road, scenery="none"), pose).astype(int)
-    u_px, v_px, _ = view_from(MODEL, pose).project(np.append(road.across(10.0, -5.25), 0.0))
+    u_px, v_px, _ = place_camera(MODEL, pose).project(np.append(road.across(10.0, -5.25), 0.0))
     blue, _, red = picture[round(v_px), round(u_px)]
     assert abs(red - blue) < 25
     assert blue > 140
 
 
-def test_rows_see_the_ground_at_their_depth() -> None:
-    """The row for a depth is where the pinhole projects the ground at that depth, also with a pitched camera."""
+def test_the_row_of_a_depth_is_the_projection_of_its_ground() -> None:
+    """The row of a depth contains the projection of the ground at that depth, also for a pitched camera."""
     for pitch_rad in (0.0, 0.2):
         model = dataclasses.replace(MODEL, pitch_rad=pitch_rad)
-        view = view_from(model, Pose(0, 0.0, 0.0, 0.0))
-        _, v_px, _ = view.project(np.array([model.x_m + 10.0, 0.0, 0.0]))
+        placement = place_camera(model, Pose(0, 0.0, 0.0, 0.0))
+        _, v_px, _ = placement.project(np.array([model.x_m + 10.0, 0.0, 0.0]))
         assert row_of_depth(model, 10.0) - 1 < v_px <= row_of_depth(model, 10.0)
 
 
 def test_the_homography_is_the_inverse_of_the_projection() -> None:
-    """A pixel's ground projects back to the pixel."""
-    view = view_from(dataclasses.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
-    ground = view.ground_from_picture() @ np.array([123.0, 400.0, 1.0])
-    assert view.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx([123.0, 400.0])
+    """The ground point of a pixel projects back to the pixel."""
+    placement = place_camera(dataclasses.replace(MODEL, pitch_rad=0.1), Pose(0, 30.0, -7.0, 2.0))
+    ground = placement.ground_from_picture() @ np.array([123.0, 400.0, 1.0])
+    assert placement.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx([123.0, 400.0])
 
 
-def test_rails_stand_only_with_scenery(road: Road) -> None:
-    """The barrier hides the ground beside the road in `light` and `full`, and is left out in `none`."""
+def test_rails_are_drawn_only_with_scenery(road: Road) -> None:
+    """The barrier is drawn with scenery `light` and `full`, and left out with `none`."""
     pose = pose_at(road, 60.0)
     pictures = {
         kind: picture_of(camera_on(road, scenery=kind), pose).astype(float) for kind in ("full", "light", "none")
     }
     point = np.append(road.across(84.0, 12.25), 0.5)
-    u_px, v_px, _ = view_from(MODEL, pose).project(point)
+    u_px, v_px, _ = place_camera(MODEL, pose).project(point)
     place = np.s_[round(v_px) - 1 : round(v_px) + 2, round(u_px) - 3 : round(u_px) + 4]
     assert np.abs(pictures["light"][place].mean() - pictures["none"][place].mean()) > 25
     assert pictures["full"][place].mean() == pytest.approx(pictures["light"][place].mean(), abs=3)
 
 
-def test_another_model_is_drawn_too(road: Road) -> None:
-    """A small, wide, high and pitched camera gets a picture of its own size with no row left empty."""
+def test_another_camera_model_is_drawn(road: Road) -> None:
+    """A small, wide, high and pitched camera has a picture of its own size without empty rows."""
     model = CameraModel(width_px=320, height_px=200, field_of_view_rad=2.0, z_m=2.0, pitch_rad=0.15)
     picture = picture_of(camera_on(road, model=model), pose_at(road, 40.0))
     assert picture.shape == (200, 320, 3)
@@ -149,26 +149,26 @@ TURNED = CameraModel(x_m=1.2, y_m=0.5, z_m=1.6, pitch_rad=0.1, yaw_rad=0.3, roll
 
 
 def test_the_homography_inverts_the_projection_for_every_pose() -> None:
-    """A turned, leaning camera beside the middle sees the ground of a pixel at that pixel."""
-    view = view_from(TURNED, Pose(0, 30.0, -7.0, 2.0))
+    """For a turned, rolled and offset camera the ground point of a pixel projects back to the pixel."""
+    placement = place_camera(TURNED, Pose(0, 30.0, -7.0, 2.0))
     for pixel in ([123.0, 400.0], [600.0, 300.0], [320.0, 470.0]):
-        ground = view.ground_from_picture() @ np.array([*pixel, 1.0])
-        assert view.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx(pixel)
+        ground = placement.ground_from_picture() @ np.array([*pixel, 1.0])
+        assert placement.project(np.append(ground[:2] / ground[2], 0.0))[:2] == pytest.approx(pixel)
 
 
-def test_signs_of_the_cameras_pose() -> None:
-    """Turned left the road ahead is to the right; moved left likewise; leaning right the right horizon is higher."""
+def test_yaw_offset_and_roll_have_their_signs() -> None:
+    """A camera turned or moved left sees the road ahead on the right; rolled right, its right horizon is higher."""
     pose, ahead = Pose(0, 0.0, 0.0, 0.0), np.array([40.0, 0.0, 1.4])
     for model in (CameraModel(yaw_rad=0.1), CameraModel(y_m=0.5)):
-        assert view_from(model, pose).project(ahead)[0] > MODEL.width_px / 2
-    leaning = view_from(CameraModel(roll_rad=0.1), pose)
+        assert place_camera(model, pose).project(ahead)[0] > MODEL.width_px / 2
+    leaning = place_camera(CameraModel(roll_rad=0.1), pose)
     right, left = (leaning.project(np.array([40.0, side, 1.4]))[1] for side in (-20.0, 20.0))
     assert right < horizon_row(MODEL) < left
 
 
 @pytest.mark.parametrize("scenery", ["full", "none"])
-def test_a_turned_camera_draws_what_it_projects(road: Road, scenery: SceneryKind) -> None:
-    """Marks are where the pinhole says for a camera with yaw, pitch, roll and offset too, within 1.5 pixels."""
+def test_a_turned_camera_has_marks_at_their_projection(road: Road, scenery: SceneryKind) -> None:
+    """For a camera with yaw, pitch, roll and offset, marks are within 1.5 pixels of their projection."""
     pose = pose_at(road, 0.0)
     picture = picture_of(camera_on(road, scenery=scenery, model=TURNED), pose).astype(float).mean(axis=2)
     for u_px, v_px, _ in marks_in_view(road, pose, TURNED, -1.75, np.arange(4.0, 9.0, 0.5)):
@@ -181,7 +181,7 @@ def test_a_turned_camera_draws_what_it_projects(road: Road, scenery: SceneryKind
 
 
 def test_far_dashes_do_not_flicker(road: Road) -> None:
-    """While the car moves in steps of 0.1 m no place of a broken line beyond 40 m changes by 12 levels in a step."""
+    """A car that moves by 0.1 m changes no pixel of a broken line beyond 40 m by 12 grey levels or more."""
     camera = camera_on(road, scenery="none")
     rows = np.arange(round(horizon_row(MODEL)) + 4, row_of_depth(MODEL, 40.0))
     beside_px = 1.75 / MODEL.z_m * (rows - horizon_row(MODEL))
@@ -195,18 +195,18 @@ def test_far_dashes_do_not_flicker(road: Road) -> None:
 
 @pytest.mark.parametrize("route", ["a_key", pytest.param("b", marks=pytest.mark.full)])
 def test_a_prepared_camera_paints_few_tiles_while_driving(monkeypatch: pytest.MonkeyPatch, route: str) -> None:
-    """A car that swerves by 6 m and 0.6 rad needs no new coarse tile all along, and at most 10 fine ones in a frame."""
+    """A car that swerves by 6 m and 0.6 rad needs no new coarse tiles, and at most 10 fine ones per frame."""
     whole_road = load_road(route)
     camera = camera_on(whole_road)
     camera.prepare()
     painted: list[int] = []
     paint = Ground._paint
 
-    def watched(ground: Ground, level: int, square: Square) -> Picture:
+    def counted_paint(ground: Ground, level: int, square: Square) -> Picture:
         painted.append(level)
         return paint(ground, level, square)
 
-    monkeypatch.setattr(Ground, "_paint", watched)
+    monkeypatch.setattr(Ground, "_paint", counted_paint)
     for s_m in np.arange(0.0, whole_road.length_m, 2.5):
         painted.clear()
         picture_of(camera, pose_at(whole_road, s_m, 6.0 * np.sin(s_m / 9), 0.6 * np.cos(s_m / 9)))

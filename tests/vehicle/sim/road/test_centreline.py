@@ -21,24 +21,26 @@ def line_of(segments: list[Segment]) -> Centreline:
 
 @settings(max_examples=200)
 @given(SEGMENTS, st.floats(0, 1), st.floats(-8.0, 8.0), st.floats(-12.0, 12.0))
-def test_projection_finds_the_station_and_the_offset_a_place_was_made_from(
+def test_projection_inverts_station_and_offset(
     segments: list[Segment], share: float, offset_m: float, beside_m: float
 ) -> None:
-    """Whatever the segments, a place beside the line projects to its station, offset, heading and curvature."""
+    """A point constructed at a station and an offset projects back to them, for any segments."""
     line = line_of(segments)
     s_m = -10.0 + share * (line.last_m + 10.0)
     x_m, y_m, heading_rad, _ = (float(each) for each in line.point(s_m))
     found = line.project(
-        x_m - offset_m * math.sin(heading_rad), y_m + offset_m * math.cos(heading_rad),
-        s_m + beside_m - 13.0, s_m + beside_m + 13.0,
-    )  # fmt: skip
+        x_m - offset_m * math.sin(heading_rad),
+        y_m + offset_m * math.cos(heading_rad),
+        s_m + beside_m - 13.0,
+        s_m + beside_m + 13.0,
+    )
     assert found[:3] == pytest.approx((s_m, offset_m, heading_rad), abs=1e-6)
 
 
 @settings(max_examples=50)
 @given(st.floats(20.0, 200.0), CURVATURES, CURVATURES)
-def test_a_clothoid_is_where_its_heading_leads(length_m: float, begin: float, end: float) -> None:
-    """Positions are the integral of the heading, to less than a tenth of a millimetre over 200 m."""
+def test_a_clothoids_position_is_the_integral_of_its_heading(length_m: float, begin: float, end: float) -> None:
+    """Positions on a clothoid equal the integral of the heading within 0.1 mm over 200 m."""
     line = Centreline(0.0, (0.0, 0.0, 0.0), [Segment(length_m, begin, end)])
     middles_m = (np.arange(200_000) + 0.5) * length_m / 200_000
     turn_rad = begin * middles_m + (end - begin) / length_m * middles_m**2 / 2
@@ -50,17 +52,17 @@ def test_a_clothoid_is_where_its_heading_leads(length_m: float, begin: float, en
 
 
 def test_a_clothoid_is_the_fresnel_integral() -> None:
-    """From the straight to a radius of 50 m in 100 m: the tabled end of Euler's spiral, scaled by a = 70.71 m."""
+    """A clothoid from straight to a radius of 50 m in 100 m ends at the tabulated point of Euler's spiral."""
     line = Centreline(0.0, (0.0, 0.0, 0.0), [Segment(100.0, 0.0, 0.02)])
     x_m, y_m, _, _ = line.point(100.0)
-    # x = a sqrt(2) integral of cos t^2 to 1, y likewise with sin: 0.904524238, 0.310268302
+    # x = a sqrt(2) integral of cos t^2 to 1, y likewise with sin: 0.904524238, 0.310268302; a = 70.71 m
     assert (float(x_m), float(y_m)) == pytest.approx((90.4524238, 31.0268302), abs=1e-6)
 
 
 @settings(max_examples=100)
 @given(SEGMENTS)
-def test_a_line_has_no_gap_and_no_kink(segments: list[Segment]) -> None:
-    """Across every joint place and heading are continuous, and curvature is where the segments say so."""
+def test_a_centreline_is_continuous(segments: list[Segment]) -> None:
+    """Position and heading are continuous across every joint, and curvature is that of the segments."""
     line = line_of(segments)
     joint_m = -10.0
     for before, after in itertools.pairwise(segments):
@@ -71,8 +73,8 @@ def test_a_line_has_no_gap_and_no_kink(segments: list[Segment]) -> None:
         assert curvature.tolist() == pytest.approx([before.end_curvature_per_m, after.curvature_per_m], abs=1e-6)
 
 
-def test_beyond_both_ends_a_line_goes_straight_on() -> None:
-    """Before the first and after the last segment the line is straight, whatever they are."""
+def test_a_centreline_is_straight_beyond_both_ends() -> None:
+    """The line is straight before the first segment and after the last one."""
     line = line_of([Segment(30.0, 0.02, 0.02)])
     _, _, heading_rad, curvature = line.point([-60.0, -11.0, 20.1, 70.0])
     assert heading_rad[0] == heading_rad[1]

@@ -15,7 +15,7 @@ ROUTES = {
     "c": (292.56, -90.17, 134.96, 216.68, 367.69, -0.43),
     "c_key": (163.68, -61.57, 134.96, 231.83, 367.64, 0.30),
 }
-"""What the map says of the six routes' lane."""
+"""Properties of the six routes' lane in the map."""
 
 
 @pytest.fixture(scope="module")
@@ -23,14 +23,14 @@ def road() -> Road:
     return load_road("a_key")
 
 
-def test_the_six_routes_come_along() -> None:
-    """Three routes, their key parts and a straight road come with the package."""
+def test_the_package_includes_all_roads() -> None:
+    """The package includes three routes, their key parts and a straight road."""
     assert road_names() == sorted([*ROUTES, "straight"])
 
 
 @pytest.mark.parametrize("name", ROUTES)
 def test_a_route_has_the_shape_of_the_map(name: str) -> None:
-    """Length, turn, smallest radius and starting pose of a route are those of the map's lane."""
+    """A route's length, turn, smallest radius and start pose are those of the map's lane."""
     length_m, turn_deg, radius_m, *start = ROUTES[name]
     road = load_road(name)
     assert road.length_m == pytest.approx(length_m, abs=0.01)
@@ -44,20 +44,18 @@ def test_a_route_has_the_shape_of_the_map(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROUTES)
 def test_a_route_has_the_lanes_of_the_map(name: str) -> None:
-    """Four lanes of 3.5 m a direction, the third from the left is driven, shoulders of 3.5 m, a barrier, rails."""
+    """A route has the four lanes, shoulders, barrier and rails of the map, and the third lane is driven."""
     road = load_road(name)
     assert (road.lanes.edges_m, road.lanes.driven) == ((-5.25, -1.75, 1.75, 5.25, 8.75), 2)
     assert [(strip.left_m, strip.right_m) for strip in road.paved] == [(12.25, -8.75), (33.25, 12.25)]
     assert {mark.offset_m for mark in road.marks if mark.colour == "yellow"} == {8.75, 15.75}
     assert {mark.offset_m for mark in road.marks if mark.kind == "broken"} >= {5.25, 1.75, -1.75}
-    assert {(rail.offset_m, rail.kind) for rail in road.rails} == {
-        (12.25, "barrier"), (-9.15, "rail"), (33.65, "rail")
-    }  # fmt: skip
+    assert {(rail.offset_m, rail.kind) for rail in road.rails} == {(12.25, "barrier"), (-9.15, "rail"), (33.65, "rail")}
 
 
 @pytest.mark.parametrize("name", ROUTES)
-def test_there_is_road_before_the_start_and_beyond_the_end(name: str) -> None:
-    """At least 20 m lie before the start and 60 m beyond the end, and beyond these it goes straight on."""
+def test_a_road_extends_beyond_its_route(name: str) -> None:
+    """A road has at least 20 m before the start and 60 m beyond the end, and continues straight after these."""
     road = load_road(name)
     assert road.first_m <= -20.0
     assert road.last_m > road.length_m + 60.0
@@ -67,8 +65,8 @@ def test_there_is_road_before_the_start_and_beyond_the_end(name: str) -> None:
 
 
 def test_the_route_ends_where_the_map_says(road: Road) -> None:
-    """The end is the map's centre of lane -3 of road 38 at s = 75 m: 42.464 m along its line, 12.25 m to the right."""
-    heading_rad = 3.1245246695832329
+    """The route ends at the map's centre of lane -3 of road 38 at s = 75 m."""
+    heading_rad = 3.1245246695832329  # the end is 42.464 m along the map's line and 12.25 m to its right
     x_m = 341.47150492643561 + 42.46406 * math.cos(heading_rad) + 12.25 * math.sin(heading_rad)
     y_m = -26.389396319849876 + 42.46406 * math.sin(heading_rad) - 12.25 * math.cos(heading_rad)
     end_x_m, end_y_m, _, _ = road.point(road.length_m)
@@ -79,7 +77,7 @@ def test_the_route_ends_where_the_map_says(road: Road) -> None:
     ("key", "whole", "from_m"), [("a_key", "a", 12.0), ("b_key", "b", 0.0), ("c_key", "c", 15.155)]
 )
 def test_a_key_part_is_the_same_road_with_other_stations(key: str, whole: str, from_m: float) -> None:
-    """Everything of a key part lies where it lies in its whole: line, marks and their dashes, rails, both ends."""
+    """A key part has its line, marks, dashes, rails and ends in the same places as its whole road."""
     part, road = load_road(key), load_road(whole)
     stations_m = np.linspace(part.first_m, part.last_m, 50)
     np.testing.assert_allclose(part.across(stations_m, -3.0), road.across(stations_m + from_m, -3.0), atol=1e-9)
@@ -92,8 +90,8 @@ def test_a_key_part_is_the_same_road_with_other_stations(key: str, whole: str, f
         np.testing.assert_allclose(mine_m + from_m, their_mark.dashes_m(road.first_m, road.last_m))
 
 
-def test_dashes_are_whole_and_in_their_range(road: Road) -> None:
-    """A broken mark begins a dash every dash and gap, and shows no part of one beyond its ends."""
+def test_a_broken_mark_has_whole_dashes_within_its_range(road: Road) -> None:
+    """A broken mark has a whole dash in each period and none that exceeds its ends."""
     mark = next(mark for mark in road.marks if mark.kind == "broken" and math.isfinite(mark.from_m))
     begin_m = mark.dashes_m(road.first_m, 100.0)
     assert (np.diff(begin_m) == mark.dash_m + mark.gap_m).all()
@@ -101,13 +99,13 @@ def test_dashes_are_whole_and_in_their_range(road: Road) -> None:
     assert 100.0 - mark.dash_m - mark.gap_m - mark.dash_m < begin_m[-1] <= 100.0 - mark.dash_m
 
 
-def test_projection_looks_only_near_the_last_station(road: Road) -> None:
-    """A search that begins far away stays in its window and does not jump to the nearest piece of road."""
+def test_projection_searches_only_near_the_last_station(road: Road) -> None:
+    """A projection from a distant station stays within its window."""
     x_m, y_m = road.across(100.0, 0.0).tolist()
     assert road.project(x_m, y_m, 20.0)[0] <= 35.0
 
 
-def test_an_unknown_road_is_rejected_with_the_known_ones() -> None:
-    """The error for an unknown name lists what there is, and that a file would do."""
+def test_an_unknown_road_is_rejected() -> None:
+    """The error for an unknown road lists the known roads and mentions files."""
     with pytest.raises(UserError, match=r"a, a_key, b, b_key, c, c_key.*\.yaml file"):
         load_road("nowhere")

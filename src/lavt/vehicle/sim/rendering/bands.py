@@ -1,4 +1,4 @@
-"""Which rows of a picture each scale of the ground serves, finer scales nearer (a clipmap)."""
+"""The bands of picture rows that each scale of the ground covers, finer scales nearer (a clipmap)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, row_of_depth
 from lavt.vehicle.sim.rendering.textures import SCALES_M
 
 BAND_FAR_M = (5.0, 11.0, 26.0, 60.0, 160.0)
-"""How far ahead of the camera each scale of the ground serves."""
+"""The distance ahead of the camera that each scale of the ground reaches."""
 
-_MOST_LINES = 6
+_MAX_LINES = 6
 _TEXELS_A_LINE = 2.5
 
 
 class Band:
-    """The rows of a level camera's picture that one scale serves, and the square of tiles that they see.
+    """The rows of a level camera's picture that one scale covers, and the square of tiles visible in them.
 
-    A row far ahead sees a long piece of ground: it is drawn as the mean of `lines` finer ones, or dashes would flicker.
+    A distant row covers a long piece of ground. It is drawn as the mean of `lines` finer rows, so that dashes do not
+    flicker.
     """
 
     def __init__(self, model: CameraModel, level: int) -> None:
@@ -31,34 +32,34 @@ class Band:
         self.first_row = row_of_depth(model, far_m)
         self.end_row = row_of_depth(model, near_m) if level else model.height_px
         self._tile_m = TILE_M[level]
-        # The square is laid around a point ahead of the camera, from which everything in the rows is within reach.
+        # The square is centred on a point ahead of the camera and contains everything visible in the rows.
         self._ahead_m = (near_m + far_m) / 2
-        beside_m = far_m * model.width_px / 2 / model.focal_px * math.hypot(1.0, math.tan(model.pitch_rad))
-        reach_m = math.hypot(far_m - self._ahead_m, beside_m)
-        self._around = math.ceil(reach_m / self._tile_m)
+        half_width_m = far_m * model.width_px / 2 / model.focal_px * math.hypot(1.0, math.tan(model.pitch_rad))
+        reach_m = math.hypot(far_m - self._ahead_m, half_width_m)
+        self._tiles_around = math.ceil(reach_m / self._tile_m)
         middle_m = math.sqrt(max(near_m, 2.0) * far_m)
         row_m = middle_m**2 / (model.focal_px * model.z_m)
-        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_A_LINE)), 1), _MOST_LINES)
+        self.lines = min(max(round(row_m / (SCALES_M[level] * _TEXELS_A_LINE)), 1), _MAX_LINES)
 
     @property
     def tiles(self) -> int:
-        """How many tiles an edge of the square has."""
-        return 2 * self._around + 1
+        """The number of tiles along an edge of the square."""
+        return 2 * self._tiles_around + 1
 
     @property
     def picture_from_lines(self) -> FloatArray:
-        """3 x 3 matrix from (column, line, 1) of the band to picture coordinates."""
+        """The 3 x 3 matrix from (column, line, 1) of the band to picture coordinates."""
         first = self.first_row + 0.5 / self.lines - 0.5
         return np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / self.lines, first], [0.0, 0.0, 1.0]])
 
-    def low_tile(self, view: CameraPlacement) -> tuple[int, int]:
-        """Index (x, y) of the square's first tile."""
-        x_m = view.x_m + self._ahead_m * math.cos(view.heading_rad)
-        y_m = view.y_m + self._ahead_m * math.sin(view.heading_rad)
-        return math.floor(x_m / self._tile_m) - self._around, math.floor(y_m / self._tile_m) - self._around
+    def first_tile(self, placement: CameraPlacement) -> tuple[int, int]:
+        """Return the index (x, y) of the square's first tile."""
+        x_m = placement.x_m + self._ahead_m * math.cos(placement.heading_rad)
+        y_m = placement.y_m + self._ahead_m * math.sin(placement.heading_rad)
+        return math.floor(x_m / self._tile_m) - self._tiles_around, math.floor(y_m / self._tile_m) - self._tiles_around
 
     def texel_from_ground(self, low: tuple[int, int]) -> FloatArray:
-        """3 x 3 matrix from the world's ground to texels of the square that begins with the tile `low`."""
+        """Return the 3 x 3 matrix from the world's ground to texels of the square whose first tile is `low`."""
         scale_m = SCALES_M[self.level]
         return np.array(
             [
@@ -70,5 +71,5 @@ class Band:
 
 
 def bands_of(model: CameraModel) -> tuple[Band, ...]:
-    """All bands of a level camera, nearest first."""
+    """Return all bands of a level camera, nearest first."""
     return tuple(Band(model, level) for level in range(len(SCALES_M)))

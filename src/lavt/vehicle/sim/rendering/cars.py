@@ -1,4 +1,4 @@
-"""Named cars: what a simulated car is made of, each number with where it is from."""
+"""Named cars: the parameters of simulated cars, each number with its source."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CARS = {"lincoln_mkz": LINCOLN_MKZ}
 
 
 def named_car(name: str) -> CarParameters:
-    """Give the car of a name; raises `UserError` with the known ones."""
+    """Return the car with this name; raise a `UserError` that lists the known cars if there is none."""
     if name not in CARS:
         raise UserError(f"there is no car {name!r}: the known ones are {', '.join(CARS)}")
     return CARS[name]

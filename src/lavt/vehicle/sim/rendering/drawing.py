@@ -1,4 +1,4 @@
-"""One picture of a road: from above, to scale, and from the driver's seat."""
+"""A figure of a road: a plan to scale, and views from the driver's seat."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lavt.vehicle.sim.road.cross_section import Along, PavedArea, Rail, RoadMark
 from lavt.vehicle.sim.road.road import Road
 
 VIEWS = 4
-"""From the driver's seat: at the start, at the end, and evenly between."""
+"""The number of views from the driver's seat: at the start, at the end, and evenly spaced between."""
 
 DETAIL_M = 40.0
-"""How much of the road the detail shows: enough to see single marks."""
+"""The length of road in the detail plot, which shows single marks."""
 
 _STEP_M = 1.0
 _STATION_STEPS_M = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0)
@@ -28,11 +28,11 @@ _ASPHALT, _LANE, _GRASS = "#8d9096", "#7f9fc4", "#dfe8d5"
 _PAINT = {"white": "#ffffff", "yellow": "#f2c14e"}
 _RAILS = {"rail": "#b5541c", "barrier": "#222222"}
 _FROM_ABOVE_PT = 0.3
-"""Thinnest line: from far above, marks are thinner than paper shows."""
+"""The line width of marks in the plan, where they are too thin to draw to scale."""
 
 
 def draw_road(road: Road, *, model: CameraModel, scenery: SceneryKind = "full") -> Figure:
-    """Draw `road` from above, whole and in detail at its start, its curvature, and views of the camera `model`."""
+    """Draw a plan of `road`, a detail of its start, its curvature, and views of the camera `model`."""
     figure = Figure(figsize=(14.0, 11.5), dpi=110, layout="constrained")
     figure.suptitle(f"{road.title}: {road.length_m:.1f} m", fontsize=14, fontweight="bold")
     rows = figure.add_gridspec(3, VIEWS, height_ratios=[3.4, 0.8, 1.6])
@@ -71,18 +71,26 @@ def _draw_whole(axes: Axes, road: Road) -> None:
 
 
 def _draw_detail(axes: Axes, road: Road) -> None:
-    """Show the first metres upright, as the driver goes: along upwards, left to the left."""
+    """Draw the first metres with stations upwards and left offsets on the left."""
     last_m = min(DETAIL_M, road.length_m)
-    for strip in _within(road.paved, 0.0, last_m):
-        axes.fill_between([strip.right_m, strip.left_m], _low(strip, 0.0), _high(strip, last_m), color=_ASPHALT)
+    for strip in _overlapping(road.paved, 0.0, last_m):
+        axes.fill_between(
+            [strip.right_m, strip.left_m], _first_station(strip, 0.0), _last_station(strip, last_m), color=_ASPHALT
+        )
     half_m = road.lanes.widths_m[road.lanes.driven] / 2
     axes.fill_between([-half_m, half_m], 0.0, last_m, color=_LANE, alpha=0.5)
-    for mark in _within(road.marks, 0.0, last_m):
-        for begin_m, end_m in _painted(mark, 0.0, last_m):
+    for mark in _overlapping(road.marks, 0.0, last_m):
+        for begin_m, end_m in _painted_pieces(mark, 0.0, last_m):
             right_m = mark.offset_m - mark.width_m / 2
             axes.fill_between([right_m, right_m + mark.width_m], begin_m, end_m, color=_PAINT[mark.colour])
-    for rail in _within(road.rails, 0.0, last_m):
-        axes.vlines(rail.offset_m, _low(rail, 0.0), _high(rail, last_m), color=_RAILS[rail.kind], linewidth=2.0)
+    for rail in _overlapping(road.rails, 0.0, last_m):
+        axes.vlines(
+            rail.offset_m,
+            _first_station(rail, 0.0),
+            _last_station(rail, last_m),
+            color=_RAILS[rail.kind],
+            linewidth=2.0,
+        )
     axes.set_facecolor(_GRASS)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_title(f"the first {last_m:.0f} m, unrolled", fontsize=10, loc="left")
@@ -103,48 +111,49 @@ def _draw_curvature(axes: Axes, road: Road) -> None:
 def _draw_ground(axes: Axes, road: Road, first_m: float, last_m: float) -> None:
     axes.set_facecolor(_GRASS)
     half_m = road.lanes.widths_m[road.lanes.driven] / 2
-    for strip in _within(road.paved, first_m, last_m):
-        _fill(axes, road, strip, (_low(strip, first_m), _high(strip, last_m)), _ASPHALT)
+    for strip in _overlapping(road.paved, first_m, last_m):
+        _fill(axes, road, strip, (_first_station(strip, first_m), _last_station(strip, last_m)), _ASPHALT)
     _fill(axes, road, PavedArea(half_m, -half_m), (0.0, road.length_m), _LANE)
-    axes.plot(*road.across(_along(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)  # seen from any height
+    # A line of fixed width, which stays visible at any scale.
+    axes.plot(*road.across(_sample_stations(0.0, road.length_m), 0.0).T, color=_LANE, linewidth=1.0)
     for colour, paint in _PAINT.items():
         lines = [
-            road.across(_along(*piece), mark.offset_m)
-            for mark in _within(road.marks, first_m, last_m)
+            road.across(_sample_stations(*piece), mark.offset_m)
+            for mark in _overlapping(road.marks, first_m, last_m)
             if mark.colour == colour
-            for piece in _painted(mark, first_m, last_m)
+            for piece in _painted_pieces(mark, first_m, last_m)
         ]
         axes.add_collection(LineCollection(lines, colors=paint, linewidths=_FROM_ABOVE_PT))
-    for rail in _within(road.rails, first_m, last_m):
-        along = _along(_low(rail, first_m), _high(rail, last_m))
-        axes.plot(*road.across(along, rail.offset_m).T, color=_RAILS[rail.kind], linewidth=0.9)
+    for rail in _overlapping(road.rails, first_m, last_m):
+        stations_m = _sample_stations(_first_station(rail, first_m), _last_station(rail, last_m))
+        axes.plot(*road.across(stations_m, rail.offset_m).T, color=_RAILS[rail.kind], linewidth=0.9)
     axes.margins(0.12)  # room for the stations' labels
     axes.autoscale_view()
 
 
 def _fill(axes: Axes, road: Road, strip: PavedArea, ends_m: tuple[float, float], colour: str) -> None:
-    along = _along(*ends_m)
-    outline = np.concatenate([road.across(along, strip.left_m), road.across(along[::-1], strip.right_m)])
+    stations_m = _sample_stations(*ends_m)
+    outline = np.concatenate([road.across(stations_m, strip.left_m), road.across(stations_m[::-1], strip.right_m)])
     axes.add_collection(PolyCollection([outline], facecolors=colour, edgecolors="none"))
 
 
-def _within(all_of_them: tuple[Along, ...], first_m: float, last_m: float) -> list[Along]:
-    return [each for each in all_of_them if each.from_m < last_m and each.to_m > first_m]
+def _overlapping(elements: tuple[Along, ...], first_m: float, last_m: float) -> list[Along]:
+    return [each for each in elements if each.from_m < last_m and each.to_m > first_m]
 
 
-def _painted(mark: RoadMark, first_m: float, last_m: float) -> list[tuple[float, float]]:
+def _painted_pieces(mark: RoadMark, first_m: float, last_m: float) -> list[tuple[float, float]]:
     if mark.kind == "solid":
-        return [(_low(mark, first_m), _high(mark, last_m))]
+        return [(_first_station(mark, first_m), _last_station(mark, last_m))]
     return [(begin_m, begin_m + mark.dash_m) for begin_m in mark.dashes_m(first_m, last_m).tolist()]
 
 
-def _low(each: PavedArea | RoadMark | Rail, first_m: float) -> float:
+def _first_station(each: PavedArea | RoadMark | Rail, first_m: float) -> float:
     return max(each.from_m, first_m)
 
 
-def _high(each: PavedArea | RoadMark | Rail, last_m: float) -> float:
+def _last_station(each: PavedArea | RoadMark | Rail, last_m: float) -> float:
     return min(each.to_m, last_m)
 
 
-def _along(begin_m: float, end_m: float) -> FloatArray:
+def _sample_stations(begin_m: float, end_m: float) -> FloatArray:
     return np.linspace(begin_m, end_m, max(2, round((end_m - begin_m) / _STEP_M) + 1))

@@ -1,6 +1,6 @@
-"""The ground seen from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
+"""The ground from above, painted in square tiles on a world grid, at five scales, with its light and shadows.
 
-A tile is a function of its place alone, so that what the camera sees does not depend on where the car has been.
+A tile depends on its position alone, so pictures do not depend on the car's history.
 """
 
 from __future__ import annotations
@@ -15,76 +15,85 @@ from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from lavt.domain import FloatArray, Picture
-from lavt.vehicle.sim.rendering.damage import damages
 from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.shadows import Shadows
+from lavt.vehicle.sim.rendering.surface_wear import surface_wear
 from lavt.vehicle.sim.rendering.textures import SCALES_M, all_textures
 from lavt.vehicle.sim.road.road import Road
-from lavt.vehicle.sim.road.strips import OVERLAP_M, PIECE_M, Grey, Square, Strips, along, join, pieces
+from lavt.vehicle.sim.road.strips import (
+    OVERLAP_M,
+    PIECE_M,
+    Grey,
+    Square,
+    Strips,
+    join_strips,
+    strip_along,
+    strip_pieces,
+)
 
 TILE_M = (8.0, 16.0, 32.0, 32.0, 64.0)
-"""Edge of a tile at each scale."""
+"""The length of a tile's edge at each scale."""
 
-_KEPT_TILES = (40, 60, 160, 400, 400)
-"""The two finest scales are painted on the way, a few tiles at a time; the others are kept for a whole road."""
+_MAX_TILES = (40, 60, 160, 400, 400)
+"""Cache sizes. The two finest scales are painted during the drive, a few tiles at a time; the others fit a road."""
 _GRAVEL_M = 1.6
 _PAINT = {"white": (212, 218, 216), "yellow": (62, 172, 208)}
 _TRACK_PROFILE = ((1.1, 4), (0.8, 8), (0.5, 12))
-"""Wheel tracks are darker than the rest of a lane: width (m) and by how many grey levels, widest first."""
+"""Wheel tracks, which are darker than the rest of a lane: width (m) and grey levels, widest first."""
 _OIL = (0.7, 6)
-"""The middle of a lane is, too."""
+"""The darker middle of a lane: width (m) and grey levels."""
 
 
 class Ground:
-    """Tiles of one road in one light, painted when they are first asked for."""
+    """The tiles of one road in one light, painted on first use."""
 
     def __init__(self, road: Road, light: Light, shadows: Shadows | None) -> None:
         self._tiles: tuple[OrderedDict[tuple[int, int], Picture], ...] = tuple(OrderedDict() for _ in SCALES_M)
-        # Factors in 255ths: a surface in the sun, and which share of that is gone in the deepest shadow.
+        # Factors in 255ths: of a surface in the sun, and the share of it that is lost in full shadow.
         self._lit = _bytes(np.array(light.lit))
         self._dimmed = _bytes(1.0 - np.array(light.shade) / np.array(light.lit))
         self._shadows = shadows
         self._gravel, self._asphalt = (
-            join(
+            join_strips(
                 [
-                    along(road, each.left_m + wide_m, each.right_m - wide_m, each.from_m, each.to_m)
+                    strip_along(road, each.left_m + wide_m, each.right_m - wide_m, each.from_m, each.to_m)
                     for each in road.paved
                 ]
             )
             for wide_m in (_GRAVEL_M, 0.0)
         )
         self._tracks = _tracks(road)
-        self._damages = damages(road)
-        self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _paints(road)]
+        self._wear = surface_wear(road)
+        self._marks = [(colour, width_m, _marks(road, colour, width_m)) for colour, width_m in _mark_styles(road)]
 
-    def window(self, level: int, low: tuple[int, int], count: int) -> Picture:
-        """Paint `count` x `count` tiles from the tile index `low` (x, y) on, with a fourth channel that says nothing.
+    def assemble(self, level: int, low: tuple[int, int], count: int) -> Picture:
+        """Return a picture of `count` x `count` tiles from the tile index `low` (x, y), with an unused fourth channel.
 
-        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. Four bytes a
-        texel, because OpenCV warps them in less than half the time of three.
+        Row 0 is at low y, column 0 at low x; the middle of texel i is (i + 0.5) * scale from the corner. OpenCV warps
+        four bytes per texel in less than half the time of three.
         """
         pixels = round(TILE_M[level] / SCALES_M[level])
-        window = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
+        assemble = np.empty((count * pixels, count * pixels, 4), dtype=np.uint8)
         for row in range(count):
             for column in range(count):
                 tile = self.tile(level, low[0] + column, low[1] + row)
                 part = np.s_[row * pixels : (row + 1) * pixels, column * pixels : (column + 1) * pixels]
-                cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, window[part])
-        return window
+                cv2.cvtColor(tile, cv2.COLOR_BGR2BGRA, assemble[part])
+        return assemble
 
-    def room(self, level: int) -> bool:
-        """Whether one more tile of a scale can be kept without giving up another."""
-        return len(self._tiles[level]) < _KEPT_TILES[level]
+    def has_room(self, level: int) -> bool:
+        """Return whether one more tile of a scale fits the cache without evicting another."""
+        return len(self._tiles[level]) < _MAX_TILES[level]
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Give one tile, painted now if it is not there."""
+        """Return one tile, painting it unless it is cached."""
         tiles = self._tiles[level]
         tile = tiles.get((column, row))
         if tile is None:
             edge_m = TILE_M[level]
             tile = self._paint(level, Square(column * edge_m, row * edge_m, edge_m, SCALES_M[level]))
             tiles[(column, row)] = tile
-            if len(tiles) > _KEPT_TILES[level]:
+            if len(tiles) > _MAX_TILES[level]:
                 tiles.popitem(last=False)
         else:
             tiles.move_to_end((column, row))
@@ -97,40 +106,42 @@ class Ground:
         elif asphalt.min() == 255:
             picture = self._paint_asphalt(level, square)
         else:
-            picture = _laid(self._paint_verge(level, square), self._paint_asphalt(level, square), asphalt)
+            picture = _blend(self._paint_verge(level, square), self._paint_asphalt(level, square), asphalt)
         shade = None if self._shadows is None else self._shadows.mask(square)
-        lit = _coloured(picture, self._lit)
+        lit = _multiply_colour(picture, self._lit)
         if shade is None:
             return lit
-        gone = cv2.multiply(lit, _coloured(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
+        gone = cv2.multiply(lit, _multiply_colour(cv2.merge((shade, shade, shade)), self._dimmed), scale=1 / 255)
         return np.asarray(cv2.subtract(lit, gone), dtype=np.uint8)
 
     def _paint_verge(self, level: int, square: Square) -> Picture:
         textures = all_textures()[level]
-        grass = _mottled(_cut(textures.grass, square), square)
+        grass = _mottle(_crop_texture(textures.grass, square), square)
         gravel = self._gravel.mask(square)
-        return grass if gravel is None else _laid(grass, _cut(textures.gravel, square), gravel)
+        return grass if gravel is None else _blend(grass, _crop_texture(textures.gravel, square), gravel)
 
     def _paint_asphalt(self, level: int, square: Square) -> Picture:
         textures, scale_m = all_textures()[level], SCALES_M[level]
         darker = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
-        for places, grey in self._tracks:
-            places.fill(darker, square, grey)
-        for damage in self._damages:
-            # What is thinner than a texel is still drawn about one texel wide: let as much of the road through.
-            grey = round(damage.grey * min(1.0, damage.width_m / scale_m))
+        for strips, grey in self._tracks:
+            strips.fill(darker, square, grey)
+        for wear in self._wear:
+            # Strips thinner than a texel are still drawn about one texel wide: reduce their strength accordingly.
+            grey = round(wear.grey * min(1.0, wear.width_m / scale_m))
             if grey:
-                damage.places.fill(darker, square, grey)
-        worn = np.asarray(cv2.subtract(_cut(textures.asphalt, square), darker), dtype=np.uint8)
+                wear.strips.fill(darker, square, grey)
+        worn = np.asarray(cv2.subtract(_crop_texture(textures.asphalt, square), darker), dtype=np.uint8)
         picture = np.asarray(cv2.merge((worn, worn, worn - 2)), dtype=np.uint8)
-        for colour, width_m, places in self._marks:
-            paint = places.mask(square)
+        for colour, width_m, strips in self._marks:
+            paint = strips.mask(square)
             if paint is not None:
                 thinness = min(1.0, width_m * 1.3 / scale_m)
-                alpha = np.asarray(cv2.multiply(paint, _cut(textures.wear, square), scale=thinness / 255), np.uint8)
+                alpha = np.asarray(
+                    cv2.multiply(paint, _crop_texture(textures.wear, square), scale=thinness / 255), np.uint8
+                )
                 cover = cv2.merge((alpha, alpha, alpha))
                 kept = cv2.multiply(picture, cv2.bitwise_not(cover), scale=1 / 255)
-                picture = np.asarray(cv2.add(kept, _coloured(cover, _PAINT[colour])), dtype=np.uint8)
+                picture = np.asarray(cv2.add(kept, _multiply_colour(cover, _PAINT[colour])), dtype=np.uint8)
         return picture
 
 
@@ -138,21 +149,21 @@ def _bytes(factors: FloatArray) -> tuple[int, ...]:
     return tuple(np.clip(np.rint(factors * 255.0), 0, 255).astype(int).tolist())
 
 
-def _coloured(picture: MatLike, colour: tuple[int, ...]) -> Picture:
-    """Multiply every texel by a colour, in 255ths."""
-    return np.asarray(cv2.multiply(picture, _flat(picture.shape[0], colour), scale=1 / 255), dtype=np.uint8)
+def _multiply_colour(picture: MatLike, colour: tuple[int, ...]) -> Picture:
+    """Multiply every texel by a colour in 255ths."""
+    return np.asarray(cv2.multiply(picture, _uniform_picture(picture.shape[0], colour), scale=1 / 255), dtype=np.uint8)
 
 
 @lru_cache(maxsize=32)
-def _flat(pixels: int, colour: tuple[int, ...]) -> Picture:
-    """Give a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
+def _uniform_picture(pixels: int, colour: tuple[int, ...]) -> Picture:
+    """Return a square of one colour; OpenCV multiplies by a picture much faster than by a colour or a table."""
     flat = np.empty((pixels, pixels, 3), dtype=np.uint8)
     flat[:] = colour
     return flat
 
 
-def _cut(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
-    """Cut the square's part of a pattern; a period is a whole number of tiles or a tile one of periods."""
+def _crop_texture(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
+    """Return a square's part of a texture; its period is a whole multiple of a tile's edge, or the reverse."""
     pixels, period = square.pixels, len(texture)
     if pixels > period:
         count = pixels // period
@@ -163,19 +174,19 @@ def _cut(texture: NDArray[np.uint8], square: Square) -> NDArray[np.uint8]:
 
 
 def _tracks(road: Road) -> list[tuple[Strips, int]]:
-    """Where wheels run, and where oil drips, in every lane of the driven direction."""
+    """Return the strips of wheel tracks and oil in every lane of the driven direction, with their grey levels."""
     edges = np.array(road.lanes.edges_m)
     centres = (edges[1:] + edges[:-1]) / 2
     wheels = [centre + side for centre in centres for side in (-0.85, 0.85)]
-    ways = [(centres, *_OIL)] + [(wheels, width_m, grey) for width_m, grey in _TRACK_PROFILE]
+    bands = [(centres, *_OIL)] + [(wheels, width_m, grey) for width_m, grey in _TRACK_PROFILE]
     return [
-        (join([along(road, at + width_m / 2, at - width_m / 2) for at in offsets]), grey)
-        for offsets, width_m, grey in ways
+        (join_strips([strip_along(road, at + width_m / 2, at - width_m / 2) for at in offsets]), grey)
+        for offsets, width_m, grey in bands
     ]
 
 
-def _paints(road: Road) -> list[tuple[str, float]]:
-    """Colours and widths (m) of marks, white first."""
+def _mark_styles(road: Road) -> list[tuple[str, float]]:
+    """Return the colours and widths (m) of marks, white first."""
     return [
         (colour, each) for colour in _PAINT for each in sorted({m.width_m for m in road.marks if m.colour == colour})
     ]
@@ -188,25 +199,25 @@ def _marks(road: Road, colour: str, width_m: float) -> Strips:
             continue
         left_m, right_m = mark.offset_m + mark.width_m / 2, mark.offset_m - mark.width_m / 2
         if mark.kind == "solid":
-            found.append(along(road, left_m, right_m, mark.from_m, mark.to_m))
+            found.append(strip_along(road, left_m, right_m, mark.from_m, mark.to_m))
             continue
         begin = mark.dashes_m(road.first_m, road.last_m)
-        # Two pieces a dash and more, so that it bends with the road.
+        # At least two pieces per dash, so that it bends with the road.
         count = max(2, math.ceil(mark.dash_m / PIECE_M))
         parts = (begin + np.arange(count)[:, None] * (mark.dash_m / count)).ravel()
-        found.append(pieces(road, left_m, right_m, parts, parts + mark.dash_m / count + OVERLAP_M))
-    return join(found)
+        found.append(strip_pieces(road, left_m, right_m, parts, parts + mark.dash_m / count + OVERLAP_M))
+    return join_strips(found)
 
 
-def _laid(under: Picture, over: Picture, alpha: Grey) -> Picture:
-    """Lay a picture over another."""
+def _blend(under: Picture, over: Picture, alpha: Grey) -> Picture:
+    """Blend a picture over another."""
     cover = cv2.merge((alpha, alpha, alpha))
     kept = cv2.multiply(under, cv2.bitwise_not(cover), scale=1 / 255)
     return np.asarray(cv2.add(cv2.multiply(over, cover, scale=1 / 255), kept), dtype=np.uint8)
 
 
-def _mottled(grass: Picture, square: Square) -> Picture:
-    """Lay large patches over the grass, of lengths that do not fit its period: the eye must not see it repeat."""
+def _mottle(grass: Picture, square: Square) -> Picture:
+    """Modulate the grass with wavelengths that do not divide its period, so that the repetition is not visible."""
     count = 16
     middle_m = (np.arange(count) + 0.5) * square.edge_m / count
     x_m, y_m = square.left_m + middle_m, (square.low_m + middle_m)[:, None]

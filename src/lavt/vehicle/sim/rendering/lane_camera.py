@@ -1,4 +1,4 @@
-"""A camera that gives the lane itself: what a faultless detector would make of the picture from a pose."""
+"""A camera that delivers the lane itself, as a perfect detector would find it in the picture from a pose."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from lavt.vehicle.camera import CapturedFrame, newest_pose
 from lavt.vehicle.sim.road.road import Road
 
 LINEAR_BELOW_M = 6.0
-"""Of length seen: as with pixels, less gives no curvature."""
+"""A visible length below this gives no curvature, as in `lane_fit`."""
 POINTS_AT_LEAST = 3
 _ABEAM_RAD = math.radians(89.9)
-"""Edges of the view that look farther aside, or back, see nothing of what lies ahead."""
+"""Edges of the field of view are limited to this angle, because beyond it they cover no ground ahead."""
 
 STATION_M = 1.0
-"""So far apart are the places of the lane's lines that are looked at."""
+"""The spacing of the sampled points on the lane's lines."""
 
 
 class LaneCamera:
     """A `lavt.vehicle.camera.Camera` without pixels: its pictures are `SeenLane`, fitted to the road's true centre.
 
-    The ground it looks at is that of the detector: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to
-    both sides, as far as the camera's field of view has it: its place, its yaw and its width count, pitch and roll do
-    not. Confidence is the share of the lane's two lines in there. A car that has turned by more than 90 degrees sees
-    none.
+    It covers the detector's ground: `near_m` to `far_m` ahead of the rear axle and `half_width_m` to both sides, within
+    the camera's field of view. The camera's position, yaw and horizontal angle matter; pitch and roll do not.
+    Confidence is the share of the lane's two lines within that ground. A car turned by more than 90 degrees sees none.
     """
 
     def __init__(
@@ -55,55 +54,57 @@ class LaneCamera:
             math.tan(min(max(model.yaw_rad + edge_rad, -_ABEAM_RAD), _ABEAM_RAD)) for edge_rad in (half_rad, -half_rad)
         )
         self._width_m = road.lanes.widths_m[road.lanes.driven]
-        self._ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
-        stations_m = np.arange(road.length_m / STATION_M + 2 * self._ahead) * STATION_M
+        self._stations_ahead = math.ceil(math.hypot(far_m, half_width_m) / STATION_M) + 1
+        stations_m = np.arange(road.length_m / STATION_M + 2 * self._stations_ahead) * STATION_M
         lines = [road.across(stations_m, offset_m) for offset_m in (0.0, self._width_m / 2, -self._width_m / 2)]
         self._stations: list[list[float]] = np.concatenate(lines, axis=1).tolist()
-        """World x and y of the lane's centre, of its left line and of its right one: six numbers each."""
+        """World x and y of the lane's centre, left line and right line at each station."""
         self._near_s_m = 0.0
 
     def capture(self, number: int, at_ns: int, pose: Pose | None) -> CapturedFrame | None:
-        """Give the lane as it is seen from `pose`; None without a pose."""
+        """Return the lane visible from `pose`; None without a pose."""
         if pose is None:
             return None
-        return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.lane_from(pose)))
+        return CapturedFrame(number, at_ns, SeenLane(0, at_ns, self.observe_lane(pose)))
 
     def expose(self, number: int, begin_ns: int, poses: Sequence[Pose]) -> CapturedFrame | None:
-        """Give the lane as it is seen half-way between the poses at the shutter's opening and at its closing."""
+        """Return the lane visible half-way between the poses when the shutter opens and when it closes."""
         first, last = newest_pose(poses, begin_ns), newest_pose(poses, begin_ns + self.exposure_ns)
         if first is None or last is None:
             return None
-        turned_rad = math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi)
+        turn_rad = math.remainder(last.heading_rad - first.heading_rad, 2 * math.pi)
         middle_ns = begin_ns + self.exposure_ns // 2
         x_m, y_m = (first.x_m + last.x_m) / 2, (first.y_m + last.y_m) / 2
-        return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turned_rad / 2))
+        return self.capture(number, middle_ns, Pose(middle_ns, x_m, y_m, first.heading_rad + turn_rad / 2))
 
-    def lane_from(self, pose: Pose) -> Lane:
-        """Fit the driven lane's centre as far as its lines are in view; confidence 0 where nothing of them is."""
+    def observe_lane(self, pose: Pose) -> Lane:
+        """Fit the driven lane's centre where its lines are in view; the confidence is 0 where none is."""
         self._near_s_m = self._road.project(pose.x_m, pose.y_m, self._near_s_m)[0]
         first = max(math.ceil(self._near_s_m / STATION_M), 0)
         cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         x_m, y_m = pose.x_m, pose.y_m
-        near_m, far_m, wide_m = self._near_m, self._far_m, self._half_width_m
+        near_m, far_m, half_width_m = self._near_m, self._far_m, self._half_width_m
         left_slope, right_slope = self._left_slope, self._right_slope
         lens_x_m, lens_y_m = self.model.x_m, self.model.y_m
         centre, lines_seen = [], 0
-        # The two lines are written out: a loop over them would take half of the time here.
-        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._stations[first : first + self._ahead]:
+        # The two lines are written out: a loop over them would take half of this function's time.
+        for centre_x, centre_y, left_x, left_y, right_x, right_y in self._stations[
+            first : first + self._stations_ahead
+        ]:
             seen = 0
             dx, dy = left_x - x_m, left_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
-                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
-                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
-                if in_view and -wide_m <= left_m <= wide_m:
+                left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
+                if in_view and -half_width_m <= left_m <= half_width_m:
                     seen = 1
             dx, dy = right_x - x_m, right_y - y_m
             ahead_m = dx * cosine + dy * sine
             if near_m <= ahead_m <= far_m:
-                left_m, deep_m = dy * cosine - dx * sine, ahead_m - lens_x_m
-                in_view = right_slope * deep_m <= left_m - lens_y_m <= left_slope * deep_m
-                if in_view and -wide_m <= left_m <= wide_m:
+                left_m, depth_m = dy * cosine - dx * sine, ahead_m - lens_x_m
+                in_view = right_slope * depth_m <= left_m - lens_y_m <= left_slope * depth_m
+                if in_view and -half_width_m <= left_m <= half_width_m:
                     seen += 1
             if seen:
                 lines_seen += seen
@@ -113,13 +114,15 @@ class LaneCamera:
             return Lane((0.0, 0.0, 0.0), self._width_m, near_m, far_m, 0.0)
         share = lines_seen * STATION_M / (2 * (far_m - near_m))
         near_m, far_m = min(centre)[0], max(centre)[0]
-        return Lane(_fit(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0))
+        return Lane(
+            _fit_centre(centre, far_m - near_m >= LINEAR_BELOW_M), self._width_m, near_m, far_m, min(share, 1.0)
+        )
 
 
-def _fit(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
-    """Least squares for c0, c1 and, where `curved`, c2; two dozen points are too few for arrays to be faster.
+def _fit_centre(points: list[tuple[float, float]], curved: bool) -> tuple[float, float, float]:
+    """Fit c0, c1 and, if `curved`, c2 by least squares; for two dozen points plain floats are faster than arrays.
 
-    x is taken from its mean, so that the normal equations are well conditioned.
+    x is centred on its mean, so that the normal equations are well conditioned.
     """
     n = len(points)
     mean = sum(x for x, _ in points) / n

@@ -1,8 +1,8 @@
-"""The lights a road can be seen in: where the sun stands, and the colours of sun, shade, sky and haze.
+"""The lighting of a road: the sun's position, and the colours of sun, shade, sky and haze.
 
-Surfaces have the colours they show in the noon sun. A light multiplies these, once for what the sun reaches and once
-for what lies in the shade; the figures include what a camera's exposure control makes of the scene, which is why an
-overcast day is not much darker than a sunny one. All of them are our choice.
+Surfaces are defined by their colours in the noon sun. A light multiplies these by one factor in the sun and another in
+the shade. The factors include a camera's exposure control, so an overcast day is not much darker than a sunny one. All
+values are our choice.
 """
 
 from __future__ import annotations
@@ -18,34 +18,34 @@ from lavt.domain import FloatArray
 LightName = Literal["noon", "low_sun", "overcast"]
 
 Colour = tuple[float, float, float]
-"""Blue, green, red: 0 to 255 of what is seen, a factor of what is light."""
+"""Blue, green, red: 0 to 255 for a visible colour, a factor for light."""
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """One light; angles are the sun's, in the world's frame, `azimuth_rad` from x towards y."""
+    """One light; the angles are the sun's in the world frame, `azimuth_rad` from x towards y."""
 
     azimuth_rad: float
     elevation_rad: float
     lit: Colour
-    """What the sun makes of level ground."""
+    """The factor for level ground in the sun."""
     shade: Colour
-    """What is left of it in the shade."""
+    """The factor for level ground in the shade."""
     zenith: Colour
     haze: Colour
     """The colour of the sky at the horizon and of everything far away."""
     glow: Colour
-    """What the sky has more of around the sun."""
+    """The colour added to the sky around the sun."""
     cloud: Colour
     cloud_cover: float
-    """Share of the sky, about."""
+    """The approximate share of the sky that clouds cover."""
     shadows: bool
     clouds_shade: bool
-    """Whether clouds throw shadows on the ground around the road."""
+    """True if clouds cast shadows on the ground around the road."""
 
     @property
     def towards_sun(self) -> FloatArray:
-        """Unit vector (3,) that points at the sun."""
+        """The unit vector (3,) towards the sun."""
         flat = math.cos(self.elevation_rad)
         return np.array(
             [flat * math.cos(self.azimuth_rad), flat * math.sin(self.azimuth_rad), math.sin(self.elevation_rad)]
@@ -53,17 +53,17 @@ class Light:
 
     @property
     def shadow_m(self) -> FloatArray:
-        """Where the shadow of a point 1 m above the ground falls (x, y), from the point's foot."""
+        """The offset (x, y) from the foot of a point 1 m above the ground to its shadow."""
         towards = self.towards_sun
         return np.asarray(-towards[:2] / towards[2])
 
-    def upright(self, normals: FloatArray) -> FloatArray:
-        """Factors (n, 3) for upright faces with level unit normals (n, 2): those turned away are shaded."""
+    def upright_factors(self, normals: FloatArray) -> FloatArray:
+        """Return factors (n, 3) for upright faces with horizontal unit normals (n, 2); faces turned away are shaded."""
         lit, shade = np.array(self.lit), np.array(self.shade)
         if not self.shadows:
             return np.broadcast_to(lit, (len(normals), 3))
-        # The ground shows `lit` under the sine of the elevation; a face under the cosine of its angle. A camera's curve
-        # flattens the ratio, and a face that looks at the sun is no brighter than half as much again.
+        # `lit` applies to the ground, lit with the sine of the elevation; a face is lit with the cosine of its angle to
+        # the sun. A camera's response curve flattens the ratio, so a face gets at most 1.5 times the ground's sunlight.
         facing = np.clip(normals @ self.towards_sun[:2], 0.0, None) / max(math.sin(self.elevation_rad), 0.5)
         return np.asarray(shade + (lit - shade) * np.minimum(facing + 0.15, 1.5)[:, None])
 

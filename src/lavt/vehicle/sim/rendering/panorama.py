@@ -1,4 +1,4 @@
-"""What lies beyond the ground that is drawn: sky, sun, clouds, hills and a wood, one picture of the horizon."""
+"""The panorama beyond the drawn ground: one picture of the whole horizon with sky, sun, clouds, hills and a wood."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ from lavt.vehicle.sim.rendering.textures import seamless_noise
 _COLUMNS = 4096
 _WORLD_SEED = 0
 _SUN_RAD = 0.011
-"""Radius of the white in the sky: the sun's disc, and what overexposure makes of its surroundings."""
+"""Radius of the white disc in the sky: the sun and its overexposed surroundings."""
 
 _RIDGES = (
     (0.062, ((0.022, 3, 0.0), (0.015, 7, 1.0)), (186.0, 172.0, 150.0), 0.62),
     (0.036, ((0.012, 5, 2.0), (0.008, 13, 0.0)), (152.0, 152.0, 128.0), 0.42),
 )
-"""Hills: mean height, waves (height, how many around the horizon, phase), colour at noon, share of haze otherwise."""
+"""Hills: mean height, waves (height, number around the horizon, phase), colour at noon, share of haze."""
 _WOOD = (112.0, 122.0, 104.0)
 
 
 class Panorama:
-    """The horizon for one camera model; a picture of it is a choice of columns."""
+    """The panorama for one camera model; a picture's background is a selection of its columns."""
 
     def __init__(self, model: CameraModel, rows: int, light: Light, *, plain: bool) -> None:
-        self._words = _painted(rows, horizon_row(model), model.focal_px, light, plain=plain)
+        self._texels = _paint(rows, horizon_row(model), model.focal_px, light, plain=plain)
         across_px = np.arange(model.width_px) - principal_point(model)[0]
         self._azimuth_rad = np.arctan2(across_px, model.focal_px)
 
-    def cut(self, heading_rad: float, out: Picture) -> None:
-        """Write what a camera with this heading sees into `out` (rows, columns, 4), the first rows of its picture."""
+    def crop(self, heading_rad: float, out: Picture) -> None:
+        """Write the background for a camera heading into `out` (rows, columns, 4), the first rows of the picture."""
         turn = (self._azimuth_rad - heading_rad) / (2 * math.pi)
         columns = np.rint((turn - np.floor(turn)) * _COLUMNS).astype(np.intp) % _COLUMNS
-        np.take(self._words, columns, axis=1, out=out.view(np.uint32)[..., 0], mode="clip")
+        np.take(self._texels, columns, axis=1, out=out.view(np.uint32)[..., 0], mode="clip")
 
 
 @lru_cache(maxsize=6)
-def _painted(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
-    """Paint (rows, columns) of blue, green, red and nothing in one word each."""
-    # Height above the horizon as a share of the focal length, for each row.
+def _paint(rows: int, horizon: float, focal_px: float, light: Light, *, plain: bool) -> NDArray[np.uint32]:
+    """Return the panorama (rows, columns), each texel one word of blue, green, red and an unused byte."""
+    # The height of each row above the horizon, as a share of the focal length.
     height = np.asarray((horizon - np.arange(rows)) / focal_px, dtype=np.float64)[:, None]
     # Column c shows the azimuth -c, so that columns run to the right.
     turn = np.arange(_COLUMNS) / _COLUMNS * 2 * math.pi
     rise = np.clip(height / 0.75, 0.0, 1.0) ** 0.6
     sky = np.array(light.haze) * (1 - rise[..., None]) + np.array(light.zenith) * rise[..., None]
     picture = np.broadcast_to(sky, (rows, _COLUMNS, 3)).copy()
-    away_rad = _away_from_sun(light, np.arctan(height), -turn)
+    away_rad = _angle_to_sun_rad(light, np.arctan(height), -turn)
     picture += np.exp(-away_rad / 0.35)[..., None] * np.array(light.glow)
     if not plain:
         _add_clouds(picture, height, light)
@@ -60,23 +60,23 @@ def _painted(rows: int, horizon: float, focal_px: float, light: Light, *, plain:
             _add_sun(picture, away_rad)
         for mean, waves, colour, haze in _RIDGES:
             ridge = mean + sum((wave * np.sin(count * turn + phase) for wave, count, phase in waves), np.zeros(1))
-            _add_ridge(picture, height, ridge, _distant(colour, light, haze))
-    _add_ridge(picture, height, 0.020 + 0.0035 * _crowns(), _distant(_WOOD, light, 0.2))
+            _add_ridge(picture, height, ridge, _hazed_colour(colour, light, haze))
+    _add_ridge(picture, height, 0.020 + 0.0035 * _wood_outline(), _hazed_colour(_WOOD, light, 0.2))
     words = np.zeros((rows, _COLUMNS, 4), dtype=np.uint8)
     words[..., :3] = np.clip(np.rint(picture), 0, 255)
     return np.asarray(words.view(np.uint32)[..., 0], dtype=np.uint32)
 
 
-def _away_from_sun(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
-    """Angle between the sun and every direction of the picture."""
+def _angle_to_sun_rad(light: Light, elevation_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
+    """Return the angle between the sun and each direction of the picture."""
     cosine = np.sin(elevation_rad) * math.sin(light.elevation_rad)
     cosine = cosine + np.cos(elevation_rad) * math.cos(light.elevation_rad) * np.cos(azimuth_rad - light.azimuth_rad)
     angle_rad: FloatArray = np.arccos(np.clip(cosine, -1.0, 1.0))
     return angle_rad
 
 
-def _distant(colour: Colour, light: Light, haze: float) -> FloatArray:
-    """Colour of something far away that was chosen for the noon light."""
+def _hazed_colour(colour: Colour, light: Light, haze: float) -> FloatArray:
+    """Return the colour, with haze, of a distant object whose colour at noon is given."""
     near, far = np.array(colour) * np.array(light.lit), np.array(light.haze) * 0.85
     return np.asarray(near * (1 - haze) + far * haze)
 
@@ -97,7 +97,7 @@ def _add_ridge(picture: FloatArray, height: FloatArray, ridge: FloatArray, colou
 def _add_clouds(picture: FloatArray, height: FloatArray, light: Light) -> None:
     octaves = ((14, 1.0), (30, 0.6), (70, 0.4), (160, 0.22), (330, 0.12))
     noise = sum((share * seamless_noise("clouds", 1024, cells) for cells, share in octaves), np.zeros((1024, 1024)))
-    # Clouds lie in a layer: a point of the sky shows the layer where the line of sight meets it, seen from its middle.
+    # Clouds are a flat layer: a point of the sky shows the layer where the line of sight intersects it.
     distance = np.minimum(1.0 / np.maximum(height, 0.02), 14.0) * 62.0
     turn = np.arange(_COLUMNS)[None, :] / _COLUMNS * 2 * math.pi
     rows = np.rint(512 + distance * np.sin(turn)).astype(np.intp) % 1024
@@ -107,13 +107,13 @@ def _add_clouds(picture: FloatArray, height: FloatArray, light: Light) -> None:
     fading = np.clip((height - 0.04) / 0.12, 0.0, 1.0)
     cover = (0.92 * (1.0 - np.exp(-2.2 * thickness)) * fading)[..., None]
     picture *= 1 - cover
-    # Thick clouds are darker below than at their edges, and lumpy.
+    # Thick clouds are uneven, and darker than their edges.
     lumps = 0.05 * noise[(rows + 37) % 1024, (columns + 91) % 1024]
     picture += cover * np.array(light.cloud) * np.clip(1.0 - 0.13 * thickness + lumps, 0.7, 1.06)[..., None]
 
 
-def _crowns() -> FloatArray:
-    """Outline of a distant wood, one value for each column."""
+def _wood_outline() -> FloatArray:
+    """Return the outline of a distant wood, one value per column."""
     steps = stream(_WORLD_SEED, "wood").standard_normal(_COLUMNS)
     kernel = np.hanning(9)
     smooth = np.convolve(np.concatenate([steps[-8:], steps, steps[:8]]), kernel / kernel.sum(), mode="same")

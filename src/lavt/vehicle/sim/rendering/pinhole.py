@@ -1,4 +1,4 @@
-"""Where a point of the world is in the picture, and what ground a row of the picture sees.
+"""The pinhole projection of the world into the picture, and from rows of the picture to the ground.
 
 Pixel coordinates are those of OpenCV: the middle of the top left pixel is (0, 0), so the principal point is
 ((width - 1) / 2, (height - 1) / 2). The world's ground is the plane z = 0.
@@ -16,7 +16,7 @@ from lavt.domain import CameraModel, FloatArray, Pose
 
 @dataclass(frozen=True, slots=True)
 class CameraPlacement:
-    """A camera at a place: its position (m) and heading (rad) in the world's frame, above the ground by `z_m`."""
+    """A placed camera: its position (m) and heading (rad) in the world frame, `model.z_m` above the ground."""
 
     model: CameraModel
     x_m: float
@@ -24,12 +24,12 @@ class CameraPlacement:
     heading_rad: float
 
     def project(self, points_m: FloatArray) -> FloatArray:
-        """Picture coordinates and depth (u px, v px, m) of world points (..., 3); the depth may be negative."""
+        """Return picture coordinates and depth (u px, v px, m) of world points (..., 3); the depth may be negative."""
         model = self.model
         cosine, sine = math.cos(self.heading_rad), math.sin(self.heading_rad)
         pitch_cosine, pitch_sine = math.cos(model.pitch_rad), math.sin(model.pitch_rad)
         u_px, v_px = principal_point(model)
-        # Right, down and depth of a point less the camera, each a row; then turned by the roll, times the focal length.
+        # Rows: right, down and depth relative to the camera; the first two are then rolled and scaled to pixels.
         camera_from_world = np.array(
             [
                 [sine, -cosine, 0.0],
@@ -37,7 +37,7 @@ class CameraPlacement:
                 [cosine * pitch_cosine, sine * pitch_cosine, -pitch_sine],
             ]
         )
-        camera_from_world[:2] = rolled(model.roll_rad) @ camera_from_world[:2] * model.focal_px
+        camera_from_world[:2] = roll_matrix(model.roll_rad) @ camera_from_world[:2] * model.focal_px
         points = (points_m - np.array([self.x_m, self.y_m, model.z_m])) @ camera_from_world.T
         depth = points[..., 2:]
         points[..., :2] /= np.where(np.abs(depth) < 1e-6, 1e-6, depth)
@@ -45,10 +45,10 @@ class CameraPlacement:
         return np.asarray(points)
 
     def ground_from_picture(self) -> FloatArray:
-        """3 x 3 homography from picture (u, v, 1) to the world's ground (x, y, 1), for what is below the horizon."""
+        """Return the 3 x 3 homography from picture (u, v, 1) below the horizon to the world's ground (x, y, 1)."""
         model = self.model
         focal_px, pitch_cosine, pitch_sine = model.focal_px, math.cos(model.pitch_rad), math.sin(model.pitch_rad)
-        # Along the ray of a pixel: ahead, left and down for each metre of depth; the ground is z_m below the camera.
+        # A pixel's ray: ahead, left and down per metre of depth; the ground is z_m below the camera.
         ahead = np.array([0.0, -pitch_sine / focal_px, pitch_cosine])
         left = np.array([-1.0 / focal_px, 0.0, 0.0])
         down = np.array([0.0, pitch_cosine / focal_px, pitch_sine])
@@ -62,27 +62,27 @@ class CameraPlacement:
         )
         u_px, v_px = principal_point(model)
         level_from_picture = np.eye(3)
-        level_from_picture[:2, :2] = rolled(-model.roll_rad)
+        level_from_picture[:2, :2] = roll_matrix(-model.roll_rad)
         level_from_picture[:2, 2] = level_from_picture[:2, :2] @ np.array([-u_px, -v_px])
         return np.asarray(ground_from_level @ level_from_picture)
 
 
-def view_from(model: CameraModel, pose: Pose) -> CameraPlacement:
-    """Place the camera of a vehicle at `pose`."""
+def place_camera(model: CameraModel, pose: Pose) -> CameraPlacement:
+    """Return the placement of the camera of a vehicle at `pose`."""
     cosine, sine = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     x_m = pose.x_m + model.x_m * cosine - model.y_m * sine
     y_m = pose.y_m + model.x_m * sine + model.y_m * cosine
     return CameraPlacement(model, x_m, y_m, pose.heading_rad + model.yaw_rad)
 
 
-def rolled(roll_rad: float) -> FloatArray:
-    """Turn picture coordinates (right, down) from a level camera's to those of one that leans right by `roll_rad`."""
+def roll_matrix(roll_rad: float) -> FloatArray:
+    """Return the matrix from a level camera's picture coordinates (right, down) to a camera's rolled by `roll_rad`."""
     cosine, sine = math.cos(roll_rad), math.sin(roll_rad)
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
-def levelled(model: CameraModel) -> CameraModel:
-    """Give a camera without roll, of the same focal length, whose picture holds all that `model` sees."""
+def level_model(model: CameraModel) -> CameraModel:
+    """Return a camera without roll, of the same focal length, whose picture contains everything that `model` sees."""
     if model.roll_rad == 0.0:
         return model
     cosine, sine = abs(math.cos(model.roll_rad)), abs(math.sin(model.roll_rad))
@@ -93,17 +93,17 @@ def levelled(model: CameraModel) -> CameraModel:
 
 
 def principal_point(model: CameraModel) -> tuple[float, float]:
-    """Tell where the camera's axis meets the picture (u, v), in pixels."""
+    """Return the point (u, v) in pixels where the camera's axis meets the picture."""
     return (model.width_px - 1) / 2, (model.height_px - 1) / 2
 
 
 def horizon_row(model: CameraModel) -> float:
-    """Picture row (v, px) of the horizon, for a camera without roll."""
+    """Return the picture row (v, px) of the horizon, for a camera without roll."""
     return principal_point(model)[1] - model.focal_px * math.tan(model.pitch_rad)
 
 
 def row_of_depth(model: CameraModel, ahead_m: float) -> int:
-    """First row whose ground is no more than `ahead_m` ahead, kept within the picture; for a camera without roll."""
+    """Return the first row whose ground is at most `ahead_m` ahead, within the picture, for a camera without roll."""
     angle_rad = math.atan2(model.z_m, ahead_m) - model.pitch_rad
     row = math.ceil(principal_point(model)[1] + model.focal_px * math.tan(angle_rad))
     return min(max(row, 0), model.height_px)

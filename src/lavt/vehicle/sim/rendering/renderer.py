@@ -1,8 +1,8 @@
-"""Pictures of a road for a camera on a car, made on the CPU.
+"""The renderer of a road for a camera on a car, on the CPU.
 
-The ground is warped from tiles seen from above, in five bands of rows (`bands`); sky and hills are cut from a panorama;
-what stands upright is drawn from far to near; the sensor adds its noise. A frame depends on the poses, the frame's
-number and the seed alone: equal to the byte for equal versions and processor features.
+The ground is warped from top-view tiles, in five bands of rows (`bands`). Sky and hills are cropped from a panorama,
+upright objects are drawn from far to near, and sensor noise is added. A frame depends only on the poses, its number and
+the seed: it is byte-for-byte reproducible for equal versions and processor features.
 """
 
 from __future__ import annotations
@@ -21,101 +21,101 @@ from lavt.vehicle.sim.rendering.bands import Band, bands_of
 from lavt.vehicle.sim.rendering.ground import Ground
 from lavt.vehicle.sim.rendering.light import LIGHTS, LightName
 from lavt.vehicle.sim.rendering.panorama import Panorama
-from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, levelled, principal_point, rolled, view_from
-from lavt.vehicle.sim.rendering.roadside_objects import standing
+from lavt.vehicle.sim.rendering.pinhole import CameraPlacement, level_model, place_camera, principal_point, roll_matrix
+from lavt.vehicle.sim.rendering.roadside_objects import place_roadside_objects
 from lavt.vehicle.sim.rendering.scenery import HAZE_M, Scenery
 from lavt.vehicle.sim.rendering.shadows import Shadows
 from lavt.vehicle.sim.road.road import Road
 
 SceneryKind = Literal["full", "light", "none"]
-"""full: everything; light: no trees, lamp posts, buildings and clouds; none: no rails and no shadows either."""
+"""full: everything; light: no trees, lamp posts, buildings or clouds; none: no rails or shadows either."""
 
-MOST_PARTS, MOST_INSTANTS = 8, 16
-"""An exposure is drawn in so many parts at most, the near ground in each from so many instants at most."""
+MAX_PARTS, MAX_INSTANTS = 8, 16
+"""The maximum number of parts of an exposure, and of instants per part at which the near ground is drawn."""
 
 _STEP_PX = 3.0
 _NEAR_BANDS = 2
 _NOISE_DEVIATION = 2.2
 _NOISE_MARGIN_PX = 64
-_CLEAR_M = 11.0
-_KEPT_FROM_LEVEL = 2
+_HAZE_FROM_M = 11.0
+_PREPARED_FROM_LEVEL = 2
 _SWERVE_M = 6.0
 _SWERVE_RAD = 0.6
 
 
 class Renderer:
-    """Draws one road in one light for one camera model."""
+    """A renderer of one road in one light for one camera model."""
 
     def __init__(
         self, road: Road, model: CameraModel, *, seed: int, scenery: SceneryKind, light: LightName = "noon"
     ) -> None:
-        cv2.setNumThreads(1)  # with more the split of the work, and with it the last bit, may change
+        cv2.setNumThreads(1)  # with more threads the division of work, and so the last bit, may vary
         self._road, self._model, self._seed = road, model, seed
-        self._level = levelled(model)
+        self._level_model = level_model(model)
         self._ground, self._scenery = world(road, scenery, light)
-        self._bands = bands_of(self._level)
-        self._panorama = Panorama(self._level, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
+        self._bands = bands_of(self._level_model)
+        self._panorama = Panorama(self._level_model, self._bands[-1].first_row, LIGHTS[light], plain=scenery != "full")
         self._windows: list[tuple[tuple[int, int], Picture] | None] = [None] * len(self._bands)
-        self._canvas = np.empty((self._level.height_px, self._level.width_px, 4), dtype=np.uint8)
-        self._kept, self._haze = _haze(self._level, self._bands, LIGHTS[light].haze)
+        self._canvas = np.empty((self._level_model.height_px, self._level_model.width_px, 4), dtype=np.uint8)
+        self._haze_factor, self._haze = _haze(self._level_model, self._bands, LIGHTS[light].haze)
         self._noise = _noise(model)
 
     def prepare(self) -> None:
-        """Do beforehand what would make a frame late: the coarse ground along the route, and the first picture."""
+        """Fill the caches whose first use would delay a frame: coarse ground along the route, sprites, textures."""
         for s_m in np.arange(0.0, self._road.length_m + 16.0, 16.0):
             heading_rad = float(self._road.point(s_m)[2])
             for lateral_m in (-_SWERVE_M, 0.0, _SWERVE_M):
                 x_m, y_m = self._road.across(s_m, lateral_m).tolist()
                 for turned_rad in (-_SWERVE_RAD, 0.0, _SWERVE_RAD):
-                    self._prepare_ground(view_from(self._level, Pose(0, x_m, y_m, heading_rad + turned_rad)))
+                    self._prepare_ground(place_camera(self._level_model, Pose(0, x_m, y_m, heading_rad + turned_rad)))
         if self._scenery is not None:
             self._scenery.prepare()
         self.render(Pose(0, *self._road.start), 0)
 
     def render(self, pose: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen in one moment by a vehicle at `pose`; a new array each time."""
-        picture = self._drawn(pose)
+        """Return frame `number` for a vehicle at `pose`, without motion blur, in a new array."""
+        picture = self._draw_world(pose)
         self._add_noise(picture, number)
         return picture
 
     def render_exposed(self, begin: Pose, end: Pose, number: int) -> Picture:
-        """Draw frame `number` as seen by a vehicle that moves from `begin` to `end` while the shutter is open.
+        """Return frame `number` for a vehicle that moves from `begin` to `end` while the shutter is open.
 
-        The exposure is cut into parts, within which nothing but the near ground moves much; in each part that is seen
-        from several instants.
+        The exposure is divided into parts so short that only the near ground moves much within one; the near ground is
+        drawn at several instants per part.
         """
-        parts = _count(self._moved_px(begin, end, self._bands[_NEAR_BANDS].end_row), MOST_PARTS)
-        instants = _count(self._moved_px(begin, end, self._level.height_px - 1) / parts, MOST_INSTANTS)
+        parts = _part_count(self._motion_px(begin, end, self._bands[_NEAR_BANDS].end_row), MAX_PARTS)
+        instants = _part_count(self._motion_px(begin, end, self._level_model.height_px - 1) / parts, MAX_INSTANTS)
         light = np.zeros((self._model.height_px, self._model.width_px, 3), dtype=np.uint16)
         for part in range(parts):
             shares = (part + (np.arange(instants) + 0.5) / instants) / parts
-            near = [_between(begin, end, share) for share in shares.tolist()]
-            light += self._drawn(_between(begin, end, (part + 0.5) / parts), near)
+            near = [_interpolate_pose(begin, end, share) for share in shares.tolist()]
+            light += self._draw_world(_interpolate_pose(begin, end, (part + 0.5) / parts), near)
         picture = ((light + parts // 2) // parts).astype(np.uint8)
         self._add_noise(picture, number)
         return picture
 
-    def _drawn(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
-        """Draw the world without noise, from `pose`; the near ground as the mean of what is seen from `near`."""
-        view = view_from(self._level, pose)
-        self._panorama.cut(view.heading_rad, self._canvas[: self._bands[-1].first_row])
+    def _draw_world(self, pose: Pose, near: Sequence[Pose] = ()) -> Picture:
+        """Return the world seen from `pose`, without noise; the near ground is the mean of its views from `near`."""
+        placement = place_camera(self._level_model, pose)
+        self._panorama.crop(placement.heading_rad, self._canvas[: self._bands[-1].first_row])
         blurred = len(near) > 1
-        homography = view.ground_from_picture()
+        homography = placement.ground_from_picture()
         for band in self._bands[_NEAR_BANDS if blurred else 0 :]:
-            self._warp(band, view, homography)
+            self._warp(band, placement, homography)
         if blurred:
-            self._blur_near([view_from(self._level, each) for each in near])
+            self._blur_near([place_camera(self._level_model, each) for each in near])
         self._add_haze()
         picture = np.asarray(cv2.cvtColor(self._canvas, cv2.COLOR_BGRA2BGR), dtype=np.uint8)
         if self._scenery is not None:
-            self._scenery.draw(view, picture)
-        return picture if self._level is self._model else self._rolled(picture)
+            self._scenery.draw(placement, picture)
+        return picture if self._level_model is self._model else self._apply_roll(picture)
 
-    def _warp(self, band: Band, view: CameraPlacement, homography: FloatArray) -> None:
+    def _warp(self, band: Band, placement: CameraPlacement, homography: FloatArray) -> None:
         rows = self._canvas[band.first_row : band.end_row]
         if not len(rows):
             return
-        low = band.low_tile(view)
+        low = band.first_tile(placement)
         matrix = band.texel_from_ground(low) @ homography @ band.picture_from_lines
         flags, size = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR, (rows.shape[1], rows.shape[0] * band.lines)
         window = self._window(band, low)
@@ -123,54 +123,54 @@ class Renderer:
             cv2.warpPerspective(window, matrix, size, rows, flags, cv2.BORDER_REPLICATE)
             return
         lines = cv2.warpPerspective(window, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        # In NumPy: OpenCV's reduction by area takes longer than the warp.
+        # NumPy, because OpenCV's reduction by area takes longer than the warp.
         light = np.add.reduce(lines.reshape(len(rows), band.lines, -1), axis=1, dtype=np.uint16)
         rows.reshape(len(rows), -1)[:] = (light + band.lines // 2) // band.lines
 
     def _window(self, band: Band, low: tuple[int, int]) -> Picture:
-        held = self._windows[band.level]
-        if held is None or held[0] != low:
-            held = (low, self._ground.window(band.level, low, band.tiles))
-            self._windows[band.level] = held
-        return held[1]
+        cached = self._windows[band.level]
+        if cached is None or cached[0] != low:
+            cached = (low, self._ground.assemble(band.level, low, band.tiles))
+            self._windows[band.level] = cached
+        return cached[1]
 
-    def _prepare_ground(self, view: CameraPlacement) -> None:
-        for band in self._bands[_KEPT_FROM_LEVEL:]:
-            low = band.low_tile(view)
-            for index in range(band.tiles**2 if self._ground.room(band.level) else 0):
+    def _prepare_ground(self, placement: CameraPlacement) -> None:
+        for band in self._bands[_PREPARED_FROM_LEVEL:]:
+            low = band.first_tile(placement)
+            for index in range(band.tiles**2 if self._ground.has_room(band.level) else 0):
                 self._ground.tile(band.level, low[0] + index % band.tiles, low[1] + index // band.tiles)
 
     def _add_haze(self) -> None:
-        rows = self._canvas[self._bands[-1].first_row :][: len(self._kept)]
+        rows = self._canvas[self._bands[-1].first_row :][: len(self._haze_factor)]
         if len(rows):
-            cv2.multiply(rows, self._kept, rows, 1 / 255)
+            cv2.multiply(rows, self._haze_factor, rows, 1 / 255)
             cv2.add(rows, self._haze, rows)
 
-    def _rolled(self, level: Picture) -> Picture:
+    def _apply_roll(self, level: Picture) -> Picture:
         model = self._model
         level_from_picture = np.empty((2, 3))
-        level_from_picture[:, :2] = rolled(-model.roll_rad)
-        level_from_picture[:, 2] = np.array(principal_point(self._level)) - level_from_picture[:, :2] @ np.array(
+        level_from_picture[:, :2] = roll_matrix(-model.roll_rad)
+        level_from_picture[:, 2] = np.array(principal_point(self._level_model)) - level_from_picture[:, :2] @ np.array(
             principal_point(model)
         )
         flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
         turned = cv2.warpAffine(level, level_from_picture, (model.width_px, model.height_px), flags=flags)
         return np.asarray(turned, dtype=np.uint8)
 
-    def _blur_near(self, views: Sequence[CameraPlacement]) -> None:
+    def _blur_near(self, placements: Sequence[CameraPlacement]) -> None:
         rows = self._canvas[self._bands[_NEAR_BANDS].end_row :]
         light = np.zeros(rows.shape, dtype=np.uint16)
-        for view in views:
-            homography = view.ground_from_picture()
+        for placement in placements:
+            homography = placement.ground_from_picture()
             for band in self._bands[:_NEAR_BANDS]:
-                self._warp(band, view, homography)
+                self._warp(band, placement, homography)
             light += rows
-        rows[:] = (light + len(views) // 2) // len(views)
+        rows[:] = (light + len(placements) // 2) // len(placements)
 
-    def _moved_px(self, begin: Pose, end: Pose, row: int) -> float:
-        """How far the ground in the corners of a row moves in the picture, or the horizon if that is more."""
-        model = self._level
-        first, last = view_from(model, begin), view_from(model, end)
+    def _motion_px(self, begin: Pose, end: Pose, row: int) -> float:
+        """Return how far a row's corners, or the horizon if that is more, move in the picture."""
+        model = self._level_model
+        first, last = place_camera(model, begin), place_camera(model, end)
         pixels = np.array([[0.0, row, 1.0], [model.width_px - 1.0, row, 1.0]])
         ground = pixels @ first.ground_from_picture().T
         turned_px = model.focal_px * abs(math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi))
@@ -188,20 +188,20 @@ class Renderer:
 
 @lru_cache(maxsize=1)  # up to a gigabyte, for 600 m driven
 def world(road: Road, scenery: SceneryKind, light_name: LightName) -> tuple[Ground, Scenery | None]:
-    """Make a road's ground and what stands on it; the runs of a sweep that follow each other share them."""
+    """Return a road's ground and scenery, cached for consecutive runs of a sweep."""
     light = LIGHTS[light_name]
     if scenery == "none":
         return Ground(road, light, None), None
-    things = standing(road, trees=scenery == "full")
-    shadows = Shadows(things, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
-    return Ground(road, light, shadows), Scenery(things, light)
+    objects = place_roadside_objects(road, trees=scenery == "full")
+    shadows = Shadows(objects, light, clouds=scenery == "full" and light.clouds_shade) if light.shadows else None
+    return Ground(road, light, shadows), Scenery(objects, light)
 
 
-def _count(moved_px: float, most: int) -> int:
-    return min(max(math.ceil(moved_px / _STEP_PX), 1), most)
+def _part_count(moved_px: float, limit: int) -> int:
+    return min(max(math.ceil(moved_px / _STEP_PX), 1), limit)
 
 
-def _between(begin: Pose, end: Pose, share: float) -> Pose:
+def _interpolate_pose(begin: Pose, end: Pose, share: float) -> Pose:
     turn_rad = math.remainder(end.heading_rad - begin.heading_rad, 2 * math.pi)
     return Pose(
         begin.mono_ns + round((end.mono_ns - begin.mono_ns) * share),
@@ -212,19 +212,19 @@ def _between(begin: Pose, end: Pose, share: float) -> Pose:
 
 
 def _haze(model: CameraModel, bands: tuple[Band, ...], colour: tuple[float, ...]) -> tuple[Picture, Picture]:
-    """What haze leaves of the ground's far rows (255ths), and what it adds: (rows, columns, 4) each."""
+    """Return the transmittance of haze for the far rows (255ths), and its added colour: (rows, columns, 4) each."""
     rows = np.arange(bands[-1].first_row, bands[1].first_row)
     angle_rad = np.arctan((rows - (model.height_px - 1) / 2) / model.focal_px) + model.pitch_rad
     depth_m = model.z_m / np.maximum(np.tan(angle_rad), 1e-6)
     share = np.broadcast_to(
-        (1.0 - np.exp(-np.maximum(depth_m - _CLEAR_M, 0.0) / HAZE_M))[:, None, None], (len(rows), model.width_px, 4)
+        (1.0 - np.exp(-np.maximum(depth_m - _HAZE_FROM_M, 0.0) / HAZE_M))[:, None, None], (len(rows), model.width_px, 4)
     )
     added = share * np.array([*colour, 0.0])
     return np.rint(255.0 * (1 - share)).astype(np.uint8), np.rint(added).astype(np.uint8)
 
 
 def _noise(model: CameraModel) -> tuple[Picture, Picture]:
-    """Make what the sensor adds and what it takes away, larger than a picture; a frame gets a part of it."""
+    """Return the positive and negative sensor noise, larger than a picture; each frame uses a random part."""
     size = (model.height_px + _NOISE_MARGIN_PX, model.width_px + _NOISE_MARGIN_PX, 3)
     noise = np.rint(stream(0, "sensor noise bank").standard_normal(size) * _NOISE_DEVIATION)
     return np.clip(noise, 0, 255).astype(np.uint8), np.clip(-noise, 0, 255).astype(np.uint8)

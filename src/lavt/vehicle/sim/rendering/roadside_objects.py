@@ -1,6 +1,6 @@
-"""What stands beside a road: rails and barriers, lamp posts, trees and buildings.
+"""Roadside objects: rails and barriers, lamp posts, trees and buildings.
 
-Their places and shapes are the world's, the same in every run and every light.
+Their positions and shapes are the same in every run and every light.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lavt.vehicle.sim.road.cross_section import Rail
 from lavt.vehicle.sim.road.road import Road
 
 FAR_M = 160.0
-"""Nothing is seen beyond."""
+"""The distance beyond which nothing is drawn."""
 
 _WORLD_SEED = 0
 _DETAIL_M = 45.0
@@ -41,7 +41,7 @@ _BANDS: dict[str, tuple[tuple[float, float, tuple[int, int, int], float], ...]] 
         (0.62, 0.76, (178, 176, 170), _DETAIL_M),
     ),
 }
-"""The faces of a rail in the order of painting: from and to which height (m), blue green red, how far it is seen."""
+"""The faces of a rail in painting order: lower and upper height (m), blue green red, and visible distance (m)."""
 
 _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 
@@ -50,7 +50,7 @@ _FACADES = ((158, 172, 190), (176, 182, 184), (120, 140, 168), (186, 200, 206))
 class Faces:
     """Upright quadrilaterals: corners (n, 4, 3) in m (begin low, end low, end high, begin high), colours (n, 3).
 
-    `normals` (n, 2) are level unit vectors towards who drives on the road, `seen_to_m` (n,) how far each is seen.
+    `normals` (n, 2) are horizontal unit vectors towards the road, `seen_to_m` (n,) the distances of visibility.
     """
 
     corners_m: FloatArray
@@ -61,7 +61,7 @@ class Faces:
 
 @dataclass(frozen=True, slots=True)
 class Walls:
-    """Walls of buildings: outlines (n, 4, 3) as of `Faces`, colours, outward normals, and each one's windows."""
+    """Walls of buildings: outlines (n, 4, 3) as in `Faces`, colours, outward normals, and the windows of each wall."""
 
     outlines_m: FloatArray
     colours: FloatArray
@@ -74,10 +74,10 @@ _NO_WALLS = Walls(np.empty((0, 4, 3)), np.empty((0, 3)), np.empty((0, 2)), ())
 
 @dataclass(frozen=True, slots=True)
 class RoadsideObjects:
-    """Everything that stands along one road.
+    """The objects along one road.
 
-    `poles` are (n, 5): x, y, foot, top, width in metres; `trees` (n, 4): x, y, height (m), kind; `tree_road_rad` (n,)
-    the heading of the road beside each tree.
+    `poles` are (n, 5): x, y, foot, top, width in metres. `trees` are (n, 4): x, y, height (m), kind. `tree_road_rad`
+    (n,) are the headings of the road beside the trees.
     """
 
     faces: Faces
@@ -87,20 +87,20 @@ class RoadsideObjects:
     walls: Walls
 
 
-def standing(road: Road, *, trees: bool) -> RoadsideObjects:
-    """Place everything along a road; `trees` says whether trees, lamp posts and buildings are there too."""
-    runs = [_stations(road, rail) for rail in road.rails]
-    planted = _plant(road) if trees else np.empty((0, 4))
+def place_roadside_objects(road: Road, *, trees: bool) -> RoadsideObjects:
+    """Place the objects along a road; `trees` includes trees, lamp posts and buildings."""
+    runs = [_rail_stations(road, rail) for rail in road.rails]
+    placed_trees = _place_trees(road) if trees else np.empty((0, 4))
     return RoadsideObjects(
         faces=_join_faces([*_rail_faces(road, runs), *_lamp_faces(road, runs if trees else [])]),
-        poles=_poles(road, runs, lamps=trees),
-        trees=planted,
-        tree_road_rad=_road_heading(road, planted[:, :2]),
-        walls=_build(road) if trees else _NO_WALLS,
+        poles=_place_poles(road, runs, lamps=trees),
+        trees=placed_trees,
+        tree_road_rad=_road_heading(road, placed_trees[:, :2]),
+        walls=_place_buildings(road) if trees else _NO_WALLS,
     )
 
 
-def _stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
+def _rail_stations(road: Road, rail: Rail) -> tuple[Rail, FloatArray]:
     first_m, last_m = max(rail.from_m, road.first_m), min(rail.to_m, road.last_m)
     return rail, np.linspace(first_m, last_m, max(2, round((last_m - first_m) / _POST_SPACING_M) + 1))
 
@@ -113,36 +113,36 @@ def _rail_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Fac
     found = []
     for rail, stations in runs:
         line = road.across(stations, rail.offset_m)
-        # Every piece a little different, so that the eye can see them pass.
+        # Vary the tone of the pieces, so that their motion is visible.
         tone = stream(_WORLD_SEED, "rail").uniform(-6, 6, len(line) - 1)[:, None]
-        normals = _beside(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
+        normals = _left_normals(line[:-1], line[1:]) * (-1.0 if rail.offset_m > 0 else 1.0)
         for low_m, high_m, colour, seen_to_m in _BANDS[rail.kind]:
-            corners = _upright(line[:-1], line[1:], low_m, high_m)
+            corners = _upright_faces(line[:-1], line[1:], low_m, high_m)
             found.append(Faces(corners, np.array(colour) + tone, normals, np.full(len(tone), seen_to_m)))
     return found
 
 
 def _lamp_faces(road: Road, runs: Sequence[tuple[Rail, FloatArray]]) -> list[Faces]:
-    """Make the arms of lamp posts, to both sides."""
+    """Create the arms of lamp posts, to both sides."""
     found = []
     for rail, stations in runs:
         if rail.kind == "barrier":
             places = _lamp_stations(stations)
             begin, end = road.across(places, rail.offset_m - 1.8), road.across(places, rail.offset_m + 1.8)
-            corners = _upright(begin, end, 9.35, 9.55)
-            normals = _beside(begin, end)
+            corners = _upright_faces(begin, end, 9.35, 9.55)
+            normals = _left_normals(begin, end)
             found.append(Faces(corners, np.full((len(corners), 3), 104.0), normals, np.full(len(corners), FAR_M)))
     return found
 
 
-def _beside(begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Level unit vectors to the left of the way from `begin` to `end`, (n, 2)."""
+def _left_normals(begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Return horizontal unit vectors (n, 2) to the left of the direction from `begin` to `end`."""
     along = end - begin
     left = np.column_stack([-along[:, 1], along[:, 0]])
     return np.asarray(left / np.maximum(np.hypot(left[:, :1], left[:, 1:]), 1e-9))
 
 
-def _upright(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
+def _upright_faces(begin: FloatArray, end: FloatArray, low_m: float, high_m: float) -> FloatArray:
     low, high = np.full(len(begin), low_m), np.full(len(begin), high_m)
     corners = [(begin, low), (end, low), (end, high), (begin, high)]
     return np.stack([np.column_stack(corner) for corner in corners], axis=1)
@@ -157,7 +157,7 @@ def _join_faces(faces: Sequence[Faces]) -> Faces:
     )
 
 
-def _poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
+def _place_poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) -> FloatArray:
     """Place posts of rails and lamp posts on barriers."""
     poles = [np.empty((0, 5))]
     for rail, stations in runs:
@@ -171,8 +171,8 @@ def _poles(road: Road, runs: Sequence[tuple[Rail, FloatArray]], *, lamps: bool) 
     return np.concatenate(poles)
 
 
-def _middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
-    """Points (n, 2) along the middle of the asphalt, the heading (n,) there, and half its width."""
+def _road_middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
+    """Return points (n, 2) along the middle of the asphalt, the heading (n,) there, and half the asphalt's width."""
     left_m = max(strip.left_m for strip in road.paved)
     right_m = min(strip.right_m for strip in road.paved)
     stations = np.arange(road.first_m - 40.0, road.last_m + 40.0, 4.0)
@@ -180,23 +180,23 @@ def _middle(road: Road) -> tuple[FloatArray, FloatArray, float]:
 
 
 def _road_heading(road: Road, places: FloatArray) -> FloatArray:
-    middle, heading_rad, _ = _middle(road)
+    middle, heading_rad, _ = _road_middle(road)
     nearest = ((places[:, None] - middle[None]) ** 2).sum(axis=-1).argmin(axis=1)
     return np.asarray(heading_rad[nearest], dtype=np.float64)
 
 
 def _free_places(road: Road, name: str, every_m2: float, clear_m: float) -> FloatArray:
-    """Random places around the road, one in `every_m2`, none nearer than `clear_m` to its asphalt."""
-    middle, _, half_width_m = _middle(road)
+    """Return random positions around the road, one per `every_m2`, none closer than `clear_m` to its asphalt."""
+    middle, _, half_width_m = _road_middle(road)
     low, high = middle.min(axis=0) - _AROUND_M, middle.max(axis=0) + _AROUND_M
     places = stream(_WORLD_SEED, name).uniform(low, high, (round(float(np.prod(high - low)) / every_m2), 2))
     distance = np.full(len(places), np.inf)
-    for x_m, y_m in middle:  # point after point: a table of all distances does not fit a long road
+    for x_m, y_m in middle:  # one point at a time: a table of all distances would be too large for a long road
         np.minimum(distance, np.hypot(places[:, 0] - x_m, places[:, 1] - y_m), out=distance)
     return np.asarray(places[(distance > half_width_m + clear_m) & (distance < half_width_m + _AROUND_M)])
 
 
-def _plant(road: Road) -> FloatArray:
+def _place_trees(road: Road) -> FloatArray:
     places = _free_places(road, "tree places", _TREE_EVERY_M2, clear_m=6.0)
     random = stream(_WORLD_SEED, "tree shapes")
     kinds = random.integers(0, TREE_KINDS, len(places))
@@ -206,7 +206,7 @@ def _plant(road: Road) -> FloatArray:
     return np.column_stack([places, heights, kinds])
 
 
-def _build(road: Road) -> Walls:
+def _place_buildings(road: Road) -> Walls:
     random = stream(_WORLD_SEED, "building shapes")
     outlines, colours, normals, windows = [], [], [], []
     for place in _free_places(road, "building places", _BUILDING_EVERY_M2, clear_m=24.0):
@@ -223,7 +223,7 @@ def _build(road: Road) -> Walls:
             windows.append(_panels(begin, end, shares=(first, first + 0.5 / columns), heights_m=(sill, sill + 1.5)))
             whole, height_m = (np.zeros(1), np.ones(1)), (np.zeros(1), np.full(1, _STOREY_M * storeys + 0.5))
             outlines.append(_panels(begin, end, shares=whole, heights_m=height_m)[0])
-            normals.append(-_beside(begin[None], end[None])[0])
+            normals.append(-_left_normals(begin[None], end[None])[0])
             colours.append(colour)
     return Walls(
         np.array(outlines).reshape(-1, 4, 3),
@@ -240,7 +240,7 @@ def _panels(
     shares: tuple[FloatArray, FloatArray],
     heights_m: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Rectangles on a wall: every (first, last) share of its length with every (low, high) height, (n, 4, 3)."""
+    """Return rectangles (n, 4, 3) on a wall: each (first, last) share of its length with each (low, high) height."""
     left = begin + shares[0][:, None] * (end - begin)
     right = begin + shares[1][:, None] * (end - begin)
     panels = [

@@ -1,4 +1,4 @@
-"""Draws what stands beside the road, from far to near, in one light."""
+"""The scenery: drawing of roadside objects from far to near, in one light."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lavt.vehicle.sim.rendering.roadside_objects import FAR_M, RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, Trees
 
 HAZE_M = 240.0
-"""At this distance 63 % of a thing's colour is haze."""
+"""At this distance 63 % of an object's colour is haze."""
 
 _NEAR_M = 0.4
 _SUBPIXEL_BITS = 4
@@ -28,94 +28,99 @@ _GLASS = (104.0, 88.0, 74.0)
 _POLE = 96.0
 
 Drawing = tuple[float, Callable[..., None], Any, Any]
-"""Depth (m), what draws the thing, and its two arguments after the picture."""
+"""Depth (m), the drawing function, and its two arguments after the picture."""
 
 
 class Scenery:
-    """Everything that stands along one road, in one light."""
+    """The roadside objects of one road, in one light."""
 
-    def __init__(self, standing: RoadsideObjects, light: Light) -> None:
-        self._standing = standing
-        faces, walls = standing.faces, standing.walls
-        self._colours = faces.colours * light.upright(faces.normals)
-        self._pole_colour = _POLE * light.upright(np.zeros((1, 2)))
-        self._wall_colours = walls.colours * light.upright(walls.normals)
-        self._glass = np.array(_GLASS) * light.upright(walls.normals)
-        # The trees' pictures have the sun to the left: those that see it to the right of the road are mirrored.
-        mirrored = np.sin(light.azimuth_rad - standing.tree_road_rad) < 0
-        self._trees = np.column_stack([standing.trees, mirrored])
+    def __init__(self, objects: RoadsideObjects, light: Light) -> None:
+        self._objects = objects
+        faces, walls = objects.faces, objects.walls
+        self._colours = faces.colours * light.upright_factors(faces.normals)
+        self._pole_colour = _POLE * light.upright_factors(np.zeros((1, 2)))
+        self._wall_colours = walls.colours * light.upright_factors(walls.normals)
+        self._glass = np.array(_GLASS) * light.upright_factors(walls.normals)
+        # Sprites show trees with the sun on the left: they are mirrored where the sun is to the right of the road.
+        mirrored = np.sin(light.azimuth_rad - objects.tree_road_rad) < 0
+        self._trees = np.column_stack([objects.trees, mirrored])
         self._haze = np.array(light.haze)
         self._sprites = Trees(light)
 
     def prepare(self) -> None:
-        """Paint beforehand what is slow."""
+        """Fill the slow caches beforehand."""
         self._sprites.prepare()
 
-    def draw(self, view: CameraPlacement, picture: Picture) -> None:
-        """Draw into `picture` what is in view."""
-        things: list[Drawing] = [
-            *self._faces(view), *self._poles(view), *self._tree_drawings(view), *self._walls(view)
-        ]  # fmt: skip
-        things.sort(key=itemgetter(0), reverse=True)  # stable: faces of one piece stay in the order of painting
-        for _, draw, shape, look in things:
-            draw(picture, shape, look)
+    def draw(self, placement: CameraPlacement, picture: Picture) -> None:
+        """Draw the visible objects into `picture`."""
+        drawings: list[Drawing] = [
+            *self._face_drawings(placement),
+            *self._pole_drawings(placement),
+            *self._tree_drawings(placement),
+            *self._wall_drawings(placement),
+        ]
+        drawings.sort(key=itemgetter(0), reverse=True)  # stable: faces of one piece stay in painting order
+        for _, draw, shape, style in drawings:
+            draw(picture, shape, style)
 
-    def _faces(self, view: CameraPlacement) -> Iterable[Drawing]:
-        faces = self._standing.faces
+    def _face_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
+        faces = self._objects.faces
         corners = faces.corners_m
-        ahead = _ahead(corners[:, :2, :2], view)
+        ahead = _depth_m(corners[:, :2, :2], placement)
         near = np.flatnonzero((ahead.max(axis=1) > _NEAR_M) & (ahead.min(axis=1) < faces.seen_to_m))
         ahead = ahead[near]
-        points = view.project(_clipped(corners[near], ahead))
-        inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
-        # Faces of one piece have one depth.
+        points = placement.project(_clip(corners[near], ahead))
+        inside = (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
+        # All faces of one piece have the same depth.
         depth = np.maximum(ahead[inside], _NEAR_M).mean(axis=1)
-        shades = self._hazed(self._colours[near[inside]], depth)
+        shades = self._add_haze(self._colours[near[inside]], depth)
         return zip(depth.tolist(), repeat(_polygon), _subpixels(points[inside]), shades.tolist())
 
-    def _poles(self, view: CameraPlacement) -> Iterable[Drawing]:
-        ahead = _ahead(self._standing.poles[:, :2], view)
-        shown = (ahead > 1.0) & (ahead < FAR_M)
-        poles, depth = self._standing.poles[shown], ahead[shown]
-        ends = view.project(np.stack([poles[:, :3], poles[:, [0, 1, 3]]], axis=1))
-        inside = (ends[:, 0, 0] > -20) & (ends[:, 0, 0] < view.model.width_px + 20)
+    def _pole_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
+        ahead = _depth_m(self._objects.poles[:, :2], placement)
+        visible = (ahead > 1.0) & (ahead < FAR_M)
+        poles, depth = self._objects.poles[visible], ahead[visible]
+        ends = placement.project(np.stack([poles[:, :3], poles[:, [0, 1, 3]]], axis=1))
+        inside = (ends[:, 0, 0] > -20) & (ends[:, 0, 0] < placement.model.width_px + 20)
         depth = depth[inside]
-        widths = np.clip(np.rint(poles[inside, 4] * view.model.focal_px / depth), 1, 40).astype(int).tolist()
-        shades = self._hazed(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
-        looks = zip(shades, widths, strict=True)
-        # A pole stands behind the face it carries.
-        return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), looks)
+        widths = np.clip(np.rint(poles[inside, 4] * placement.model.focal_px / depth), 1, 40).astype(int).tolist()
+        shades = self._add_haze(np.broadcast_to(self._pole_colour, (len(depth), 3)), depth).tolist()
+        styles = zip(shades, widths, strict=True)
+        # A pole is behind the face it carries.
+        return zip((depth + 0.3).tolist(), repeat(_line), _subpixels(ends[inside]).tolist(), styles)
 
-    def _tree_drawings(self, view: CameraPlacement) -> Iterable[Drawing]:
-        ahead = _ahead(self._trees[:, :2], view)
+    def _tree_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
+        ahead = _depth_m(self._trees[:, :2], placement)
         trees = self._trees[(ahead > 3.0) & (ahead < FAR_M)]
-        feet = view.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
-        heights = trees[:, 2] * view.model.focal_px / feet[:, 2]
+        feet = placement.project(np.column_stack([trees[:, :2], np.zeros(len(trees))]))
+        heights = trees[:, 2] * placement.model.focal_px / feet[:, 2]
         reach = heights * (TREE_WIDTH / 2)
-        inside = (heights >= 3) & (feet[:, 0] > -reach) & (feet[:, 0] < view.model.width_px + reach)
+        inside = (heights >= 3) & (feet[:, 0] > -reach) & (feet[:, 0] < placement.model.width_px + reach)
         shapes = np.column_stack([feet[:, :2], heights, trees[:, 3:]])[inside].tolist()
         depth = feet[inside, 2]
         haze = (1.0 - np.exp(-depth / HAZE_M)).tolist()
         return zip(depth.tolist(), repeat(self._sprites.draw), shapes, haze)
 
-    def _walls(self, view: CameraPlacement) -> Iterable[Drawing]:
-        walls = self._standing.walls
+    def _wall_drawings(self, placement: CameraPlacement) -> Iterable[Drawing]:
+        walls = self._objects.walls
         outlines = walls.outlines_m
         begin, end = outlines[:, 0, :2], outlines[:, 1, :2]
-        # Seen from outside, a wall's outline runs from the left to the right.
-        seen = (view.x_m - begin[:, 0]) * (end - begin)[:, 1] > (view.y_m - begin[:, 1]) * (end - begin)[:, 0]
-        ahead = _ahead(outlines[:, :2, :2], view)
+        # A wall seen from outside has its begin on the left and its end on the right.
+        seen = (placement.x_m - begin[:, 0]) * (end - begin)[:, 1] > (placement.y_m - begin[:, 1]) * (end - begin)[:, 0]
+        ahead = _depth_m(outlines[:, :2, :2], placement)
         seen &= (ahead.min(axis=1) > _NEAR_M) & (ahead.min(axis=1) < FAR_M * 1.2)
-        points = view.project(outlines)
-        seen &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < view.model.width_px)
-        shown = np.flatnonzero(seen)
-        depth = ahead[shown].mean(axis=1)
-        windows = [list(_subpixels(view.project(walls.windows_m[wall]))) for wall in shown]
-        walls_and_glass = (self._hazed(colours[shown], depth).tolist() for colours in (self._wall_colours, self._glass))
-        shapes = zip(_subpixels(points[shown]), windows, strict=True)
+        points = placement.project(outlines)
+        seen &= (points[..., 0].max(axis=1) > 0) & (points[..., 0].min(axis=1) < placement.model.width_px)
+        visible = np.flatnonzero(seen)
+        depth = ahead[visible].mean(axis=1)
+        windows = [list(_subpixels(placement.project(walls.windows_m[wall]))) for wall in visible]
+        walls_and_glass = (
+            self._add_haze(colours[visible], depth).tolist() for colours in (self._wall_colours, self._glass)
+        )
+        shapes = zip(_subpixels(points[visible]), windows, strict=True)
         return zip(depth.tolist(), repeat(_facade), shapes, zip(*walls_and_glass, strict=True))
 
-    def _hazed(self, colours: FloatArray, depth_m: FloatArray) -> FloatArray:
+    def _add_haze(self, colours: FloatArray, depth_m: FloatArray) -> FloatArray:
         share = (1.0 - np.exp(-depth_m / HAZE_M))[:, None]
         return np.asarray(np.minimum(np.rint(colours * (1 - share) + self._haze * share), 255.0))
 
@@ -124,8 +129,8 @@ def _polygon(picture: Picture, polygon: NDArray[np.int32], colour: list[float]) 
     cv2.fillConvexPoly(picture, polygon, colour, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _line(picture: Picture, ends: list[list[int]], look: tuple[list[float], int]) -> None:
-    cv2.line(picture, ends[0], ends[1], look[0], look[1], cv2.LINE_AA, _SUBPIXEL_BITS)
+def _line(picture: Picture, ends: list[list[int]], style: tuple[list[float], int]) -> None:
+    cv2.line(picture, ends[0], ends[1], style[0], style[1], cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _facade(
@@ -137,14 +142,14 @@ def _facade(
     cv2.fillPoly(picture, shape[1], colours[1], cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _ahead(points_m: FloatArray, view: CameraPlacement) -> FloatArray:
-    """How far ahead of the camera points (..., 2) are."""
-    along = (points_m[..., 0] - view.x_m) * math.cos(view.heading_rad)
-    return np.asarray(along + (points_m[..., 1] - view.y_m) * math.sin(view.heading_rad))
+def _depth_m(points_m: FloatArray, placement: CameraPlacement) -> FloatArray:
+    """Return how far ahead of the camera points (..., 2) are."""
+    along = (points_m[..., 0] - placement.x_m) * math.cos(placement.heading_rad)
+    return np.asarray(along + (points_m[..., 1] - placement.y_m) * math.sin(placement.heading_rad))
 
 
-def _clipped(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
-    """Faces with the part that is not in front of the camera cut off; `ahead` (n, 2) is of their begin and end."""
+def _clip(corners_m: FloatArray, ahead: FloatArray) -> FloatArray:
+    """Clip faces to the part in front of the camera; `ahead` (n, 2) are the depths of their begin and end."""
     for near, far in ((0, 1), (1, 0)):
         cut = ahead[:, near] < _NEAR_M
         if cut.any():

@@ -1,4 +1,4 @@
-"""Shadows on the ground, of what stands beside the road and of clouds; they are painted into the ground's tiles."""
+"""Shadows of roadside objects and clouds, painted into the ground's tiles."""
 
 from __future__ import annotations
 
@@ -12,49 +12,51 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.roadside_objects import RoadsideObjects
 from lavt.vehicle.sim.rendering.sprites import TREE_WIDTH, tree_shape
 from lavt.vehicle.sim.rendering.textures import seamless_noise
-from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join, strips
+from lavt.vehicle.sim.road.strips import Grey, Square, Strips, join_strips, make_strips
 
 _CLOUD_TEXELS = 128
 _CLOUD_TEXEL_M = 6.0
 _CLOUD_DEPTH = 150.0
-"""How dark a cloud's shadow becomes, of 255: light comes through and around it."""
+"""The darkest value of a cloud's shadow, of 255: some light passes through and around the cloud."""
 _MARGIN_M = 1.0
 
 
 class Shadows:
-    """The shadows of one road's things in one light."""
+    """The shadows on one road in one light."""
 
-    def __init__(self, standing: RoadsideObjects, light: Light, *, clouds: bool) -> None:
-        self._falls = light.shadow_m
-        self._upright = join([_of_faces(standing, self._falls), _of_poles(standing.poles, self._falls)])
-        self._trees = standing.trees
-        ends = standing.trees[:, :2] + standing.trees[:, 2:3] * self._falls
-        reach = standing.trees[:, 2:3] * TREE_WIDTH / 2 + _MARGIN_M
+    def __init__(self, objects: RoadsideObjects, light: Light, *, clouds: bool) -> None:
+        self._shadow_m = light.shadow_m
+        self._upright = join_strips(
+            [_face_shadows(objects, self._shadow_m), _pole_shadows(objects.poles, self._shadow_m)]
+        )
+        self._trees = objects.trees
+        ends = objects.trees[:, :2] + objects.trees[:, 2:3] * self._shadow_m
+        reach = objects.trees[:, 2:3] * TREE_WIDTH / 2 + _MARGIN_M
         self._tree_boxes = np.concatenate(
-            [np.minimum(standing.trees[:, :2], ends) - reach, np.maximum(standing.trees[:, :2], ends) + reach], axis=1
+            [np.minimum(objects.trees[:, :2], ends) - reach, np.maximum(objects.trees[:, :2], ends) + reach], axis=1
         )
         self._clouds = _clouds() if clouds else None
 
     def mask(self, square: Square) -> Grey | None:
-        """How much of the sun is away, 0 to 255, for each texel of a square; None where it shines everywhere."""
+        """Return the share of sunlight missing in each texel of a square, 0 to 255; None without any shadow."""
         mask = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         if self._clouds is not None:
-            _lay_clouds(self._clouds, square, mask)
+            _draw_clouds(self._clouds, square, mask)
         self._upright.fill(mask, square, 255)
-        self._lay_trees(square, mask)
+        self._draw_trees(square, mask)
         return mask if mask.any() else None
 
-    def _lay_trees(self, square: Square, mask: Grey) -> None:
+    def _draw_trees(self, square: Square, mask: Grey) -> None:
         low = np.array([square.left_m, square.low_m])
         boxes = self._tree_boxes
-        touch = (boxes[:, :2] <= low + square.edge_m).all(axis=1) & (boxes[:, 2:] >= low).all(axis=1)
-        across = np.array([-self._falls[1], self._falls[0]]) / np.hypot(*self._falls)
-        for x_m, y_m, height_m, kind in self._trees[touch]:
+        overlapping = (boxes[:, :2] <= low + square.edge_m).all(axis=1) & (boxes[:, 2:] >= low).all(axis=1)
+        across = np.array([-self._shadow_m[1], self._shadow_m[0]]) / np.hypot(*self._shadow_m)
+        for x_m, y_m, height_m, kind in self._trees[overlapping]:
             shape = tree_shape(int(kind))
             rows, columns = shape.shape
-            # Rows of the shape run down the tree: its foot is at the last row, its top falls where the sun throws it.
+            # Rows of the shape run down the tree: the last row is its foot, the first is the shadow of its top.
             right = across * (height_m * TREE_WIDTH / columns)
-            down = -self._falls * (height_m / rows)
+            down = -self._shadow_m * (height_m / rows)
             foot = np.array([x_m, y_m])
             origin = foot - right * (columns - 1) / 2 - down * (rows - 1)
             ground_from_shape = np.column_stack([right, down, origin - low]) / square.scale_m
@@ -63,16 +65,16 @@ class Shadows:
             cv2.max(mask, cv2.warpAffine(shape, ground_from_shape, size, flags=cv2.INTER_LINEAR), mask)
 
 
-def _of_faces(standing: RoadsideObjects, falls: FloatArray) -> Strips:
-    """Shadows of rails, barriers, arms of lamps and walls."""
-    corners = np.concatenate([standing.faces.corners_m, standing.walls.outlines_m])
-    return strips(corners[..., :2] + corners[..., 2:] * falls)
+def _face_shadows(objects: RoadsideObjects, shadow_m: FloatArray) -> Strips:
+    """Return the shadows of rails, barriers, lamp arms and walls."""
+    corners = np.concatenate([objects.faces.corners_m, objects.walls.outlines_m])
+    return make_strips(corners[..., :2] + corners[..., 2:] * shadow_m)
 
 
-def _of_poles(poles: FloatArray, falls: FloatArray) -> Strips:
-    side = np.array([-falls[1], falls[0]]) / np.hypot(*falls) * poles[:, 4:] / 2
-    foot, top = poles[:, :2] + poles[:, 2:3] * falls, poles[:, :2] + poles[:, 3:4] * falls
-    return strips(np.stack([foot - side, foot + side, top + side, top - side], axis=1))
+def _pole_shadows(poles: FloatArray, shadow_m: FloatArray) -> Strips:
+    side = np.array([-shadow_m[1], shadow_m[0]]) / np.hypot(*shadow_m) * poles[:, 4:] / 2
+    foot, top = poles[:, :2] + poles[:, 2:3] * shadow_m, poles[:, :2] + poles[:, 3:4] * shadow_m
+    return make_strips(np.stack([foot - side, foot + side, top + side, top - side], axis=1))
 
 
 @lru_cache(maxsize=1)
@@ -83,7 +85,7 @@ def _clouds() -> Grey:
     return np.rint(np.clip((noise - 0.75) * 1.6, 0.0, 1.0) * _CLOUD_DEPTH).astype(np.uint8)
 
 
-def _lay_clouds(clouds: Grey, square: Square, mask: Grey) -> None:
+def _draw_clouds(clouds: Grey, square: Square, mask: Grey) -> None:
     texel = square.scale_m / _CLOUD_TEXEL_M
     matrix = np.array(
         [
@@ -91,7 +93,7 @@ def _lay_clouds(clouds: Grey, square: Square, mask: Grey) -> None:
             [0.0, texel, square.low_m / _CLOUD_TEXEL_M + texel / 2],
         ]
     )
-    # Brought near the origin first: what reads the pattern knows its far repeats, but not with all their digits.
+    # Reduce the offset to one period: `warpAffine` wraps the pattern, but loses precision far from the origin.
     matrix[:, 2] %= len(clouds)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     cv2.warpAffine(clouds, matrix, mask.shape, mask, flags, cv2.BORDER_WRAP)

@@ -1,4 +1,4 @@
-"""Trees and a bush, painted once for each light and scaled to what the camera sees of them."""
+"""Sprites of trees and a bush, painted once per light and scaled to their size in the picture."""
 
 from __future__ import annotations
 
@@ -15,86 +15,86 @@ from lavt.vehicle.sim.rendering.light import Light
 from lavt.vehicle.sim.rendering.textures import Grey
 
 TREE_KINDS = 5
-"""Three broad-leaved trees, a conifer, and last a bush."""
+"""Three broad-leaved trees, a conifer, and a bush as the last kind."""
 
 _WORLD_SEED = 0
 _HEIGHT_PX = 256
 _WIDTH_PX = 208
 TREE_WIDTH = _WIDTH_PX / _HEIGHT_PX
-"""Width of a tree's picture as a share of its height."""
+"""The width of a tree's sprite as a share of its height."""
 
 _SHADOW_REDUCTION = 4
-_LARGEST_KEPT_PX = 64
-_KEPT = 2000
+_MAX_CACHED_PX = 64
+_MAX_CACHED = 2000
 _HAZE_STEPS = 24
 
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """What a tree adds to a picture, and what it leaves of it, 0 to 255 (rows, columns, 3)."""
+    """A tree's premultiplied colour and the transmittance of the background, 0 to 255, (rows, columns, 3) each."""
 
-    adds: Picture
-    leaves: Picture
+    colour: Picture
+    transmittance: Picture
 
 
 class Trees:
-    """The trees in one light."""
+    """The sprites of all trees in one light."""
 
     def __init__(self, light: Light) -> None:
         self._light = light
-        self._kept: dict[tuple[int, bool, int, int], Sprite] = {}
+        self._cache: dict[tuple[int, bool, int, int], Sprite] = {}
 
     def prepare(self) -> None:
-        """Paint all trees beforehand."""
+        """Paint all trees in advance."""
         for kind in range(TREE_KINDS):
             for mirrored in (False, True):
-                _lit(self._light, kind, mirrored)
+                _lit_tree(self._light, kind, mirrored)
 
     def draw(self, picture: Picture, shape: Sequence[float], haze: float) -> None:
         """Draw a tree into `picture`; `haze` is the share of haze in its colour.
 
-        `shape` is where its foot is (u, v), how high it is in pixels, its kind, and whether it is mirrored.
+        `shape` is the position of its foot (u, v), its height in pixels, its kind, and whether it is mirrored.
         """
         foot_u, foot_v, height_px, kind, mirrored = shape
-        what = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
-        if height_px > _LARGEST_KEPT_PX:
-            self._draw_large(picture, what, height_px, (foot_u, foot_v))
+        variant = (int(kind), mirrored != 0, round(haze * _HAZE_STEPS))
+        if height_px > _MAX_CACHED_PX:
+            self._draw_large(picture, variant, height_px, (foot_u, foot_v))
             return
         rows = round(height_px)
-        sprite = self._small(*what, rows)
-        columns = sprite.adds.shape[1]
+        sprite = self._small_sprite(*variant, rows)
+        columns = sprite.colour.shape[1]
         left, top = round(foot_u - columns / 2), round(foot_v) - rows + 1
         low_u, high_u = max(left, 0), min(left + columns, picture.shape[1])
         low_v, high_v = max(top, 0), min(top + rows, picture.shape[0])
         if low_u < high_u and low_v < high_v:
             part = np.s_[low_v - top : high_v - top, low_u - left : high_u - left]
-            _lay(picture[low_v:high_v, low_u:high_u], sprite.adds[part], sprite.leaves[part])
+            _blend(picture[low_v:high_v, low_u:high_u], sprite.colour[part], sprite.transmittance[part])
 
-    def _small(self, kind: int, mirrored: bool, step: int, rows: int) -> Sprite:
+    def _small_sprite(self, kind: int, mirrored: bool, step: int, rows: int) -> Sprite:
         key = (kind, mirrored, step, rows)
-        sprite = self._kept.get(key)
+        sprite = self._cache.get(key)
         if sprite is None:
-            whole = _whole(self._light, kind, mirrored, step, 0)
+            full_size = _full_size_sprite(self._light, kind, mirrored, step, 0)
             size = (max(2, round(rows * TREE_WIDTH)), rows)
-            sprite = Sprite(_resized(whole.adds, size), _resized(whole.leaves, size))
-            if len(self._kept) >= _KEPT:
-                self._kept.clear()
-            self._kept[key] = sprite
+            sprite = Sprite(_resize(full_size.colour, size), _resize(full_size.transmittance, size))
+            if len(self._cache) >= _MAX_CACHED:
+                self._cache.clear()
+            self._cache[key] = sprite
         return sprite
 
     def _draw_large(
-        self, picture: Picture, what: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
+        self, picture: Picture, variant: tuple[int, bool, int], height_px: float, foot_px: tuple[float, float]
     ) -> None:
-        """Scale only what of the tree is in the picture, to fractions of a pixel: large trees would jump otherwise."""
+        """Draw only the visible part of a large tree, with subpixel scaling: otherwise large trees would jump."""
         width_px = height_px * TREE_WIDTH
         left, top = foot_px[0] - width_px / 2, foot_px[1] - height_px
         low_u, high_u = max(round(left), 0), min(round(left + width_px), picture.shape[1])
         low_v, high_v = max(round(top), 0), min(round(top + height_px), picture.shape[0])
         if low_u >= high_u or low_v >= high_v:
             return
-        kind, mirrored, step = what
-        whole = _whole(self._light, kind, mirrored, step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
-        scale = whole.adds.shape[0] / height_px
+        kind, mirrored, step = variant
+        full_size = _full_size_sprite(self._light, kind, mirrored, step, 1 if height_px < _HEIGHT_PX * 0.6 else 0)
+        scale = full_size.colour.shape[0] / height_px
         matrix = np.array(
             [
                 [scale, 0.0, (low_u - left + 0.5) * scale - 0.5],
@@ -102,48 +102,48 @@ class Trees:
             ]
         )
         size, flags = (high_u - low_u, high_v - low_v), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        adds = cv2.warpAffine(whole.adds, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        colour = cv2.warpAffine(full_size.colour, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT)
         border = (255.0, 255.0, 255.0)
-        leaves = cv2.warpAffine(
-            whole.leaves, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=border
+        transmittance = cv2.warpAffine(
+            full_size.transmittance, matrix, size, flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=border
         )
-        _lay(picture[low_v:high_v, low_u:high_u], np.asarray(adds, np.uint8), np.asarray(leaves, np.uint8))
+        _blend(picture[low_v:high_v, low_u:high_u], np.asarray(colour, np.uint8), np.asarray(transmittance, np.uint8))
 
 
-def _lay(under: Picture, adds: Picture, leaves: Picture) -> None:
-    cv2.multiply(under, leaves, under, 1 / 255)
-    cv2.add(under, adds, under)
+def _blend(under: Picture, colour: Picture, transmittance: Picture) -> None:
+    cv2.multiply(under, transmittance, under, 1 / 255)
+    cv2.add(under, colour, under)
 
 
-def _resized(image: Picture, size: tuple[int, int]) -> Picture:
+def _resize(image: Picture, size: tuple[int, int]) -> Picture:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 @lru_cache(maxsize=240)
-def _whole(light: Light, kind: int, mirrored: bool, step: int, halvings: int) -> Sprite:
-    """Make the sprite of a tree in full size, halved so many times."""
+def _full_size_sprite(light: Light, kind: int, mirrored: bool, step: int, halvings: int) -> Sprite:
+    """Return a tree's sprite in full size, halved `halvings` times."""
     if halvings:
-        larger = _whole(light, kind, mirrored, step, halvings - 1)
+        larger = _full_size_sprite(light, kind, mirrored, step, halvings - 1)
         size = (_WIDTH_PX >> halvings, _HEIGHT_PX >> halvings)
-        return Sprite(_resized(larger.adds, size), _resized(larger.leaves, size))
-    clear, hazed, leaves = _lit(light, kind, mirrored)
+        return Sprite(_resize(larger.colour, size), _resize(larger.transmittance, size))
+    clear, hazed, transmittance = _lit_tree(light, kind, mirrored)
     share = step / _HAZE_STEPS
-    return Sprite(np.asarray(cv2.addWeighted(clear, 1 - share, hazed, share, 0.0), dtype=np.uint8), leaves)
+    return Sprite(np.asarray(cv2.addWeighted(clear, 1 - share, hazed, share, 0.0), dtype=np.uint8), transmittance)
 
 
 @lru_cache(maxsize=6 * TREE_KINDS)
-def _lit(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture, Picture]:
-    """What a tree adds to a picture without haze and in nothing but haze, and what it leaves."""
-    colour, alpha = _painted(kind)
+def _lit_tree(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture, Picture]:
+    """Return a tree's colour without haze and in full haze, and its transmittance."""
+    colour, alpha = _paint_tree(kind)
     if mirrored:
         colour, alpha = colour[:, ::-1], alpha[:, ::-1]
-    # The painting is of a tree in the noon sun: its dark side takes the colour of shade, its bright one of the sun.
+    # The painted tree is in the noon sun: its dark side takes the colour of shade, its bright side that of the sun.
     brightness = np.clip(colour.mean(axis=2, keepdims=True) / 75.0, 0.0, 1.0)
     if light.shadows:
         factor = np.array(light.shade) * 1.7 * (1 - brightness) + np.array(light.lit) * brightness
         lit = colour * np.minimum(factor, 1.15)
     else:
-        # Under clouds light comes from everywhere: the picture loses most of its contrast.
+        # Under clouds light comes from all directions, so the tree loses most of its contrast.
         mean = colour[alpha > 0].mean(axis=0)
         lit = (mean + 0.45 * (colour - mean)) * np.array(light.lit)
     cover = alpha[..., None] / 255.0
@@ -153,15 +153,15 @@ def _lit(light: Light, kind: int, mirrored: bool) -> tuple[Picture, Picture, Pic
 
 @lru_cache(maxsize=TREE_KINDS)
 def tree_shape(kind: int) -> Grey:
-    """Outline of a tree as its shadow sees it, 0 to 255; small, so that the shadow's edge is soft."""
-    _, alpha = _painted(kind)
+    """Return a tree's silhouette for its shadow, 0 to 255; it is small, so that the shadow's edge is soft."""
+    _, alpha = _paint_tree(kind)
     size = (_WIDTH_PX // _SHADOW_REDUCTION, _HEIGHT_PX // _SHADOW_REDUCTION)
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 @lru_cache(maxsize=TREE_KINDS)
-def _painted(kind: int) -> tuple[Picture, Grey]:
-    """Colour (rows, columns, 3) and cover of a tree, the sun at its upper left."""
+def _paint_tree(kind: int) -> tuple[Picture, Grey]:
+    """Return the colour (rows, columns, 3) and opacity of a tree, with the sun at its upper left."""
     random = stream(_WORLD_SEED, "tree", kind)
     leaf = np.array([46.0, 92.0, 70.0]) * random.uniform(0.75, 1.1) + random.uniform(-8, 8, 3)
     colour = np.broadcast_to(np.clip(leaf * 0.55, 0, 255), (_HEIGHT_PX, _WIDTH_PX, 3)).astype(np.uint8).copy()
@@ -169,7 +169,7 @@ def _painted(kind: int) -> tuple[Picture, Grey]:
     middle = _WIDTH_PX // 2
     if kind != TREE_KINDS - 1:
         _paint_trunk(colour, alpha, middle, random)
-    for u, v, radius, light in _leaves(kind, random):
+    for u, v, radius, light in _leaf_tufts(kind, random):
         shade = np.clip(leaf * light + random.uniform(-5, 5, 3), 0, 255).tolist()
         centre, size = (round(u * 8), round(v * 8)), round(radius * 8)
         cv2.circle(colour, centre, size, shade, -1, cv2.LINE_AA, 3)
@@ -178,18 +178,18 @@ def _painted(kind: int) -> tuple[Picture, Grey]:
 
 
 def _paint_trunk(colour: Picture, alpha: Grey, middle: int, random: np.random.Generator) -> None:
-    ways = [((middle, _HEIGHT_PX), (middle, 120), 8)]
-    ways += [
+    branches = [((middle, _HEIGHT_PX), (middle, 120), 8)]
+    branches += [
         ((middle, round(v)), (round(middle + u), round(v - 60)), 4)
         for u, v in random.uniform((-50, 130), (50, 190), (5, 2))
     ]
-    for begin, end, width_px in ways:
+    for begin, end, width_px in branches:
         for image, paint in ((colour, (38, 50, 62)), (alpha, (255,))):
             cv2.line(image, begin, end, paint, width_px, cv2.LINE_AA)
 
 
-def _leaves(kind: int, random: np.random.Generator) -> FloatArray:
-    """Tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
+def _leaf_tufts(kind: int, random: np.random.Generator) -> FloatArray:
+    """Return tufts of leaves, back to front, (n, 4): u, v, radius in pixels, brightness."""
     count = 3200
     middle = _WIDTH_PX / 2
     if kind == 3:  # a conifer: a cone of tiers
@@ -210,19 +210,22 @@ def _leaves(kind: int, random: np.random.Generator) -> FloatArray:
 def _crown(
     kind: int, random: np.random.Generator, count: int, middle: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """A crown is made of clumps, each a ball of leaves with a bright and a dark side, before and behind each other."""
+    """Return u, v, brightness and nearness of a crown's tufts of leaves.
+
+    A crown consists of overlapping clumps, each a ball of leaves with a bright and a dark side.
+    """
     bush = kind == TREE_KINDS - 1
     clumps = 26
     half_height, centre_v, half_width = (84.0, 150.0, 70.0) if bush else (62.0, 96.0, 70.0)
     angle, away = random.uniform(0, 2 * np.pi, clumps), np.sqrt(random.uniform(0.02, 1, clumps))
     clump_u, clump_v = np.cos(angle) * away * half_width, np.sin(angle) * away * half_height
     clump_near, clump_size = random.uniform(0, 1, clumps), random.uniform(17.0, 30.0, clumps)
-    of = random.integers(0, clumps, count)
+    clump = random.integers(0, clumps, count)
     turn, out = random.uniform(0, 2 * np.pi, count), np.sqrt(random.uniform(0, 1, count)) ** 0.8
     u_in, v_in = np.cos(turn) * out, np.sin(turn) * out
-    u = middle + clump_u[of] + u_in * clump_size[of]
-    v = centre_v + clump_v[of] + v_in * clump_size[of]
+    u = middle + clump_u[clump] + u_in * clump_size[clump]
+    v = centre_v + clump_v[clump] + v_in * clump_size[clump]
     light = 0.80 - 0.26 * u_in - 0.34 * v_in
-    light += -0.14 * clump_u[of] / half_width - 0.26 * clump_v[of] / half_height + 0.16 * clump_near[of]
+    light += -0.14 * clump_u[clump] / half_width - 0.26 * clump_v[clump] / half_height + 0.16 * clump_near[clump]
     light += random.uniform(-0.16, 0.16, count)
-    return u, np.minimum(v, _HEIGHT_PX - 3.0), light, clump_near[of] + 0.25 * random.uniform(0, 1, count)
+    return u, np.minimum(v, _HEIGHT_PX - 3.0), light, clump_near[clump] + 0.25 * random.uniform(0, 1, count)

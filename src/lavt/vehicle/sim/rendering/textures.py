@@ -1,7 +1,7 @@
-"""Surfaces of the simulated world: seamless patterns of asphalt, grass, gravel and worn paint.
+"""Textures of the simulated world: seamless patterns of asphalt, grass, gravel and worn paint.
 
-A pattern repeats every `PERIOD_M` and is anchored to the world's frame. It is made once at the finest scale; each
-coarser one is the mean of the finer, so that the ground keeps its brightness from one band of the picture to the next.
+A pattern repeats every `PERIOD_M` and is anchored to the world frame. It is generated once at the finest scale; each
+coarser scale is the mean of the finer one, so the brightness is equal in all bands of the picture.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from lavt.streams import stream
 
 PERIOD_M = 32.0
 SCALES_M = (0.02, 0.04, 0.08, 0.16, 0.32)
-"""Metres a texel, finest first."""
+"""Metres per texel, finest first."""
 
 Grey = NDArray[np.uint8]
 Field = NDArray[np.float32]
 
 _WORLD_SEED = 0
-"""The world looks the same in every run; a run's seed moves only the sensor's noise."""
+"""The world is the same in every run; a run's seed changes only the sensor noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Textures:
-    """One period of each pattern at one scale; `wear` is the share of paint that is left, 0 to 255."""
+    """One period of each pattern at one scale; `wear` is the remaining share of paint, 0 to 255."""
 
     asphalt: Grey
     grass: Picture
@@ -39,28 +39,28 @@ class Textures:
 
 @lru_cache(maxsize=1)
 def all_textures() -> tuple[Textures, ...]:
-    """Make the patterns, one set for each of `SCALES_M` (about half a second the first time)."""
-    finest = _finest()
+    """Return the patterns, one set per scale of `SCALES_M`; the first call takes about half a second."""
+    finest = _make_finest()
     levels = [finest]
     for scale_m in SCALES_M[1:]:
         size = round(PERIOD_M / scale_m)
         last = levels[-1]
-        patterns = (_reduced(pattern, size) for pattern in (last.asphalt, last.grass, last.gravel, last.wear))
+        patterns = (_reduce(pattern, size) for pattern in (last.asphalt, last.grass, last.gravel, last.wear))
         levels.append(Textures(*patterns))
     return tuple(levels)
 
 
-def _reduced(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def _reduce(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def seamless_noise(name: str, size: int, cells: int) -> Field:
-    """Smooth random field (size x size, mean 0, deviation 1) of `cells` x `cells` bumps; its edges fit each other."""
+    """Return a smooth periodic random field (size x size, mean 0, deviation 1) of `cells` x `cells` bumps."""
     coarse = stream(_WORLD_SEED, name, cells).standard_normal((cells, cells))
     border = 4
     padded = np.pad(coarse, border, mode="wrap").astype(np.float32)
     scale = size / cells
-    # The inverse of what cv2.resize does, with whole coarse cells of border: texel i looks at (i + 0.5) / scale - 0.5.
+    # The coordinates of cv2.resize, with a border of whole coarse cells: texel i samples (i + 0.5) / scale - 0.5.
     index = ((np.arange(size) + 0.5) / scale - 0.5 + border).astype(np.float32)
     columns, rows = np.meshgrid(index, index)
     field = np.asarray(cv2.remap(padded, columns, rows, cv2.INTER_CUBIC), dtype=np.float32)
@@ -69,7 +69,7 @@ def seamless_noise(name: str, size: int, cells: int) -> Field:
     return field
 
 
-def _finest() -> Textures:
+def _make_finest() -> Textures:
     size = round(PERIOD_M / SCALES_M[0])
     grain = stream(_WORLD_SEED, "grain").standard_normal((size, size), dtype=np.float32)
     stones = seamless_noise("stones", size, size // 3)

@@ -1,1 +1,1 @@
-"""Roads: files, centre lines, cross-sections and markings."""
+"""Roads: files, centrelines, cross-sections and marks."""

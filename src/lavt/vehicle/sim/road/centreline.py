@@ -1,7 +1,7 @@
-"""The line a road follows: straight pieces, arcs and clothoids, one after the other, without a kink.
+"""The centreline of a road: straight segments, arcs and clothoids laid end to end with continuous heading.
 
-A station `s_m` is a distance along the line. Positions of lines and arcs are in closed form; a clothoid's are
-integrated with Gauss and Legendre's rule over pieces that turn by at most a radian, which is exact to a nanometre.
+A station `s_m` is a distance along the line. Positions on lines and arcs are in closed form. A clothoid's are
+integrated with the Gauss-Legendre rule over pieces that turn by at most a radian, which is exact to a nanometre.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _SHARES_ARRAY = (_NODES + 1) / 2
 _SHARES = tuple(zip(((_NODES + 1) / 2).tolist(), (_WEIGHTS / 2).tolist(), strict=True))
 _TURN_RAD = 1.0
-"""A clothoid is cut where it has turned by this much, so that the rule above holds for each piece."""
+"""A clothoid is split into pieces that turn by this much at most, so that the integration rule is exact for each."""
 
 _STRAIGHT_PER_M = 1e-12
-"""Less is taken as straight: over 20 km it makes 0.2 mm, and its inverse is no number to count with."""
+"""Less curvature counts as straight: over 20 km it amounts to 0.2 mm, and its inverse is too large to compute with."""
 
 _FOOT_M = 1e-9
 _FOOT_STEPS = 12
@@ -33,14 +33,14 @@ _FOOT_STEPS = 12
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A piece whose curvature (left positive) is linear in the arc length: a line, an arc or a clothoid."""
+    """A line, arc or clothoid: its curvature (left positive) is linear in the arc length."""
 
     length_m: float
     curvature_per_m: float
     end_curvature_per_m: float
 
-    def cut(self) -> list[Segment]:
-        """Cut a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
+    def split(self) -> list[Segment]:
+        """Split a clothoid into pieces that turn by a radian at most; lines and arcs stay whole."""
         if self.end_curvature_per_m == self.curvature_per_m:
             return [self]
         highest = max(abs(self.curvature_per_m), abs(self.end_curvature_per_m))
@@ -51,7 +51,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A segment in its place: first station, x, y, heading and curvature there, and the curvature's rate (1/m2)."""
+    """A placed segment: its first station, x, y, heading and curvature there, and the curvature's rate (1/m2)."""
 
     s_m: float
     x_m: float
@@ -61,11 +61,11 @@ class _Piece:
     rate_per_m2: float
 
     def turn_rad(self, along_m: float) -> float:
-        """How far the line has turned `along_m` into the piece."""
+        """Return the change of heading over the first `along_m` of the piece."""
         return along_m * (self.curvature_per_m + self.rate_per_m2 * along_m / 2)
 
-    def reached(self, along_m: float) -> tuple[float, float]:
-        """Place `along_m` into the piece, ahead and to the left of its beginning."""
+    def displacement(self, along_m: float) -> tuple[float, float]:
+        """Return the position `along_m` into the piece, ahead and to the left of its beginning."""
         if self.rate_per_m2 == 0.0:
             half_rad = self.curvature_per_m * along_m / 2
             chord_m = along_m if abs(half_rad) < 1e-9 else along_m * math.sin(half_rad) / half_rad
@@ -78,49 +78,49 @@ class _Piece:
         return ahead_m * along_m, left_m * along_m
 
 
-_Searched = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
+_SearchRow = tuple[float, float, float, float, float, float, float, float, float, "_Piece | None"]
 
 
 class Centreline:
-    """Segments laid end to end from a pose on; beyond both ends it goes straight on."""
+    """Segments laid end to end from a pose; beyond both ends the line continues straight."""
 
     def __init__(self, first_m: float, pose: tuple[float, float, float], segments: Sequence[Segment]) -> None:
         x_m, y_m, heading_rad = pose
         self._pieces: list[_Piece] = []
         s_m = first_m
-        # The straight pieces before and beyond are pieces like others; only where they begin and end is not known.
-        before = Segment(0.0, 0.0, 0.0)
-        for segment in (before, *(part for each in segments for part in each.cut()), before):
+        # The straight extensions at both ends are pieces like the others, without a known beginning or end.
+        open_end = Segment(0.0, 0.0, 0.0)
+        for segment in (open_end, *(part for each in segments for part in each.split()), open_end):
             length_m, curvature_per_m = segment.length_m, segment.curvature_per_m
             if abs(curvature_per_m) < _STRAIGHT_PER_M:
                 curvature_per_m = 0.0
             rate = (segment.end_curvature_per_m - curvature_per_m) / length_m if length_m else 0.0
             piece = _Piece(s_m, x_m, y_m, heading_rad, curvature_per_m, rate)
             self._pieces.append(piece)
-            ahead_m, left_m = _turned(*piece.reached(length_m), -heading_rad)
+            ahead_m, left_m = _rotate(*piece.displacement(length_m), -heading_rad)
             s_m += length_m
             x_m += ahead_m
             y_m += left_m
             heading_rad += piece.turn_rad(length_m)
         self.last_m = s_m
-        self._begins = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
+        self._begin_stations_m = [-math.inf, *(piece.s_m for piece in self._pieces[1:])]
 
     def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Tell x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, any shape."""
+        """Return x, y (m), heading (rad) and curvature (1/m) at the stations `s_m`, an array of any shape."""
         station = np.asarray(s_m, dtype=np.float64)
         table = self._table
-        piece = table[np.searchsorted(np.array(self._begins), station, side="right") - 1]
+        piece = table[np.searchsorted(np.array(self._begin_stations_m), station, side="right") - 1]
         begin_m, x0_m, y0_m, heading0_rad, curvature0, rate = (piece[..., column] for column in range(6))
         along = station - begin_m
         half_turn = curvature0 * along / 2
         chord = along * np.sinc(half_turn / np.pi)
         ahead, left = chord * np.cos(half_turn), chord * np.sin(half_turn)
-        bent = rate != 0.0
-        if bent.any():
+        clothoid = rate != 0.0
+        if clothoid.any():
             inner = along[..., None] * _SHARES_ARRAY
             turn = inner * (curvature0[..., None] + rate[..., None] * inner / 2)
-            ahead = np.where(bent, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
-            left = np.where(bent, np.sin(turn) @ _WEIGHTS / 2 * along, left)
+            ahead = np.where(clothoid, np.cos(turn) @ _WEIGHTS / 2 * along, ahead)
+            left = np.where(clothoid, np.sin(turn) @ _WEIGHTS / 2 * along, left)
         cosine, sine = np.cos(heading0_rad), np.sin(heading0_rad)
         return (
             x0_m + ahead * cosine - left * sine,
@@ -130,16 +130,16 @@ class Centreline:
         )
 
     def project(self, x_m: float, y_m: float, first_m: float, last_m: float) -> tuple[float, float, float, float]:
-        """Find the point nearest to a place among the stations from `first_m` to `last_m`.
+        """Project a position onto the line between the stations `first_m` and `last_m`.
 
-        Returns its station (m), the place's lateral offset (m, left positive), and heading (rad) and curvature (1/m)
-        of the line at the point.
+        Returns the nearest point's station (m), the position's lateral offset (m, left positive), and the line's
+        heading (rad) and curvature (1/m) at the point.
         """
         best = (first_m, math.inf, 0.0, 0.0)
         best_m = math.inf
-        searched = self._searched
-        for index in range(bisect_right(self._begins, first_m) - 1, len(searched)):
-            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = searched[index]
+        search_table = self._search_table
+        for index in range(bisect_right(self._begin_stations_m, first_m) - 1, len(search_table)):
+            begin_m, end_m, s_m, x0_m, y0_m, heading_rad, curvature_per_m, cosine, sine, piece = search_table[index]
             if begin_m > last_m:
                 break
             low_m = (max(first_m, begin_m)) - s_m
@@ -149,8 +149,8 @@ class Centreline:
             turn_rad = 0.0
             if piece is not None:
                 along_m = _foot_m(piece, ahead_m, left_m, low_m, high_m)
-                reached_m, turn_rad = piece.reached(along_m), piece.turn_rad(along_m)
-                ahead_m, left_m = _turned(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
+                reached_m, turn_rad = piece.displacement(along_m), piece.turn_rad(along_m)
+                ahead_m, left_m = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], turn_rad)
                 curvature_per_m += piece.rate_per_m2 * along_m
             elif curvature_per_m == 0.0:
                 along_m = low_m if ahead_m < low_m else min(ahead_m, high_m)
@@ -163,8 +163,9 @@ class Centreline:
                 ahead_m -= turned_sine / curvature_per_m
                 left_m -= (1.0 - turned_cosine) / curvature_per_m
                 ahead_m, left_m = (
-                    ahead_m * turned_cosine + left_m * turned_sine, left_m * turned_cosine - ahead_m * turned_sine
-                )  # fmt: skip
+                    ahead_m * turned_cosine + left_m * turned_sine,
+                    left_m * turned_cosine - ahead_m * turned_sine,
+                )
             distance_m = math.hypot(ahead_m, left_m)
             if distance_m < best_m:
                 best_m = distance_m
@@ -172,14 +173,16 @@ class Centreline:
         return best
 
     @cached_property
-    def _searched(self) -> list[_Searched]:
-        """For each piece what a projection needs, as plain numbers; the piece itself where it is a clothoid."""
-        found: list[_Searched] = []
-        for begin_m, end_m, each in zip(self._begins, [*self._begins[1:], math.inf], self._pieces, strict=True):
+    def _search_table(self) -> list[_SearchRow]:
+        """The values that a projection needs for each piece, as plain numbers; for a clothoid also the piece itself."""
+        rows: list[_SearchRow] = []
+        for begin_m, end_m, each in zip(
+            self._begin_stations_m, [*self._begin_stations_m[1:], math.inf], self._pieces, strict=True
+        ):
             place = (each.s_m, each.x_m, each.y_m, each.heading_rad, each.curvature_per_m)
-            bent = each if each.rate_per_m2 else None
-            found.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), bent))
-        return found
+            clothoid = each if each.rate_per_m2 else None
+            rows.append((begin_m, end_m, *place, math.cos(each.heading_rad), math.sin(each.heading_rad), clothoid))
+        return rows
 
     @cached_property
     def _table(self) -> FloatArray:
@@ -192,13 +195,13 @@ class Centreline:
 
 
 def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: float) -> float:
-    """Arc length to the foot of a point given in the frame of a clothoid's beginning, from `low_m` to `high_m`."""
+    """Return the arc length to a point's foot between `low_m` and `high_m`; the point is in the piece's first frame."""
     along_m = (low_m + high_m) / 2
     for _ in range(_FOOT_STEPS):
-        # The foot on the circle that fits the clothoid where we are; its error shrinks with the step's cube.
-        reached_m = piece.reached(along_m)
-        beside = _turned(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
-        step_m = _arc_foot_m(*beside, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
+        # Step to the foot on the clothoid's osculating circle; the error shrinks with the step's cube.
+        reached_m = piece.displacement(along_m)
+        offset = _rotate(ahead_m - reached_m[0], left_m - reached_m[1], piece.turn_rad(along_m))
+        step_m = _arc_foot_m(*offset, piece.curvature_per_m + piece.rate_per_m2 * along_m, 0.0)
         before_m, along_m = along_m, min(max(along_m + step_m, low_m), high_m)
         if abs(along_m - before_m) < _FOOT_M:
             break
@@ -206,7 +209,7 @@ def _foot_m(piece: _Piece, ahead_m: float, left_m: float, low_m: float, high_m: 
 
 
 def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m: float) -> float:
-    """Arc length to the foot of a point given in the frame of an arc's beginning; of all turns that at `middle_m`."""
+    """Return the arc length to a point's foot, on the turn nearest `middle_m`; the point is in the arc's frame."""
     if abs(curvature_per_m) < _STRAIGHT_PER_M:
         return ahead_m
     sign = math.copysign(1.0, curvature_per_m)
@@ -215,7 +218,7 @@ def _arc_foot_m(ahead_m: float, left_m: float, curvature_per_m: float, middle_m:
     return (middle_rad + math.remainder(turn_rad - middle_rad, 2 * math.pi)) / curvature_per_m
 
 
-def _turned(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
-    """Give a vector in a frame that is turned to the left by `turn_rad`."""
+def _rotate(ahead_m: float, left_m: float, turn_rad: float) -> tuple[float, float]:
+    """Return a vector's components in a frame that is turned to the left by `turn_rad`."""
     cosine, sine = math.cos(turn_rad), math.sin(turn_rad)
     return ahead_m * cosine + left_m * sine, left_m * cosine - ahead_m * sine

@@ -1,6 +1,6 @@
-"""What lies across a road: lanes, asphalt, marks, and what stops a car.
+"""The cross-section of a road: lanes, asphalt, marks, rails and barriers.
 
-Offsets are across, from the centre of the driven lane, left positive; stations are along it, 0 at the route's start.
+Offsets are lateral, from the centre of the driven lane, left positive. Stations are along it, 0 at the route's start.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import numpy as np
 from lavt.domain import FloatArray
 
 DASH_M, GAP_M = 3.0, 6.0
-"""Broken marks where a road does not say; the map of the six routes does not either, so this is our choice."""
+"""Default dash and gap of broken marks. Our choice, because the map of the six routes does not define them."""
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """The lanes of the driven direction, from the left; `driven` is the index of the one the reference runs in."""
+    """The lanes of the driven direction, from the left; `driven` is the index of the driven lane."""
 
     widths_m: tuple[float, ...]
     driven: int
 
     @property
     def left_edge_m(self) -> float:
-        """Lateral offset of the leftmost edge."""
+        """The lateral offset of the leftmost lane edge."""
         return sum(self.widths_m[: self.driven]) + self.widths_m[self.driven] / 2
 
     @cached_property
     def edges_m(self) -> tuple[float, ...]:
-        """Lateral offsets of all edges of lanes, from the right to the left."""
+        """The lateral offsets of all lane edges, from right to left."""
         edges = [self.left_edge_m]
         for width_m in self.widths_m:
             edges.append(edges[-1] - width_m)
@@ -51,7 +51,7 @@ class PavedArea:
 
 @dataclass(frozen=True, slots=True)
 class RoadMark:
-    """A painted line along the road, from one station to another; broken ones have dashes and gaps."""
+    """A painted line along the road between two stations; a broken mark has dashes and gaps."""
 
     offset_m: float
     kind: Literal["solid", "broken"]
@@ -62,10 +62,10 @@ class RoadMark:
     dash_m: float = DASH_M
     gap_m: float = GAP_M
     dash_at_m: float = 0.0
-    """Where a dash begins, and so all others."""
+    """A station where a dash begins, which fixes all other dashes."""
 
     def dashes_m(self, first_m: float, last_m: float) -> FloatArray:
-        """Stations where the whole dashes of a broken mark begin that lie between two stations and in its range."""
+        """Return the first stations of the mark's whole dashes between two stations, within its range."""
         first_m, last_m = max(self.from_m, first_m), min(self.to_m, last_m)
         period_m = self.dash_m + self.gap_m
         counts = np.arange(
@@ -77,7 +77,7 @@ class RoadMark:
 
 @dataclass(frozen=True, slots=True)
 class Rail:
-    """Something along the road that stops a car: a steel guard rail or a concrete barrier."""
+    """An obstacle along the road that stops a car: a steel guard rail or a concrete barrier."""
 
     offset_m: float
     kind: Literal["rail", "barrier"]
@@ -88,6 +88,6 @@ class Rail:
 Along = TypeVar("Along", PavedArea, RoadMark, Rail)
 
 
-def moved_start(each: Along, by_m: float) -> Along:
-    """Count stations from a place `by_m` further on."""
+def shift_stations(each: Along, by_m: float) -> Along:
+    """Return `each` with its stations counted from a point `by_m` further on."""
     return replace(each, from_m=each.from_m - by_m, to_m=each.to_m - by_m)

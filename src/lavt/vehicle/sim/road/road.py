@@ -1,7 +1,7 @@
-"""A road as data: the centre of the driven lane as lines, arcs and clothoids, and what lies across it.
+"""A road as data: the centre of the driven lane as lines, arcs and clothoids, and the cross-section.
 
-The reference is the centre of the driven lane. A station `s_m` is a distance along it, 0 at the route's start; a
-lateral offset is across it, left positive. Roads are flat. Their files are explained in `docs/roads.md`.
+The reference line is the centre of the driven lane. A station `s_m` is a distance along it, 0 at the route's start; a
+lateral offset is across it, left positive. Roads are flat. `docs/roads.md` describes their files.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from numpy.typing import ArrayLike
 from lavt.domain import FloatArray
 from lavt.errors import UserError
 from lavt.vehicle.sim.road.centreline import Centreline, Segment
-from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, moved_start
+from lavt.vehicle.sim.road.cross_section import Lanes, PavedArea, Rail, RoadMark, shift_stations
 from lavt.vehicle.sim.road.road_file import RoadFile, read_road_file
 
 PROJECTION_WINDOW_M = 15.0
-"""How far from the last known station a projection looks: a search of the whole road may jump to a far carriageway."""
+"""Range of a projection around the last known station; searching the whole road could find another part of it."""
 
 
 @dataclass(frozen=True)
 class Road:
     """A road and the route on it.
 
-    The route is stations 0 to `length_m`; the segments begin at station `first_m`, before the start, with the pose
-    `origin` (x, y in m, heading in rad, the world's frame), and go on beyond the end. Beyond both ends it is straight.
+    The route is stations 0 to `length_m`. The segments begin at station `first_m`, before the start, with the pose
+    `origin` (x, y in m, heading in rad, world frame), and end beyond the route's end. Beyond them the road is straight.
     """
 
     title: str
@@ -45,44 +45,46 @@ class Road:
 
     @cached_property
     def last_m(self) -> float:
-        """Station where the last segment ends."""
+        """The station where the last segment ends."""
         return self._centreline.last_m
 
     @cached_property
     def start(self) -> tuple[float, float, float]:
-        """x, y (m) and heading (rad) of the route's start, in the world's frame."""
+        """The pose of the route's start in the world frame: x, y (m) and heading (rad)."""
         x_m, y_m, heading_rad, _ = self.point(0.0)
         return float(x_m), float(y_m), float(heading_rad)
 
     def point(self, s_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Tell x, y (m), heading (rad) and curvature (1/m) of the lane's centre at the stations `s_m`, any shape."""
+        """Return x, y (m), heading (rad) and curvature (1/m) of the lane's centre at the stations `s_m`, any shape."""
         return self._centreline.point(s_m)
 
     def across(self, s_m: ArrayLike, offset_m: ArrayLike) -> FloatArray:
-        """World x, y (m) of the points at stations `s_m` and lateral offsets `offset_m`: shape (..., 2)."""
+        """Return world x, y (m) of the points at stations `s_m` and lateral offsets `offset_m`, shape (..., 2)."""
         x_m, y_m, heading_rad, _ = self.point(s_m)
         offset = np.asarray(offset_m, dtype=np.float64)
         return np.stack([x_m - offset * np.sin(heading_rad), y_m + offset * np.cos(heading_rad)], axis=-1)
 
     def project(self, x_m: float, y_m: float, near_s_m: float) -> tuple[float, float, float]:
-        """Find the point of the lane's centre nearest to a place.
+        """Project a position onto the lane's centre.
 
-        Only stations within `PROJECTION_WINDOW_M` of `near_s_m` are looked at. Returns the point's station (m), the
-        place's lateral offset (m, left positive) and the lane's heading (rad) there.
+        The search covers the stations within `PROJECTION_WINDOW_M` of `near_s_m`. Returns the nearest point's station
+        (m), the position's lateral offset (m, left positive) and the lane's heading (rad) at the point.
         """
         window_m = PROJECTION_WINDOW_M
         return self._centreline.project(x_m, y_m, near_s_m - window_m, near_s_m + window_m)[:3]
 
-    def part(self, title: str, from_m: float, length_m: float) -> Road:
-        """Give the same road with a route that begins at station `from_m`: nothing on the ground changes."""
+    def sub_route(self, title: str, from_m: float, length_m: float) -> Road:
+        """Return the same road with a route that begins at station `from_m`; nothing on the ground changes."""
         return replace(
             self,
             title=title,
             first_m=self.first_m - from_m,
             length_m=length_m,
-            paved=tuple(moved_start(each, from_m) for each in self.paved),
-            marks=tuple(replace(moved_start(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks),
-            rails=tuple(moved_start(each, from_m) for each in self.rails),
+            paved=tuple(shift_stations(each, from_m) for each in self.paved),
+            marks=tuple(
+                replace(shift_stations(each, from_m), dash_at_m=each.dash_at_m - from_m) for each in self.marks
+            ),
+            rails=tuple(shift_stations(each, from_m) for each in self.rails),
         )
 
     @cached_property
@@ -91,43 +93,46 @@ class Road:
 
 
 def road_names() -> list[str]:
-    """Names of the roads that come with the package, sorted."""
+    """Return the sorted names of the roads that come with LAVT."""
     folder = resources.files("lavt") / "data" / "roads"
     return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
 def load_road(name: str) -> Road:
-    """Read the road that comes with LAVT under `name`, or the one in the file of that path.
+    """Load the road that comes with LAVT under `name`, or the road file at that path.
 
-    Raises `UserError` where there is none, and for what is wrong in a file.
+    Raises `UserError` if there is no such road, or if its file is invalid.
     """
-    return parse_road(*_text_of(name))
+    return parse_road(*_read_text(name))
 
 
 def parse_road(text: str, source: str) -> Road:
-    """Read a road from YAML text; `UserError` that names `source` and the key when a key or a value is wrong.
+    """Parse a road from YAML text.
 
-    A part of a road names a road that comes with LAVT, or a file beside its own.
+    Raises `UserError`, which names `source` and the key, if a key or a value is invalid. `part_of` names a road that
+    comes with LAVT, or a file relative to the directory of `source`.
     """
     read = read_road_file(text, source)
     if isinstance(read, RoadFile):
-        return _whole(read)
+        return _make_road(read)
     try:
-        of_file = read_road_file(*_text_of(_beside(source, read.part_of)))
+        whole_file = read_road_file(*_read_text(_resolve_part_of(source, read.part_of)))
     except UserError as error:
         raise UserError(f"{source} is a part of {read.part_of}: {error}") from error
-    if not isinstance(of_file, RoadFile):
-        raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole as part_of")
-    whole = _whole(of_file)
-    room_m = whole.last_m - read.from_m
-    if room_m <= 0.0:
+    if not isinstance(whole_file, RoadFile):
+        raise UserError(f"{source}: {read.part_of} is itself a part of a road: name the whole road as part_of")
+    whole = _make_road(whole_file)
+    available_m = whole.last_m - read.from_m
+    if available_m <= 0.0:
         raise UserError(f"{source}: {read.part_of} ends at {whole.last_m:.1f} m: from_m must be less")
-    if read.length_m > room_m:
-        raise UserError(f"{source}: {read.part_of} has only {room_m:.1f} m from {read.from_m} m on: shorten length_m")
-    return whole.part(read.title, read.from_m, read.length_m)
+    if read.length_m > available_m:
+        raise UserError(
+            f"{source}: {read.part_of} has only {available_m:.1f} m from {read.from_m} m on: shorten length_m"
+        )
+    return whole.sub_route(read.title, read.from_m, read.length_m)
 
 
-def _whole(read: RoadFile) -> Road:
+def _make_road(read: RoadFile) -> Road:
     x_m, y_m, heading_rad = read.start
     run_in_m = read.run_in_m
     return Road(
@@ -143,8 +148,8 @@ def _whole(read: RoadFile) -> Road:
     )
 
 
-def _text_of(name: str) -> tuple[str, str]:
-    """Read the file of a road; give its text and what to call it."""
+def _read_text(name: str) -> tuple[str, str]:
+    """Read a road's file and return its text and its display name."""
     if name in road_names():
         file = resources.files("lavt") / "data" / "roads" / f"{name}.yaml"
         return file.read_text(encoding="utf-8"), f"{name}.yaml"
@@ -156,9 +161,9 @@ def _text_of(name: str) -> tuple[str, str]:
         return Path(name).read_text(encoding="utf-8"), name
     except OSError as error:
         raise UserError(f"the road {name} cannot be read ({error.strerror}): name an existing file") from error
-    except ValueError as error:  # bytes that are no text, a path with a zero in it
+    except ValueError as error:  # bytes that are not text, or a path with a null character
         raise UserError(f"the road {name} is not a text file: {error}") from error
 
 
-def _beside(source: str, part_of: str) -> str:
+def _resolve_part_of(source: str, part_of: str) -> str:
     return part_of if part_of in road_names() else str(Path(source).parent / part_of)

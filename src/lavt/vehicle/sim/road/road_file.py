@@ -1,4 +1,4 @@
-"""The files of roads: their keys, their defaults, and what is refused. `docs/roads.md` explains them to people."""
+"""The schema of road files: their keys, defaults and checks. `docs/roads.md` is the users' description."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from lavt.vehicle.sim.road.centreline import Segment
 from lavt.vehicle.sim.road.cross_section import DASH_M, GAP_M, Lanes, PavedArea, Rail, RoadMark
 
 SOLID_M = 0.125
-"""Width of a mark where a file does not say: that of the map the six routes come from."""
+"""Default width of a mark, that of the map the six routes come from."""
 
 TIGHTEST_PER_M = 0.2
-"""A car with a turning circle of 5 m can just follow."""
+"""The largest curvature, which a car with a turning radius of 5 m can just follow."""
 
 SHORTEST_M = 10.0
-"""Of a route: cars start up to 2 m into it."""
+"""The shortest route; cars start up to 2 m into it."""
 
 SHORTEST_DASH_M = 0.1
-"""Of a dash and of a gap: hundreds of thousands on a road take minutes to draw, and nobody sees them."""
+"""The shortest dash and gap; hundreds of thousands of dashes would take minutes to draw and be invisible."""
 
 INNER_SHARE = 0.1
 """The inner edge of the road must keep this share of the centre's length in a curve."""
@@ -45,7 +45,7 @@ Title = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
 
 
 class _Keys(BaseModel):
-    """A mapping of a road's file: no unknown keys."""
+    """A mapping in a road file, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -102,7 +102,7 @@ class _RailKeys(_Along):
 
 
 class PartFile(_Keys):
-    """A route on the road of another file, from a station of that file's route on."""
+    """A file with a route on the road of another file, from a station of that file's route."""
 
     title: Title
     part_of: Annotated[str, Field(strict=True, min_length=1)]
@@ -111,7 +111,7 @@ class PartFile(_Keys):
 
 
 class RoadFile(_Keys):
-    """A road of its own; every key but `title` and `segments` has a default."""
+    """A file with a complete road; every key but `title` and `segments` has a default."""
 
     title: Title
     segments: Annotated[list[_SegmentKeys], Field(min_length=1, max_length=1000)]
@@ -127,33 +127,33 @@ class RoadFile(_Keys):
 
     @property
     def start(self) -> tuple[float, float, float]:
-        """Pose of station 0: x, y (m), heading (rad)."""
+        """The pose of station 0: x, y (m), heading (rad)."""
         return self.origin.x_m, self.origin.y_m, self.origin.heading_rad
 
     @property
-    def laid_m(self) -> float:
-        """Length of all segments together."""
+    def segments_length_m(self) -> float:
+        """The total length of the segments."""
         return sum(each.length_m for each in self.segments)
 
     @property
     def route_m(self) -> float:
-        """Length of the route: as far as the segments go, where the file does not say."""
-        return self.laid_m if self.length_m is None else self.length_m
+        """The length of the route, by default that of all segments."""
+        return self.segments_length_m if self.length_m is None else self.length_m
 
     @property
     def all_segments(self) -> tuple[Segment, ...]:
-        """Segments with the straight run-in before and the straight run-out after."""
+        """The segments with the straight run-in before and the straight run-out after them."""
         run_in, run_out = Segment(self.run_in_m, 0.0, 0.0), Segment(self.run_out_m, 0.0, 0.0)
         return run_in, *(each.segment() for each in self.segments), run_out
 
     @property
     def lanes(self) -> Lanes:
-        """Lanes of the driven direction."""
+        """The lanes of the driven direction."""
         return Lanes(tuple(self.lane_keys.widths_m), self.lane_keys.driven)
 
     @property
     def all_paved(self) -> tuple[PavedArea, ...]:
-        """Strips of asphalt: the lanes and their shoulders, where the file does not say."""
+        """The strips of asphalt, by default the lanes and their shoulders."""
         if self.paved is not None:
             return tuple(PavedArea(**dict(each)) for each in self.paved)
         edges_m, shoulders = self.lanes.edges_m, self.shoulders or _ShoulderKeys()
@@ -161,7 +161,7 @@ class RoadFile(_Keys):
 
     @property
     def all_marks(self) -> tuple[RoadMark, ...]:
-        """Marks: solid at both edges and broken between lanes, all white, where the file does not say."""
+        """The marks, by default white: solid at both edges and broken between lanes."""
         if self.marks is not None:
             return tuple(RoadMark(**dict(each)) for each in self.marks)
         edges_m = self.lanes.edges_m
@@ -172,24 +172,24 @@ class RoadFile(_Keys):
 
     @property
     def rails(self) -> tuple[Rail, ...]:
-        """Rails and barriers."""
+        """The rails and barriers."""
         return tuple(Rail(**dict(each)) for each in self.rail_keys)
 
 
-@functools.lru_cache(maxsize=32)  # a sweep drives the same roads again and again, and YAML takes 7 ms
+@functools.lru_cache(maxsize=32)  # a sweep loads the same roads repeatedly, and parsing YAML takes 7 ms
 def read_road_file(text: str, source: str) -> RoadFile | PartFile:
-    """Read a road's file; `UserError` that names `source` and what is wrong."""
+    """Parse a road file; raise a `UserError` that names `source` and the problems."""
     try:
         data = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
         raise UserError(f"{source} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
-        raise UserError(f"{source} must hold keys and values, as docs/roads.md shows, not a {type(data).__name__}")
+        raise UserError(f"{source} must contain keys and values, as docs/roads.md shows, not a {type(data).__name__}")
     kind = PartFile if "part_of" in data else RoadFile
     try:
         read = kind.model_validate(data)
     except ValidationError as error:
-        problems = "; ".join(_sentence(kind, problem) for problem in error.errors())
+        problems = "; ".join(_describe_error(kind, problem) for problem in error.errors())
         raise UserError(f"{source} is not a road: {problems}") from error
     if isinstance(read, RoadFile):
         for problem in _problems(read):
@@ -198,32 +198,33 @@ def read_road_file(text: str, source: str) -> RoadFile | PartFile:
 
 
 def _problems(road: RoadFile) -> Iterable[str]:
-    """Find what no key shows by itself."""
+    """Yield the problems that concern more than one key."""
     lanes = road.lane_keys
     if lanes.driven >= len(lanes.widths_m):
         yield f"lanes.driven is {lanes.driven}, but lanes count from 0 to {len(lanes.widths_m) - 1}"
         return
     if road.paved is not None and road.shoulders is not None:
-        yield "paved says where all asphalt is, so leave out shoulders"
+        yield "paved defines all asphalt: leave out shoulders"
+    begin_m, end_m = -road.run_in_m, road.segments_length_m + road.run_out_m
     for name, each in _ranges(road):
         if each.from_m >= each.to_m:
             yield f"{name} goes from {each.from_m} m to {each.to_m} m: from_m must be less than to_m"
-        if each.to_m <= -road.run_in_m or each.from_m >= road.laid_m + road.run_out_m:
-            yield f"{name} is not on the road, which lies from {-road.run_in_m} m to {road.laid_m + road.run_out_m} m"
+        if each.to_m <= begin_m or each.from_m >= end_m:
+            yield f"{name} is not on the road, which lies from {begin_m} m to {end_m} m"
     for index, rail in enumerate(road.rails):
         if abs(rail.offset_m) <= lanes.widths_m[lanes.driven] / 2:
-            yield f"rails.{index} stands in the driven lane, at {rail.offset_m} m: move it out"
+            yield f"rails.{index} is in the driven lane, at {rail.offset_m} m: move it out"
     for strip in road.all_paved:
         if strip.left_m <= strip.right_m:
             yield f"a strip of paved has left_m {strip.left_m} and right_m {strip.right_m}: left is the greater offset"
-    if road.laid_m > 20_000:
-        yield f"the segments are {road.laid_m:.0f} m long: 20 km are enough"
+    if road.segments_length_m > 20_000:
+        yield f"the segments are {road.segments_length_m:.0f} m long: 20 km are enough"
     elif road.route_m < SHORTEST_M:
-        yield f"the segments are only {road.laid_m:g} m long: a route has at least {SHORTEST_M:g} m"
-    elif road.route_m > road.laid_m:
-        yield f"length_m is {road.route_m}, but the segments are only {road.laid_m:.3f} m long: add to them"
-    yield from _too_tight(road)
-    yield from _not_paved(road)
+        yield f"the segments are only {road.segments_length_m:g} m long: a route has at least {SHORTEST_M:g} m"
+    elif road.route_m > road.segments_length_m:
+        yield f"length_m is {road.route_m}, but the segments are only {road.segments_length_m:.3f} m long: add to them"
+    yield from _find_tight_curves(road)
+    yield from _find_unpaved(road)
 
 
 def _ranges(road: RoadFile) -> Iterable[tuple[str, _Along]]:
@@ -232,8 +233,8 @@ def _ranges(road: RoadFile) -> Iterable[tuple[str, _Along]]:
             yield f"{name}.{index}", along
 
 
-def _too_tight(road: RoadFile) -> Iterable[str]:
-    """In a curve, what lies inside must not reach the circle's middle."""
+def _find_tight_curves(road: RoadFile) -> Iterable[str]:
+    """Yield a problem where the inner side of a curve reaches the circle's centre."""
     offsets = [
         *road.lanes.edges_m,
         *(mark.offset_m for mark in road.all_marks),
@@ -241,19 +242,19 @@ def _too_tight(road: RoadFile) -> Iterable[str]:
     ]
     offsets += [edge for strip in road.all_paved for edge in (strip.left_m, strip.right_m)]
     for index, segment in enumerate(road.segments):
-        laid = segment.segment()
-        for curvature in (laid.curvature_per_m, laid.end_curvature_per_m):
-            inside = max(offset * curvature for offset in offsets)
-            if inside > 1.0 - INNER_SHARE:
+        placed = segment.segment()
+        for curvature in (placed.curvature_per_m, placed.end_curvature_per_m):
+            reach = max(offset * curvature for offset in offsets)
+            if reach > 1.0 - INNER_SHARE:
                 yield (
                     f"segments.{index} has a radius of {abs(1 / curvature):.1f} m, but the road reaches "
-                    f"{abs(inside / curvature):.1f} m to the inside of the curve: make one wider or the other narrower"
+                    f"{abs(reach / curvature):.1f} m to the inside of the curve: make one wider or the other narrower"
                 )
                 return
 
 
-def _not_paved(road: RoadFile) -> Iterable[str]:
-    """The driven lane must lie on asphalt all along the route."""
+def _find_unpaved(road: RoadFile) -> Iterable[str]:
+    """Yield a problem where the driven lane is not on asphalt along the whole route."""
     half_m = road.lanes.widths_m[road.lanes.driven] / 2
     strips = road.all_paved
     cuts = sorted({0.0, road.route_m, *(each for strip in strips for each in (strip.from_m, strip.to_m))})
@@ -267,31 +268,31 @@ def _not_paved(road: RoadFile) -> Iterable[str]:
             return
 
 
-def _sentence(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
-    """Say in words what is wrong with one value."""
+def _describe_error(kind: type[BaseModel], problem: Mapping[str, Any]) -> str:
+    """Return a sentence about one invalid value."""
     location = [str(part)[:60] for part in problem["loc"]]
     where = ".".join(location)
     if problem["type"] == "extra_forbidden":
-        known = _known(kind, problem["loc"][:-1])
+        known = _known_keys(kind, problem["loc"][:-1])
         near = difflib.get_close_matches(location[-1], known, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(sorted(known))}"
+        hint = f"did you mean {near[0]!r}?" if near else f"the known keys are {', '.join(sorted(known))}"
         return f"unknown key {where!r}: {hint}"
     if problem["type"] == "missing":
-        return f"{where!r} is missing: give it"
+        return f"{where!r} is missing: add it"
     if problem["type"] == "model_type":
-        return f"{where!r} must hold keys and values, not {_shown(problem['input'])}"
-    return f"{where!r}: {problem['msg']}, not {_shown(problem['input'])}"
+        return f"{where!r} must contain keys and values, not {_format_value(problem['input'])}"
+    return f"{where!r}: {problem['msg']}, not {_format_value(problem['input'])}"
 
 
-def _shown(value: Any) -> str:
-    """Show a value, or of what kind it is: lists may be made of themselves, and numbers have thousands of digits."""
+def _format_value(value: Any) -> str:
+    """Return a value as text, or only its type: lists may contain themselves, and integers may be huge."""
     if not isinstance(value, str | int | float | None) or (isinstance(value, int) and value.bit_length() > 64):
         return f"this {type(value).__name__}"
     shown = repr(value)
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
-_INNER: dict[str, type[BaseModel]] = {
+_SECTION_MODELS: dict[str, type[BaseModel]] = {
     "origin": _OriginKeys,
     "segments": _SegmentKeys,
     "lanes": _LaneKeys,
@@ -302,6 +303,6 @@ _INNER: dict[str, type[BaseModel]] = {
 }
 
 
-def _known(kind: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    inner = _INNER[location[0]] if location else kind
+def _known_keys(kind: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
+    inner = _SECTION_MODELS[location[0]] if location else kind
     return [field.alias or name for name, field in inner.model_fields.items()]

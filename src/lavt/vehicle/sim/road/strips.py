@@ -1,4 +1,4 @@
-"""Quadrilaterals on the ground, along a road or anywhere, and how they are painted into a tile."""
+"""Quadrilaterals on the ground, along a road or elsewhere, and their rasterisation into a tile."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from lavt.vehicle.sim.road.road import Road
 Grey = NDArray[np.uint8]
 
 OVERLAP_M = 0.03
-"""How far a piece reaches into the next one, so that no gap is seen."""
+"""The overlap of a piece with the next one, so that no gap is visible."""
 
 PIECE_M = 2.0
-"""Longest straight piece of what bends with the road."""
+"""The longest straight piece of a strip that follows the road."""
 
 _SUBPIXEL_BITS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """A square of ground that is painted: its low corner in the world's frame, its edge, and metres a texel."""
+    """A square of ground: its lower left corner in the world frame, the length of its edge, and metres per texel."""
 
     left_m: float
     low_m: float
@@ -34,7 +34,7 @@ class Square:
 
     @property
     def pixels(self) -> int:
-        """Texels along an edge."""
+        """The number of texels along an edge."""
         return round(self.edge_m / self.scale_m)
 
 
@@ -46,40 +46,40 @@ class Strips:
     boxes_m: FloatArray
 
     def fill(self, mask: Grey, square: Square, value: int) -> bool:
-        """Paint `value` into the mask of a square wherever these are; tell whether any was near."""
+        """Paint `value` into the mask of a square where the strips are; return whether any was near the square."""
         boxes = self.boxes_m
-        touch = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
-        touch &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
-        near = self.corners_m[touch]
+        overlapping = (boxes[:, 0] <= square.left_m + square.edge_m) & (boxes[:, 2] >= square.left_m)
+        overlapping &= (boxes[:, 1] <= square.low_m + square.edge_m) & (boxes[:, 3] >= square.low_m)
+        near = self.corners_m[overlapping]
         corners_px = (near - np.array([square.left_m, square.low_m])) / square.scale_m - 0.5
         for polygon in np.rint(corners_px * (1 << _SUBPIXEL_BITS)).astype(np.int32):
             cv2.fillConvexPoly(mask, polygon, (value,), lineType=cv2.LINE_AA, shift=_SUBPIXEL_BITS)
         return len(near) > 0
 
     def mask(self, square: Square) -> Grey | None:
-        """Make a mask of these; None when none is in the square."""
+        """Return a mask of the strips in a square; None when there are none."""
         mask = np.zeros((square.pixels, square.pixels), dtype=np.uint8)
         return mask if self.fill(mask, square, 255) and mask.any() else None
 
 
-def strips(corners_m: FloatArray) -> Strips:
-    """Make strips of corners (n, 4, 2)."""
+def make_strips(corners_m: FloatArray) -> Strips:
+    """Create strips from corners (n, 4, 2)."""
     return Strips(corners_m, np.concatenate([corners_m.min(axis=1), corners_m.max(axis=1)], axis=1))
 
 
-def join(found: Sequence[Strips]) -> Strips:
-    """Put strips together."""
-    return strips(np.concatenate([np.empty((0, 4, 2)), *(each.corners_m for each in found)]))
+def join_strips(found: Sequence[Strips]) -> Strips:
+    """Concatenate strips."""
+    return make_strips(np.concatenate([np.empty((0, 4, 2)), *(each.corners_m for each in found)]))
 
 
-def along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
-    """Lay a strip along the road between two lateral offsets, cut into short pieces."""
+def strip_along(road: Road, left_m: float, right_m: float, from_m: float = -np.inf, to_m: float = np.inf) -> Strips:
+    """Create a strip along the road between two lateral offsets, divided into short pieces."""
     first_m, last_m = max(from_m, road.first_m), min(to_m, road.last_m)
     cuts = np.linspace(first_m, last_m, max(2, round((last_m - first_m) / PIECE_M) + 1))
-    return pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
+    return strip_pieces(road, left_m, right_m, cuts[:-1], cuts[1:] + OVERLAP_M)
 
 
-def pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
-    """Quadrilaterals between stations `begin_m` and `end_m` (n,) and two lateral offsets."""
+def strip_pieces(road: Road, left_m: ArrayLike, right_m: ArrayLike, begin_m: FloatArray, end_m: FloatArray) -> Strips:
+    """Create the quadrilaterals between the stations `begin_m` and `end_m` (n,) and two lateral offsets."""
     ends = [(begin_m, left_m), (begin_m, right_m), (end_m, right_m), (end_m, left_m)]
-    return strips(np.stack([road.across(station, offset) for station, offset in ends], axis=1))
+    return make_strips(np.stack([road.across(station, offset) for station, offset in ends], axis=1))

@@ -1,4 +1,4 @@
-"""The proof that a kit's watchdog brakes: made of what `lavt can prove` saw, held against a config before arming."""
+"""The proof of a passed watchdog test: `lavt can test-watchdog` writes it, and arming requires it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from lavt.domain import NS_PER_MS
 from lavt.errors import UserError
 from lavt.vehicle.dbw.bus import is_virtual
 from lavt.vehicle.dbw.profile import Profile
-from lavt.vehicle.dbw.proving import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
+from lavt.vehicle.dbw.watchdog_test import BRAKE, BRAKE_WITHIN_NS, WatchdogObservation
 
-AGAIN = "run `lavt can prove`"
+RUN_TEST = "run `lavt can test-watchdog`"
 
 
-def proof_of(seen: WatchdogObservation, gear: str, profile: Profile, config: DbwConfig, wall_ns: int) -> WatchdogProof:
-    """Make the proof of what was seen on a config's bus."""
+def new_proof(
+    observation: WatchdogObservation, gear: str, profile: Profile, config: DbwConfig, wall_ns: int
+) -> WatchdogProof:
+    """Return the proof of a watchdog test that passed on the config's bus."""
     return WatchdogProof(
         at=calendar_time(wall_ns).isoformat(),
         profile=config.profile,
@@ -31,41 +33,41 @@ def proof_of(seen: WatchdogObservation, gear: str, profile: Profile, config: Dbw
         is_virtual=is_virtual(config.interface, config.channel),
         gear=gear,
         brake=BRAKE,
-        release_ms=round(seen.released_ns / NS_PER_MS, 1),
-        braked_ms=round(seen.braked_ns / NS_PER_MS, 1),
-        reports=seen.reports,
-        said=seen.words,
+        release_ms=round(observation.released_ns / NS_PER_MS, 1),
+        braked_ms=round(observation.braked_ns / NS_PER_MS, 1),
+        reports=observation.reports,
+        said=observation.kit_messages,
     )
 
 
-def check_proof(path: str, profile: Profile, config: DbwConfig) -> str:
-    """Say why the file at `path` does not prove that this profile's kit brakes on this config's bus; empty: it does."""
+def proof_rejection(path: str, profile: Profile, config: DbwConfig) -> str:
+    """Return why the proof at `path` does not apply to this profile and the config's bus; empty if it applies."""
     if not path:
-        return f"that the kit's watchdog brakes is not proved: {AGAIN}, and name its file in vehicle.dbw.watchdog_proof"
+        return f"the kit's watchdog has not been tested: {RUN_TEST} and name its file in vehicle.dbw.watchdog_proof"
     try:
         proof = parse_config(WatchdogProof, _read(path), path)
     except UserError as error:
-        return f"that the kit's watchdog brakes is not proved ({error}): {AGAIN}"
+        return f"the kit's watchdog has no valid test ({error}): {RUN_TEST}"
     bus = (config.interface, config.channel, config.options, is_virtual(config.interface, config.channel))
-    for what, proved, found in (
+    for subject, tested, configured in (
         ("profile or DBC", proof.digest, profile_digest(config.profile, config.dbc)),
         ("set of commands", proof.commands, profile.commands),
         ("bus", (proof.interface, proof.channel, proof.options, proof.is_virtual), bus),
     ):
-        if proved != found:
-            return f"{path} proves the watchdog of another {what}: {AGAIN} again"
+        if tested != configured:
+            return f"{path} is the watchdog test of another {subject}: {RUN_TEST} again"
     if proof.braked_ms * NS_PER_MS > BRAKE_WITHIN_NS:
-        return f"in {path} the kit took {proof.braked_ms:g} ms to brake, which is too long: {AGAIN} again"
+        return f"in {path} the kit took {proof.braked_ms:g} ms to brake, which is too long: {RUN_TEST} again"
     return ""
 
 
 def _read(path: str) -> dict[str, object]:
     try:
-        found = json.loads(Path(path).read_bytes())
+        data = json.loads(Path(path).read_bytes())
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path} is no proof")
-    return found
+    if not isinstance(data, dict):
+        raise UserError(f"{path} is not a watchdog proof: it contains no JSON object")
+    return data

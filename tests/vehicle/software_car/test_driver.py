@@ -1,5 +1,7 @@
+"""Overrides by the driver, and shifting."""
+
 import pytest
-from tests.vehicle.software_car.rig import ALL, AXES, Rig, both, driving
+from tests.vehicle.software_car.rig import ALL, AXES, KitRig, both, driving
 
 from lavt.vehicle.can_frame import CanFrame
 from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
@@ -7,30 +9,30 @@ from lavt.vehicle.software_car.state import Gear, GearRejection, ReleaseReason
 
 @both
 @pytest.mark.parametrize("axis", AXES)
-def test_the_driver_takes_over(generation: int, axis: str) -> None:
-    """Hands or feet take their axis from the kit (generation 2: all), the watchdog does not brake, and it stays so."""
+def test_override(generation: int, axis: str) -> None:
+    """An override releases its axis (generation 2: all), does not trip the watchdog, and stays until it is cleared."""
     rig = driving(generation)
     act = {"steering": rig.kit.driver_steers, "brake": rig.kit.driver_brakes, "throttle": rig.kit.driver_throttles}[
         axis
     ]
     act(3.0 if axis == "steering" else 0.3, rig.now_ns)
-    lost = ALL if generation == 2 else {axis}
-    assert rig.enabled() == ALL - lost
+    released = ALL if generation == 2 else {axis}
+    assert rig.enabled() == ALL - released
     act(0.0, rig.now_ns)
     rig.drive_ms(1000, throttle=0.1)
-    rig.ask()
-    assert rig.enabled() == ALL - lost
+    rig.request_system()
+    assert rig.enabled() == ALL - released
     assert rig.kit.state.watchdog == ReleaseReason.NONE
-    rig.ask(0)
-    rig.send(*rig.hand.clearing())
+    rig.request_system(0)
+    rig.send(*rig.sender.clearing())
     rig.command()
-    rig.ask()
+    rig.request_system()
     assert rig.enabled() == ALL
 
 
 @both
-def test_an_override_is_not_cleared_under_the_drivers_hands(generation: int) -> None:
-    """Clearing does nothing while the driver still acts."""
+def test_an_active_override_is_not_cleared(generation: int) -> None:
+    """CLEAR has no effect while the driver still acts."""
     rig = driving(generation)
     rig.kit.driver_steers(-3.0, rig.now_ns)
     rig.command(clear=True)
@@ -41,8 +43,8 @@ def test_an_override_is_not_cleared_under_the_drivers_hands(generation: int) -> 
 
 
 @both
-def test_a_light_touch_is_no_override(generation: int) -> None:
-    """Less than 2 Nm on the wheel or a twentieth of a pedal takes nothing over."""
+def test_small_inputs_do_not_override(generation: int) -> None:
+    """Less than 2 Nm on the wheel or a twentieth of a pedal is no override."""
     rig = driving(generation)
     rig.kit.driver_steers(1.9, rig.now_ns)
     rig.kit.driver_brakes(0.04, rig.now_ns)
@@ -51,8 +53,8 @@ def test_a_light_touch_is_no_override(generation: int) -> None:
 
 
 @both
-def test_ignore_lets_the_driver_push_in_vain(generation: int) -> None:
-    """With the ignore bit the driver's hands and feet take nothing over."""
+def test_ignore_prevents_an_override(generation: int) -> None:
+    """With the ignore bit the driver cannot override."""
     rig = driving(generation)
     rig.command(ignore=True)
     rig.kit.driver_steers(8.0, rig.now_ns)
@@ -62,46 +64,46 @@ def test_ignore_lets_the_driver_push_in_vain(generation: int) -> None:
 
 
 def test_clearing_frames_have_no_counter() -> None:
-    """Generation 1: a frame of 4 bytes neither trips the watchdog, nor enables, nor keeps an actuator awake."""
+    """In generation 1 a frame of 4 bytes neither trips the watchdog, nor enables, nor prevents a timeout."""
     rig = driving(1)
     for _ in range(4):
         rig.wait_ms(25)
-        rig.send(*rig.hand.clearing())
+        rig.send(*rig.sender.clearing())
     assert rig.kit.state.watchdog == ReleaseReason.TIMEOUT
-    other = Rig(1)
-    other.send(*(CanFrame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.hand.clearing()))
+    other = KitRig(1)
+    other.send(*(CanFrame(frame.identifier, b"\xff\xff\xff\xff") for frame in other.sender.clearing()))
     assert other.enabled() == set()
 
 
 def test_a_full_clearing_frame_without_a_counter_trips() -> None:
-    """Generation 1: 8 bytes with CLEAR and no counter trip the watchdog."""
+    """In generation 1 a frame of 8 bytes with CLEAR and no counter trips the watchdog."""
     rig = driving(1)
     rig.command()
-    rig.send(*(CanFrame(frame.identifier, frame.data + bytes(4)) for frame in rig.hand.clearing()))
+    rig.send(*(CanFrame(frame.identifier, frame.data + bytes(4)) for frame in rig.sender.clearing()))
     assert (rig.enabled(), rig.kit.state.watchdog) == (set(), ReleaseReason.COUNTER)
 
 
 @both
 def test_a_shift_needs_the_brake(generation: int) -> None:
-    """A shift without the brake pressed is refused with 5 (press the brake); with it, it is done."""
-    rig = Rig(generation)
+    """A shift without the brake is rejected with 5 (press the brake); with the brake it is executed."""
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.command(brake=0.0)
-    rig.send(rig.hand.gear(4))
+    rig.send(rig.sender.gear(4))
     assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.PARK, GearRejection.VEHICLE)
     rig.command(brake=0.5)
-    rig.send(rig.hand.gear(4))
+    rig.send(rig.sender.gear(4))
     assert (rig.kit.state.gear, rig.kit.state.gear_reject) == (Gear.DRIVE, GearRejection.NONE)
 
 
 @both
-def test_why_gears_are_rejected(generation: int) -> None:
-    """Park while moving 5, reverse 6, after the driver's shift 2, with a fault 7, and no gear at all is no request."""
+def test_reasons_for_rejected_gears(generation: int) -> None:
+    """Gears are rejected with a reason: park while moving, reverse, after the driver's shift, or with a fault."""
     rig = driving(generation)
 
     def rejection(gear: int) -> GearRejection:
         rig.command(brake=0.5)
-        rig.send(rig.hand.gear(gear))
+        rig.send(rig.sender.gear(gear))
         return rig.kit.state.gear_reject
 
     assert [rejection(gear) for gear in (1, 2, 5, 0)] == [
@@ -118,21 +120,21 @@ def test_why_gears_are_rejected(generation: int) -> None:
 
 
 @both
-def test_without_a_gear_nothing_drives(generation: int) -> None:
-    """In park the car is held and in neutral the throttle does nothing, whoever presses it."""
-    rig = Rig(generation)
+def test_out_of_gear_the_throttle_has_no_effect(generation: int) -> None:
+    """In park the car brakes, and in neutral the throttle has no effect, whether of the kit or of the driver."""
+    rig = KitRig(generation)
     rig.enable(in_drive=False)
     rig.command(throttle=0.5)
     rig.kit.driver_throttles(0.02, rig.now_ns)
     assert rig.wheels()[1:] == (0.0, 1.0)
     rig.command(brake=0.5)
-    rig.send(rig.hand.gear(3))
+    rig.send(rig.sender.gear(3))
     rig.command(throttle=0.5)
     assert rig.wheels()[1:] == (0.0, 0.0)
 
 
-def test_the_shifter_takes_over() -> None:
-    """Moving the shifter lets generation 2 go as a whole, and is told in generation 1, whose sender has to let go."""
+def test_override_by_the_shifter() -> None:
+    """Moving the shifter disengages generation 2; generation 1 reports it, and the sender has to disengage."""
     rig = driving(2)
     rig.kit.driver_shifts(Gear.NEUTRAL, rig.now_ns)
     assert (rig.enabled(), rig.kit.state.disengaged, rig.kit.state.watchdog) == (
@@ -144,18 +146,18 @@ def test_the_shifter_takes_over() -> None:
     first.kit.driver_shifts(Gear.NEUTRAL, first.now_ns)
     first.command(enable=False)
     assert (first.kit.state.is_gear_overridden, first.kit.state.watchdog) == (True, ReleaseReason.NONE)
-    first.send(first.hand.gear(0, clear=True))
+    first.send(first.sender.gear(0, clear=True))
     assert not first.kit.state.is_gear_overridden
 
 
 @both
-def test_nothing_is_enabled_under_the_drivers_foot(generation: int) -> None:
-    """A command to enable while the driver's foot is on the brake is an override that stays after the foot has gone."""
-    rig = Rig(generation)
+def test_the_driver_prevents_enabling(generation: int) -> None:
+    """A command to enable while the driver brakes is an override that stays after the pedal was released."""
+    rig = KitRig(generation)
     rig.kit.driver_brakes(0.5, rig.now_ns)
     rig.command()
-    rig.ask()
+    rig.request_system()
     rig.kit.driver_brakes(0.0, rig.now_ns)
     rig.command()
-    rig.ask()
+    rig.request_system()
     assert rig.enabled() == (set() if generation == 2 else ALL - {"brake"})

@@ -1,0 +1,161 @@
+"""The control session on the vehicle: the client that has control, its epoch, handover and emergency stops."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import ClassVar
+
+from lavt.domain import Command, Operation, SessionReply, SessionRequest, VehicleState
+from lavt.safety.limits import Limits
+from lavt.safety.state_machine import SafetyStateMachine
+from lavt.safety.takeover_requests import TakeoverRequests
+
+LARGEST_STORED_NUMBER = 2**62
+"""Numbers of emergency stops are times in nanoseconds: this one is in the year 2116."""
+
+
+class CommandEpoch:
+    """The present epoch with the commands accepted in it. Commands of an earlier epoch are never accepted again."""
+
+    def __init__(self, new_number: Callable[[], int]) -> None:
+        self.number = new_number()
+        self.sequence = -1
+        """Sequence number of the last accepted command; -1: none in this epoch."""
+        self.command: Command | None = None
+        """The last accepted drive command; None: none in this epoch, or none since arming began."""
+        self._new_number = new_number
+
+    def renew(self) -> None:
+        """End the present epoch and begin a new one."""
+        self.number = self._new_number()
+        self.sequence = -1
+        self.command = None
+
+
+class VehicleSession:
+    """The vehicle's side of the session: at most one client has control; every client can stop the vehicle."""
+
+    def __init__(
+        self,
+        limits: Limits,
+        machine: SafetyStateMachine,
+        epoch: CommandEpoch,
+        counts: Counter[str],
+        *,
+        new_token: Callable[[], bytes],
+        host: str,
+        video_port: int,
+    ) -> None:
+        self.active_operator: tuple[str, int] | None = None
+        """Name and instance of the client that has control."""
+        self.token = b""
+        self.takeover_requests = TakeoverRequests(
+            handover_request_timeout_ns=limits.handover_request_timeout_ns, reservation_ns=limits.reservation_ns
+        )
+        self._limits = limits
+        self._machine = machine
+        self._epoch = epoch
+        self._counts = counts
+        self._new_token = new_token
+        self._host = host
+        self._video_port = video_port
+        self._emergency_stop_number = 0
+        self._is_closed = False
+
+    def answer(self, request: SessionRequest, vehicle: VehicleState, now_ns: int) -> SessionReply:
+        """Execute a client's request and return the reply."""
+        rejection = self._OPERATIONS[request.operation](self, request, vehicle, now_ns)
+        granted = rejection == ""
+        self._counts[f"session {request.operation} {'granted' if granted else 'rejected'}"] += 1
+        # Epoch and token go to the active operator only, not to every client that stops the vehicle.
+        has_control = granted and self._has_control(request)
+        return SessionReply(
+            granted,
+            rejection,
+            self._epoch.number if has_control else 0,
+            self.token if has_control else b"",
+            self._video_port,
+            self._host,
+            self._emergency_stop_number,
+        )
+
+    def close(self) -> None:
+        """Stop the vehicle and end control for good, because the server shuts down."""
+        self._is_closed = True
+        self._machine.trigger("server shutdown")
+        self._end_control()
+
+    def raise_emergency_stop(self, number: int) -> bool:
+        """Stop the vehicle, and return True; for a number that is not higher than all before, only return False."""
+        if number <= self._emergency_stop_number:
+            self._counts["emergency stop with an old number"] += self._machine.state != "emergency_stop"
+            return False
+        if number <= LARGEST_STORED_NUMBER:  # a higher one is not stored: it would leave no number for the next stop
+            self._emergency_stop_number = number
+        self._machine.trigger("emergency stop")
+        return True
+
+    def _has_control(self, request: SessionRequest) -> bool:
+        return (request.who, request.instance) == self.active_operator
+
+    def _acquire(self, request: SessionRequest, vehicle: VehicleState, now_ns: int) -> str:
+        if self._is_closed:
+            return "the server is shutting down"
+        if self._has_control(request):
+            return ""
+        if self.active_operator is not None and not self._machine.is_at_rest(vehicle):
+            return f"{self.active_operator[0]} has control, and the vehicle is not disarmed and stationary"
+        reserved_for = self.takeover_requests.reserved_for(request, now_ns)
+        if reserved_for:
+            return f"reserved for {reserved_for} after a handover"
+        self.takeover_requests.clear()
+        self.active_operator = (request.who, request.instance)
+        self.token = self._new_token()
+        self._epoch.renew()
+        return ""
+
+    def _request_handover(self, request: SessionRequest, _vehicle: VehicleState, now_ns: int) -> str:
+        if self._has_control(request):
+            return "this client has control already"
+        if self.active_operator is None:
+            return "no client has control"
+        return self.takeover_requests.add(request, now_ns)
+
+    def _release(self, request: SessionRequest, _vehicle: VehicleState, now_ns: int) -> str:
+        if not self._has_control(request):
+            return "only the client that has control can release it"
+        self._machine.trigger("control released")
+        self.takeover_requests.reserve(now_ns)
+        self._end_control()
+        return ""
+
+    def _end_control(self) -> None:
+        self.active_operator = None
+        self.token = b""
+        self._epoch.renew()
+
+    def _emergency_stop(self, request: SessionRequest, _vehicle: VehicleState, _now_ns: int) -> str:
+        if not self.raise_emergency_stop(request.number):
+            return "the number of this emergency stop is not a new one"
+        self._machine.reason = f"emergency stop by {request.who}"
+        return ""
+
+    def _clear_emergency_stop(self, request: SessionRequest, vehicle: VehicleState, _now_ns: int) -> str:
+        if not self._has_control(request):
+            return "only the client that has control can clear the emergency stop"
+        if request.number != self._emergency_stop_number:  # a late or repeated request must not clear a newer stop
+            return "this is not the number of the last emergency stop"
+        if not self._limits.is_stationary(vehicle):
+            return "the vehicle is not stationary yet"
+        self._machine.trigger("emergency stop cleared")
+        return ""
+
+    _OPERATIONS: ClassVar[dict[Operation, Callable[..., str]]] = {
+        "hold": _acquire,
+        "ask": _request_handover,
+        "release": _release,
+        "emergency_stop": _emergency_stop,
+        "clear_emergency_stop": _clear_emergency_stop,
+    }
+    """Each operation returns why it is rejected; empty: it is granted."""

@@ -1,0 +1,98 @@
+"""Road-surface wear: patches, seams, cracks and sealed cracks.
+
+Their positions on a road are the same in every run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavt.domain import FloatArray
+from lavt.streams import stream
+from lavt.vehicle.sim.road.road import Road
+from lavt.vehicle.sim.road.strips import Strips, join_strips, make_strips, strip_along, strip_pieces
+
+_WORLD_SEED = 0
+_PATCH_SPACING_M = 16.0
+_CRACK_SPACING_M = 7.0
+_SEAM_M = 0.03
+_PAVER_WIDTH_M = 3.5
+"""The width in which a paver lays asphalt; seams lie between."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceWear:
+    """Strips of one kind of wear, their width (m), and by how many grey levels they darken the asphalt."""
+
+    strips: Strips
+    width_m: float
+    grey: int
+
+
+def surface_wear(road: Road) -> list[SurfaceWear]:
+    """Return all wear of one road, in painting order."""
+    patches, edges = _patches(road)
+    seams = [
+        strip_along(road, offset_m + _SEAM_M / 2, offset_m - _SEAM_M / 2, strip.from_m, strip.to_m)
+        for strip in road.paved
+        for offset_m in np.arange(strip.right_m + _PAVER_WIDTH_M, strip.left_m - 1.0, _PAVER_WIDTH_M)
+    ]
+    return [
+        *(SurfaceWear(join_strips(strips), 2.0, grey) for grey, strips in patches.items()),
+        SurfaceWear(join_strips(seams), _SEAM_M, 12),
+        SurfaceWear(edges, 0.05, 30),
+        SurfaceWear(_cracks(road, "cracks", 0.018), 0.018, 34),
+        SurfaceWear(_cracks(road, "sealed cracks", 0.07), 0.07, 26),
+    ]
+
+
+def _patches(road: Road) -> tuple[dict[int, list[Strips]], Strips]:
+    """Return rectangular patches of newer asphalt by grey level, newer darker, and the seams around them."""
+    random = stream(_WORLD_SEED, "repairs")
+    by_grey: dict[int, list[Strips]] = {7: [], 12: [], 17: []}
+    edges = []
+    count = int((road.last_m - road.first_m) / _PATCH_SPACING_M * len(road.paved))
+    for _ in range(count):
+        strip = road.paved[int(random.integers(len(road.paved)))]
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        begin_m = random.uniform(first_m, last_m)
+        end_m = min(begin_m + random.uniform(2.0, 16.0), last_m)
+        right_m = random.uniform(strip.right_m, max(strip.left_m - 2.0, strip.right_m))
+        left_m = min(right_m + random.uniform(1.0, 3.4), strip.left_m)
+        by_grey[sorted(by_grey)[int(random.integers(len(by_grey)))]].append(
+            strip_along(road, left_m, right_m, begin_m, end_m)
+        )
+        edges += [strip_along(road, side + 0.025, side - 0.025, begin_m, end_m) for side in (left_m, right_m)]
+        cuts = np.array([begin_m, end_m])
+        edges.append(strip_pieces(road, left_m, right_m, cuts - 0.025, cuts + 0.025))
+    return by_grey, join_strips(edges)
+
+
+def _cracks(road: Road, name: str, width_m: float) -> Strips:
+    """Return random polylines along or across the road, in steps of about a third of a metre."""
+    random = stream(_WORLD_SEED, name)
+    cracks = []
+    for _ in range(int((road.last_m - road.first_m) / _CRACK_SPACING_M * len(road.paved))):
+        strip = road.paved[int(random.integers(len(road.paved)))]
+        steps = int(random.integers(8, 30))
+        if random.uniform() < 0.5:
+            ahead, left = random.uniform(0.15, 0.45, steps), random.normal(0.0, 0.10, steps)
+        else:
+            ahead, left = random.normal(0.0, 0.10, steps), random.uniform(0.15, 0.40, steps)
+        first_m, last_m = max(strip.from_m, road.first_m), min(strip.to_m, road.last_m)
+        station = random.uniform(first_m, last_m) + np.cumsum(ahead)
+        offset = random.uniform(strip.right_m, strip.left_m) + np.cumsum(left)
+        inside = (offset < strip.left_m) & (station > first_m) & (station < last_m)
+        if inside.sum() > 2:
+            cracks.append(_line(road.across(station[inside], offset[inside]), width_m))
+    return join_strips(cracks)
+
+
+def _line(points_m: FloatArray, width_m: float) -> Strips:
+    """Create a quadrilateral of the given width along each segment of a polyline (n, 2)."""
+    begin, end = points_m[:-1], points_m[1:]
+    step = end - begin
+    side = np.column_stack([-step[:, 1], step[:, 0]]) * (width_m / 2 / np.hypot(step[:, :1], step[:, 1:]))
+    return make_strips(np.stack([begin + side, begin - side, end - side, end + side], axis=1))
