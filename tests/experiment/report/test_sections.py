@@ -126,7 +126,7 @@ def report_of(summary: dict[str, Any], directory: Path) -> ReportContext:
 
 def all_parts(report: ReportContext) -> dict[str, str]:
     parts = {
-        "head": summary_parts(report),
+        "summary": summary_parts(report),
         "conditions": conditions_parts(report),
         "contrasts": contrast_parts(report),
         "differences": difference_parts(report),
@@ -267,7 +267,7 @@ def test_two_presets_are_separate_groups(tmp_path: Path) -> None:
         "preset paper_calibrated",
         "preset designed",
     ]
-    assert "Virtual time, preset designed: Completed" in parts["head"]
+    assert "Virtual time, preset designed. Completed" in parts["summary"]
     assert "(preset paper_calibrated)" in parts["conditions"]
     assert {path.name for path in (tmp_path / "tables").glob("contrasts*.csv")} == {
         "contrasts.csv",

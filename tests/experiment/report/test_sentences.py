@@ -41,7 +41,7 @@ def test_the_results_name_the_largest_fall_of_completion() -> None:
     text = results_sentences("Virtual time", conditions(1.0, 1.0, 0.8, 0.3, 0.3, 0.0))
     assert "L2 80 % (222 ms), L3 30 % (297 ms)" in text
     assert "80 % at L2 to 30 % at L3, between 222 and 297 ms" in text
-    assert "From 297 ms, fewer than half" in text
+    assert "At 297 ms and above, fewer than half" in text
 
 
 def test_no_fall_is_reported_if_there_is_none() -> None:
@@ -56,7 +56,7 @@ def test_many_routes_and_conditions_are_counted() -> None:
     """A few names are listed, many are counted, and the number of invalid runs is given."""
     runs = [{"time": "virtual", "route": f"r{index}", "condition": "L0", "valid": index > 0} for index in range(20)]
     text = runs_overview(runs)
-    assert all(part in text for part in ("20 runs", "20 routes", "L0", "1 run is invalid"))
+    assert all(part in text for part in ("20 runs in virtual time", "20 routes", "L0", "1 run is invalid"))
     assert "All runs are valid" in runs_overview(runs[1:])
 
 
@@ -124,9 +124,9 @@ def test_conditions_with_equal_loop_latency_are_sorted_by_name() -> None:
     text = results_sentences("Virtual time", conditions)
     assert "L3 53 % (298 ms), L4 47 % (297 ms), L5 10 % (397 ms)" in text
     assert "90 % at L2 to 47 % at L4, between 222 and 297 ms" in text
-    assert "From 397 ms, fewer than half" in text
+    assert "At 397 ms and above, fewer than half" in text
     conditions["L3"]["completion_rate"] = 0.49
-    assert "From 297 ms, fewer than half" in results_sentences("Virtual time", conditions)
+    assert "At 297 ms and above, fewer than half" in results_sentences("Virtual time", conditions)
 
 
 def test_a_fall_is_between_two_latencies() -> None:

@@ -17,13 +17,13 @@ from lavt.experiment.report.table_format import (
     share_intervals,
     shares,
     tex_of,
-    words,
+    texts,
 )
 
 NASTY = 'a_b & 50 % of $x^2 #1 {~} \\ "<b>"\nτ'
 
 TABLE = TableData(
-    [words("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
+    [texts("name"), numbers("error m", 2), shares("completed"), share_intervals("interval"), latencies("loop ms")],
     [
         [NASTY, 1 / 3, 0.5, (0.123456789, 1.0), {"p5": 1.0, "p50": 2.25, "p95": 3.0, "n": 4}],
         ["nothing", None, None, None, None],
@@ -68,7 +68,7 @@ def test_latex_escapes_special_characters() -> None:
 
 def test_latex_reads_no_cell_as_an_option() -> None:
     """A row that begins with a bracket or a star is not an option of the line break before it."""
-    lines = tex_of(TableData([words("name")], [["[1 m]"], ["*"]])).splitlines()
+    lines = tex_of(TableData([texts("name")], [["[1 m]"], ["*"]])).splitlines()
     assert lines[5:7] == [r"{[}1 m] \\", r"{*} \\"]
 
 
@@ -89,7 +89,7 @@ def test_a_wide_latex_table_is_scaled_to_the_line() -> None:
 def test_latex_breaks_long_texts() -> None:
     """A column with a long text has line breaks, also inside JSON."""
     text = 'said: {"of_one":"word","of_two":"words, or more"}'
-    for column in (words("endings"), words("endings", is_long=True)):
+    for column in (texts("endings"), texts("endings", is_long=True)):
         lines = tex_of(TableData([column], [[text]])).splitlines()
         assert lines[1] == r"\begin{tabular}{p{6cm}}"
         assert lines[5] == (
@@ -107,7 +107,7 @@ def test_html_escapes_texts() -> None:
 
 def test_columns_without_values_are_left_out() -> None:
     """A column without a known value is left out; a column with one value remains."""
-    columns = [words("name"), numbers("known"), share_intervals("unknown"), probabilities("p")]
+    columns = [texts("name"), numbers("known"), share_intervals("unknown"), probabilities("p")]
     table = TableData(columns, [["a", None, None, None], ["b", 1.0, None, None]]).without_empty()
     assert [column.title for column in table.columns] == ["name", "known"]
     assert table.rows == [["a", None], ["b", 1.0]]

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lavt.experiment.report.table_format import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, words
+from lavt.experiment.report.table_format import LOW_HIGH, NOTHING, UNBROKEN, Column, TableData, number, numbers, texts
 from lavt.experiment.statistics.boundary_summary import CRITERIA
 
 STYLES = {"onset": ("#0072b2", "o"), "departure": ("#e69f00", "s"), "completion": ("#d55e00", "D")}
@@ -100,7 +100,7 @@ def _criterion(
 
 def boundary_table(boundary: Boundary) -> TableData:
     """Return the table of all groups: median, its interval, and quartiles of each criterion, in ms."""
-    columns = [words("route"), words("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
+    columns = [texts("route"), texts("preset"), numbers("seeds", 0), numbers("onset by theory (ms)", 0)]
     for name in CRITERIA:
         columns += [
             numbers(f"{LABELS[name]}: median (ms)", 0),

@@ -9,10 +9,11 @@ from typing import Any
 from lavt.experiment.report import html_page
 from lavt.experiment.report.boundary_figure import boundary_figure, boundary_table
 from lavt.experiment.report.files import save_figure, save_table
+from lavt.experiment.report.sections import Parts
 from lavt.experiment.report.sentences import boundary_sentences
 
 
-def boundary_parts(boundaries: Sequence[Mapping[str, Any]], report_dir: Path) -> list[str]:
+def boundary_parts(boundaries: Sequence[Mapping[str, Any]], report_dir: Path) -> Parts:
     """Return the sentences, the figure and the table of each boundary, the contents of a `boundary.json`."""
     parts = []
     for number, boundary in enumerate(boundaries, start=1):

@@ -160,7 +160,7 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
     """Return the figure of measured one-way latency over injected delay, for video and control.
 
     The upper panels show medians with bars from p5 to p95, and the line of the least latency plus the injected delay.
-    The lower panels show the distance of the medians from this line; bars are the bound of the clock error.
+    The lower panels show the deviation of the medians from this line; bars are the bound of the clock error.
     """
     figure = new_figure(5.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[3, 2])
@@ -172,7 +172,7 @@ def injected_figure(kinds: Mapping[str, Conditions], colours: Colours) -> Figure
         symbol = "τ video" if direction == "video" else "τ control"
         tidy(above, "", f"{symbol}, measured (ms)", direction.capitalize())
         above.set_ylim(bottom=min(0.0, above.get_ylim()[0]))
-        tidy(below, f"injected {direction} delay (ms)", "distance from line (ms)")
+        tidy(below, f"injected {direction} delay (ms)", "deviation (ms)")
         low, high = below.get_ylim()
         below.set_ylim(min(low, -1.2), max(high, 1.2))
         below.axhline(0, color="0.6", linewidth=0.8, zorder=0)

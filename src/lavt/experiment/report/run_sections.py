@@ -162,7 +162,7 @@ def machine_parts(report: ReportContext, sets: DriveSets) -> Parts:
         by_html[html] = (first, count + 1)
     parts = []
     for number, (first, count) in enumerate(by_html.values(), start=1):
-        text = f"{count} of {len(report.summary['runs'])} runs; the first is {first.result['run']}:"
+        text = f"Recorded by {count} of {len(report.summary['runs'])} runs, the first is {first.result['run']}:"
         table = machine_table(first.annotations)
         parts += [html_page.paragraph(text, is_note=True), save_table(report.directory, f"machine_{number}", table)]
     return parts

@@ -211,7 +211,7 @@ def injected_parts(report: ReportContext) -> Parts:
         return []
     caption = (
         "Measured one-way latency over injected delay: median, p5 to p95. The grey line is the latency of the "
-        "condition with the least delay, plus the injected delay. The lower panels show the distance of each median "
+        "condition with the least delay, plus the injected delay. The lower panels show the deviation of each median "
         "from this line; bars are the bound of the clock error."
         f"{_base_note(report)}"
     )
@@ -276,8 +276,8 @@ def stage_parts(report: ReportContext, captured_ms: Mapping[str, Mapping[str, fl
         loops = {name: _loop_of(entry) for name, entry in known.items()}
         stages = {name: [*loops[name], *filter(_is_after_loop, entry["stages_ms"])] for name, entry in known.items()}
         caption = (
-            "Median latency of each stage over all runs, in the order in which a frame passes the stages. The number at "
-            "each bar is the sum of these medians, which can differ slightly from the median loop latency. "
+            "Median latency of each stage over all runs, in the order in which a frame passes the stages. The number "
+            "at each bar is the sum of these medians, which can differ slightly from the median loop latency. "
             f"{kind.capitalize()} time{report.base_title(kind)}."
         )
         parts.append(

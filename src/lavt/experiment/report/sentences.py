@@ -20,7 +20,7 @@ SAME_LOOP_MS = 3.0
 SIGNIFICANT_P = 0.05
 
 CLEARLY_FEWER = 2
-"""The fall of completion is sharper here if this many fewer conditions are completed in part."""
+"""Completion falls more sharply than in the paper if this many fewer conditions are completed in part."""
 
 Contrast = Mapping[str, Any]
 
@@ -48,8 +48,9 @@ def _by_latency(conditions: Conditions) -> list[list[ConditionPoint]]:
 
 def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
     """Return a sentence with the number of runs, their routes and conditions, and the number of invalid runs."""
+    counts = {kind: sum(run["time"] == kind for run in runs) for kind in ("virtual", "real")}
     by_time = " and ".join(
-        f"{count} in {kind} time" for kind in ("virtual", "real") if (count := sum(run["time"] == kind for run in runs))
+        f"{count} run{'s' if count > 1 else ''} in {kind} time" for kind, count in counts.items() if count
     )
     routes = sorted({str(run["route"]) for run in runs})
     names = sorted({str(run["condition"]) for run in runs})
@@ -59,7 +60,7 @@ def runs_overview(runs: Sequence[Mapping[str, Any]]) -> str:
         subject = "1 run is" if invalid == 1 else f"{invalid} runs are"
         validity = f"{subject} invalid and excluded from all statistics; the table of all runs gives the reasons."
     where = f"{_listed('route', routes)} under {_listed('condition', names)}"
-    return f"{len(runs)} run{'s' if len(runs) != 1 else ''}: {by_time}, on {where}. {validity}"
+    return f"{by_time} on {where}. {validity}"
 
 
 def _listed(word: str, names: Sequence[str]) -> str:
@@ -77,7 +78,7 @@ def results_sentences(name: str, conditions: Conditions) -> str:
     parts = []
     if len(known) <= LISTED:
         each = ", ".join(f"{condition} {rate * 100:.0f} % ({loop_ms:.0f} ms)" for condition, loop_ms, rate in known)
-        parts.append(f"Completed runs (median loop latency): {each}.")
+        parts.append(f"Completed runs, with the median loop latency: {each}.")
     parts += _fall_sentences(levels)
     errors = [(condition, conditions[condition]["p95_m"]) for condition, _, _ in known]
     known_errors = [(condition, error_m) for condition, error_m in errors if error_m is not None]
@@ -87,7 +88,7 @@ def results_sentences(name: str, conditions: Conditions) -> str:
             f"Mean P95 of the cross-track error of completed runs: {first_m:.2f} m at {first}, {last_m:.2f} m at "
             f"{last}."
         )
-    return f"{name}: {' '.join(parts)}"
+    return f"{name}. {' '.join(parts)}"
 
 
 def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
@@ -99,12 +100,12 @@ def _fall_sentences(levels: Sequence[Sequence[ConditionPoint]]) -> list[str]:
         return ["Completion does not fall as latency increases."]
     parts = [
         f"The largest fall is from {before[2] * 100:.0f} % at {before[0]} to {after[2] * 100:.0f} % at {after[0]}, "
-        f"between {before[1]:.0f} and {after[1]:.0f} ms loop latency."
+        f"between {before[1]:.0f} and {after[1]:.0f} ms of loop latency."
     ]
     last = max((index for index, level in enumerate(levels) if any(rate >= 0.5 for _, _, rate in level)), default=-1)
     if last + 1 < len(levels):
         begin_ms = min(loop_ms for _, loop_ms, _ in levels[last + 1])
-        parts.append(f"From {begin_ms:.0f} ms, fewer than half of the runs are completed.")
+        parts.append(f"At {begin_ms:.0f} ms and above, fewer than half of the runs are completed.")
     return parts
 
 

@@ -68,7 +68,7 @@ class TableData:
         return TableData(columns, [[row[index] for index in known] for row in self.rows])
 
 
-def words(title: str, *, is_long: bool = False) -> Column:
+def texts(title: str, *, is_long: bool = False) -> Column:
     """Return a column of texts."""
     return Column(title, lambda cell: NOTHING if cell is None else str(cell), is_text=True, is_long=is_long)
 
@@ -168,8 +168,8 @@ def csv_of(table: TableData) -> str:
 
 def tex_of(table: TableData) -> str:
     r"""Return a table as a LaTeX `tabular`; it needs `booktabs`, and `graphicx` if it is wide."""
-    texts = _texts(table)
-    columns = [_tex_column(column, [row[index] for row in texts]) for index, column in enumerate(table.columns)]
+    shown = _texts(table)
+    columns = [_tex_column(column, [row[index] for row in shown]) for index, column in enumerate(table.columns)]
     head, *rows = [" & ".join(cells) + r" \\" for cells in zip(*(cells for _, _, cells in columns), strict=True)]
     packages = [r"% needs \usepackage{booktabs}"]
     begin, end = rf"\begin{{tabular}}{{{''.join(align for align, _, _ in columns)}}}", r"\end{tabular}"

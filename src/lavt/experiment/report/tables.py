@@ -21,8 +21,8 @@ from lavt.experiment.report.table_format import (
     probabilities,
     share_intervals,
     shares,
+    texts,
     with_bound,
-    words,
 )
 
 FLOWS = ("video", "control")
@@ -65,14 +65,14 @@ def matching_paper(conditions: Conditions, paper: Conditions) -> Conditions:
 def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of injected and measured latency with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
+        texts("condition"),
         numbers("injected video delay ms", 0),
         numbers("injected control delay ms", 0),
         latencies("τ video ms", bounded=True),
         numbers("the paper's τ video ms", 0),
         latencies("τ control ms", bounded=True),
         numbers("the paper's τ control ms", 0),
-        latencies("loop ms"),
+        latencies("loop latency ms"),
         numbers("the paper's τ video + τ control ms", 0),
         numbers("frame age, mean ms", 0),
         numbers("frame age, p95 ms", 0),
@@ -80,8 +80,8 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
     ]
     rows = []
     for name, entry in conditions.items():
-        its = paper.get(name, {})
-        total_ms = its["tau_v_ms"] + its["tau_c_ms"] if its else None
+        published = paper.get(name, {})
+        total_ms = published["tau_v_ms"] + published["tau_c_ms"] if published else None
         age_ms = entry.get("picture_age_ms") or {}
         rows.append(
             [
@@ -89,9 +89,9 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
                 entry["injected_ms"]["video"],
                 entry["injected_ms"]["control"],
                 entry["tau_v_ms"],
-                its.get("tau_v_ms"),
+                published.get("tau_v_ms"),
                 entry["tau_c_ms"],
-                its.get("tau_c_ms"),
+                published.get("tau_c_ms"),
                 entry["loop_ms"],
                 total_ms,
                 age_ms.get("mean"),
@@ -105,7 +105,7 @@ def latency_table(conditions: Conditions, paper: Conditions) -> TableData:
 def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of completion and endings with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
+        texts("condition"),
         numbers("runs", 0),
         shares("completed"),
         share_intervals("95 %, these routes"),
@@ -118,12 +118,12 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
         numbers("lane invasions / run", 2),
         numbers("the paper's lane invasions / run", 2),
         numbers("lane invasions / km", 1),
-        words("endings"),
+        texts("endings"),
     ]
     rows = []
     for name, entry in conditions.items():
-        its = paper.get(name, {})
-        endings = ", ".join(f"{many} {ending}" for ending, many in (entry.get("endings") or {}).items())
+        published = paper.get(name, {})
+        endings = ", ".join(f"{count} {ending}" for ending, count in (entry.get("endings") or {}).items())
         rows.append(
             [
                 name,
@@ -131,13 +131,13 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
                 entry["completion_rate"],
                 entry["completion_interval"],
                 entry.get("completion_such_roads"),
-                its.get("completion_rate"),
-                its.get("completion_interval"),
+                published.get("completion_rate"),
+                published.get("completion_interval"),
                 entry["collisions_per_run"],
-                its.get("collisions_per_run"),
+                published.get("collisions_per_run"),
                 entry.get("collisions_per_km"),
                 entry["lane_invasions_per_run"],
-                its.get("lane_invasions_per_run"),
+                published.get("lane_invasions_per_run"),
                 entry.get("lane_invasions_per_km"),
                 endings or None,
             ]
@@ -148,7 +148,7 @@ def driving_table(conditions: Conditions, paper: Conditions) -> TableData:
 def error_table(conditions: Conditions, paper: Conditions) -> TableData:
     """Return the table of lane-keeping errors with the paper's values: one row for each condition."""
     columns = [
-        words("condition"),
+        texts("condition"),
         numbers(f"{COMPLETED_P95}, mean of runs", 2),
         intervals("95 % interval, completed runs m"),
         numbers("the paper's p95 m", 2),
@@ -192,7 +192,7 @@ def _quartiles(quartiles: Mapping[str, float | None] | None) -> str:
 def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of planned contrasts with the paper's p values, from Fisher's test on its counts."""
     columns = [
-        words("contrast"),
+        texts("contrast"),
         numbers("pairs", 0),
         numbers("completed under first only", 0),
         numbers("completed under second only", 0),
@@ -201,20 +201,20 @@ def contrast_table(contrasts: Sequence[Mapping[str, Any]], paper: Sequence[Mappi
         probabilities("the paper's p"),
         probabilities("the paper's p, Holm"),
     ]
-    its = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
+    published = {(contrast["a"], contrast["b"]): contrast for contrast in paper}
     rows = []
     for contrast in contrasts:
-        theirs = its.get((contrast["a"], contrast["b"]), {})
-        ours = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
-        rows.append([f"{contrast['a']} – {contrast['b']}", *ours, theirs.get("p"), theirs.get("p_holm")])
+        its = published.get((contrast["a"], contrast["b"]), {})
+        values = [contrast[key] for key in ("pairs", "only_a", "only_b", "p", "p_holm")]
+        rows.append([f"{contrast['a']} – {contrast['b']}", *values, its.get("p"), its.get("p_holm")])
     return TableData(columns, rows).without_empty()
 
 
 def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
     """Return the table of groups, which the settings `names` distinguish: one row for each condition of a group."""
     columns = [
-        *(words(short(name)) for name in names),
-        words("condition"),
+        *(texts(short(name)) for name in names),
+        texts("condition"),
         numbers("runs", 0),
         shares("completed"),
         share_intervals("95 % interval"),
@@ -222,7 +222,7 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
         numbers("lane invasions / run", 2),
         numbers(f"{COMPLETED_P95}, mean of runs", 2),
         numbers(f"{COMMON_P95}, mean of runs", 2),
-        numbers("loop ms, median"),
+        numbers("loop latency ms, median"),
         numbers("frame age, mean ms", 0),
     ]
     rows = [
@@ -248,8 +248,8 @@ def group_table(groups: Sequence[Group], names: Sequence[str]) -> TableData:
 def route_table(conditions: Conditions) -> TableData:
     """Return the table of routes: one row for each condition on each route."""
     columns = [
-        words("route"),
-        words("condition"),
+        texts("route"),
+        texts("condition"),
         numbers("runs", 0),
         numbers("completed", 0),
         shares("share"),
@@ -271,7 +271,7 @@ def route_table(conditions: Conditions) -> TableData:
 def route_overview(conditions: Conditions) -> TableData:
     """Return the table of completed runs: one row for each route, one column for each condition."""
     routes = sorted({route for entry in conditions.values() for route in entry.get("routes") or {}})
-    columns = [words("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
+    columns = [texts("completed"), *(Column(name, lambda cell: cell or NOTHING) for name in conditions)]
     rows = [
         [route, *(_completed((entry.get("routes") or {}).get(route)) for entry in conditions.values())]
         for route in routes
@@ -286,12 +286,12 @@ def _completed(entry: Mapping[str, Any] | None) -> str | None:
 def survival_table(conditions: Conditions) -> TableData:
     """Return the table of all steps of the survival curves, for use in other programs."""
     columns = [
-        words("route"),
-        words("condition"),
+        texts("route"),
+        texts("condition"),
         numbers("distance m", 1),
         shares("still driving"),
         share_intervals("95 % interval"),
-        words("ended so far"),
+        texts("ended so far"),
     ]
     rows = []
     for name, entry in conditions.items():
@@ -306,18 +306,18 @@ def survival_table(conditions: Conditions) -> TableData:
 def run_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of runs: identity, ending, main results and validity."""
     columns = [
-        words("run"),
-        words("sweep"),
-        words("time"),
-        words("route"),
-        words("condition"),
-        words("preset"),
-        words("ending"),
+        texts("run"),
+        texts("sweep"),
+        texts("time, fidelity, injection"),
+        texts("route"),
+        texts("condition"),
+        texts("preset"),
+        texts("ending"),
         numbers("distance m", 0),
-        numbers("loop ms"),
+        numbers("loop latency ms, median"),
         numbers("p95 error m", 2),
         numbers("frame age, mean ms", 0),
-        words("validity", is_long=True),
+        texts("validity", is_long=True),
     ]
     rows = [
         [
@@ -343,8 +343,8 @@ def clock_table(runs: Sequence[Mapping[str, Any]]) -> TableData:
     """Return the table of clock offsets, by their source and by the probe: one row for each run."""
     parts = ("", "bound")
     columns = [
-        words("run"),
-        words("source"),
+        texts("run"),
+        texts("source"),
         Column("clock offset ms", lambda cell: with_bound(*cell, digits=3), parts),
         numbers("drift ppm", 2),
         Column("clock offset by probe ms", lambda cell: with_bound(*cell, digits=3), parts),
@@ -373,7 +373,7 @@ def stage_table(
     durations = [{(stage["node"], stage["stage"]): stage["p50"] for stage in every} for every in stages.values()]
     before: list[Any] = [(captured_ms or {}).get(name) for name in stages]
     show = numbers("", 2).show
-    columns = [words("stage, median ms"), *(Column(name, show) for name in stages)]
+    columns = [texts("stage, median ms"), *(Column(name, show) for name in stages)]
     rows = [
         [
             f"{node}: {stage}{AFTERWARDS if (node, stage) in AFTER_LOOP else ''}",
@@ -386,7 +386,7 @@ def stage_table(
 
 def machine_table(annotations: Mapping[str, Mapping[str, str]]) -> TableData:
     """Return the table of versions and machines from a run's records."""
-    columns = [words("record"), words("property", is_long=True), words("value", is_long=True)]
+    columns = [texts("category"), texts("property", is_long=True), texts("value", is_long=True)]
     rows = [
         [name, key, value]
         for name in sorted(annotations)
